@@ -6,29 +6,24 @@ visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
 
 from __future__ import annotations
 
-import inspect
 import itertools
-import json
-import re
 import tomllib
 from datetime import UTC, datetime, timedelta
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import msgspec
 from msgspec import Meta
 
 from restock.errors import ConfigError
-from restock.replay.mixture import schedules
 from restock.replay.mixture.schedules import Fraction, Portion, Schedule, knots, value_at
 from restock.toml import Checked, typed
+from restock.toml_schema import json_schema
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
 # Shipped mixtures by the names of earlier versions.
 _RENAMED = {"missions": "coverage"}
 SCHEMA_FILE = "mixture.schema.json"
-_FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 
 AtLeastOne = Annotated[int, Meta(ge=1)]
 Count = Annotated[int, Meta(ge=0)]
@@ -371,31 +366,7 @@ def mixture_schema() -> str:
 
     `python -m restock.replay.mixture.mixture` writes the file that is shipped.
     """
-    schema = msgspec.json.schema(Mixture)
-    for name, definition in schema["$defs"].items():
-        definition["properties"] = {
-            key: _without_null(value) for key, value in definition["properties"].items()
-        }
-        struct = globals().get(name) or getattr(schedules, name)
-        for part in (struct, *struct.__bases__):
-            for key, comment in _FIELD.findall(inspect.getsource(part)):
-                if key in definition["properties"]:
-                    definition["properties"][key]["description"] = comment
-    whole = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Restock mixture",
-        **schema,
-    }
-    return json.dumps(whole, indent=1, sort_keys=False) + "\n"
-
-
-def _without_null(value: dict[str, Any]) -> dict[str, Any]:
-    """TOML has no null: what may be left out is a field without one."""
-    choices = [choice for choice in value.get("anyOf", ()) if choice != {"type": "null"}]
-    if len(choices) == len(value.get("anyOf", ())):
-        return value
-    rest = {key: item for key, item in value.items() if key != "anyOf" and item is not None}
-    return {**choices[0], **rest} if len(choices) == 1 else {"anyOf": choices, **rest}
+    return json_schema(Mixture, "Restock mixture")
 
 
 if __name__ == "__main__":

@@ -99,9 +99,9 @@ MAY_IMPORT = {
         " replay/store report train/comparison train/dqn train/evaluation train/twin/physics"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay/trace train train/comparison"
-        " train/diagnosis train/evaluation train/run train/study"
-        " train/twin/physics train/view"
+        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace train"
+        " train/comparison train/diagnosis train/dqn train/evaluation train/run train/study"
+        " train/twin/floors train/twin/physics train/view"
     ),
     "cli/pages": (
         "cli report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"

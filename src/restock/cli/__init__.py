@@ -42,6 +42,7 @@ VERBS = {
     "node": "an exported policy on a robot: a ROS 2 node, in shadow or driving",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
+    "schema": "what a TOML file may say, as a JSON Schema for editors",
     "doctor": "what is installed here, what works, and is a store well?",
 }
 # folder -> the verbs whose modules it holds
@@ -50,7 +51,7 @@ FOLDERS = {
         *("info", "profile", "ingest", "label", "compact", "sql", "audit"),
         *("drift", "diff", "gaps", "mix", "export"),
     ),
-    "learning": ("train", "eval", "study", "compare", "trace", "diagnose"),
+    "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "schema"),
     "pages": ("coverage", "report"),
     "twin": ("record", "twin"),
     "robot": ("node",),

@@ -1,0 +1,111 @@
+"""`restock schema`: what a TOML file may say, for editors."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+# name -> the files that it is of
+CONFIGS: Mapping[str, str] = {
+    "train": "`restock train --config`",
+    "mixture": "`restock mix --mixture`",
+    "profile": "`restock ingest --profile`, a robot's topics and task",
+    "study": "`restock study`, of arms",
+    "search": "`restock study`, of a [space]",
+    "layout": "a floor, for `--layouts`",
+    "perturbation": "`restock record --perturbation`, effective parameters",
+    "schedule": "the same, drawn an episode from `ranges`",
+    "missions": "`restock record --missions`",
+}
+
+
+@dataclass
+class SchemaCommand:
+    """The JSON Schema of a config: an editor completes and checks the TOML file by it.
+
+    Without NAME it lists the configs. `restock schema train > train.schema.json`, and as the
+    first line of the TOML file: #:schema ./train.schema.json (Taplo, and with it VS Code's Even
+    Better TOML, read that line). --out writes every schema into a folder.
+    """
+
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
+    """Of which config."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Write NAME.schema.json there; without NAME all of them."""
+    json: bool = False
+    """Print the list as JSON (a schema is JSON anyway)."""
+
+    def run(self) -> None:
+        """Print or write."""
+        from restock.cli import output
+        from restock.errors import ConfigError
+        from restock.files import write_text
+
+        if self.name is not None and self.name not in CONFIGS:
+            raise ConfigError(
+                f"no config named {self.name!r}", remedy=f"there are {', '.join(CONFIGS)}"
+            )
+        if self.out is not None:
+            for name in [self.name] if self.name else CONFIGS:
+                file = self.out / f"{name}.schema.json"
+                write_text(file, schema_of(name))
+                output.say(f"{file}: #:schema {file} is the first line of {CONFIGS[name]} files")
+        elif self.name is not None:
+            sys.stdout.write(schema_of(self.name))
+        else:
+            rows = [{"name": name, "of": of} for name, of in CONFIGS.items()]
+            output.print_json(rows) if self.json else output.print_table(rows)
+
+
+def schema_of(name: str) -> str:
+    """The schema of a config, as JSON text."""
+    from restock.toml_schema import json_schema
+
+    kind, changed = _kinds()[name]
+    schema = json.loads(json_schema(kind, f"Restock {name}"))
+    changed(schema)
+    return json.dumps(schema, indent=1) + "\n"
+
+
+def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
+    from restock.ingest.profile.profile import Profile
+    from restock.replay.fleet.missions_file import MissionsFile
+    from restock.replay.mixture.mixture import Mixture
+    from restock.train.dqn.config import TrainConfig
+    from restock.train.study.space import Search
+    from restock.train.study.study import Study
+    from restock.train.twin.floors.floor_file import FloorFile
+    from restock.train.twin.physics.perturbation import Perturbation, Schedule
+
+    def as_it_is(_: dict[str, Any]) -> None:
+        """What is read is what the file says."""
+
+    return {
+        "train": (TrainConfig, as_it_is),
+        "mixture": (Mixture, as_it_is),
+        "profile": (Profile, _conditions_in_files),
+        "study": (Study, as_it_is),
+        "search": (Search, as_it_is),
+        "layout": (FloorFile, as_it_is),
+        "perturbation": (Perturbation, as_it_is),
+        "schedule": (Schedule, as_it_is),
+        "missions": (MissionsFile, as_it_is),
+    }
+
+
+def _conditions_in_files(schema: dict[str, Any]) -> None:
+    """A `[[condition]]` names a .sql file in place of its `sql`."""
+    condition = schema["$defs"]["Condition"]
+    condition["properties"]["file"] = {
+        "type": "string",
+        "pattern": r"\.sql$",
+        "description": "with the rule and its settings, in the profile's folder; or sql",
+    }
+    condition["required"] = [key for key in condition["required"] if key == "name"]
+    condition["oneOf"] = [{"required": ["sql"]}, {"required": ["file"]}]

@@ -1,0 +1,136 @@
+"""`restock schema`: what Restock reads an editor accepts, what it refuses an editor underlines."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from jsonschema import Draft202012Validator
+from support.pages import PAGES, blocks
+from support.paths import ROOT
+
+from restock import cli
+from restock.cli.learning.schema import CONFIGS, schema_of
+from restock.replay.mixture.mixture import shipped_schema
+from restock.train.dqn.config import TrainConfig
+from restock.train.twin.physics.perturbation import PERTURBATIONS
+
+SCHEMAS = {name: json.loads(schema_of(name)) for name in CONFIGS}
+# Of a page's blocks of TOML that are whole files: what they are.
+WRITTEN = {
+    ("docs/study.md", "study.toml"): "study",
+    ("docs/tune.md", "search.toml"): "search",
+    ("docs/schema.md", "recipe.toml"): "train",
+    ("docs/record.md", "next.toml"): "missions",
+}
+
+
+def problems(name: str, document: dict[str, Any]) -> list[str]:
+    plain = json.loads(json.dumps(document, default=str))  # TOML has dates, JSON has not
+    errors = Draft202012Validator(SCHEMAS[name]).iter_errors(plain)
+    return [f"{error.json_path}: {error.message}" for error in errors]
+
+
+def kind_of(path: str, document: dict[str, Any]) -> str | None:
+    """What a shipped TOML file is, by where it lies and what it holds."""
+    if path.startswith("ingest/profile/profiles/"):
+        return "profile"
+    if path.startswith(("replay/mixture/mixtures/", "benchmarks/")):
+        return "study" if "arms" in document else "mixture"
+    return None
+
+
+def shipped() -> list[tuple[str, str]]:
+    told = subprocess.run(
+        ["git", "ls-files", "*.toml"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.split()
+    files = told or [str(p.relative_to(ROOT)) for p in (ROOT / "replay").rglob("mixtures/*.toml")]
+    found = [(path, kind_of(path, tomllib.loads((ROOT / path).read_text()))) for path in files]
+    return [(path, kind) for path, kind in found if kind is not None]
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_schema_is_one(name: str) -> None:
+    Draft202012Validator.check_schema(SCHEMAS[name])
+    assert SCHEMAS[name]["title"] == f"Restock {name}"
+    assert problems(name, {"nothing_has_this_key": 1})
+
+
+@pytest.mark.parametrize(("path", "kind"), shipped())
+def test_every_shipped_file_is_accepted(path: str, kind: str) -> None:
+    assert problems(kind, tomllib.loads((ROOT / path).read_text())) == []
+
+
+def test_there_are_shipped_files_of_each_kind_to_be_accepted() -> None:
+    assert {kind for _, kind in shipped()} >= {"mixture"}
+
+
+def test_what_the_docs_write_is_accepted() -> None:
+    seen = set()
+    for page in PAGES:
+        for block in blocks(page):
+            if (block.page, block.marks.get("file")) in WRITTEN:
+                kind = WRITTEN[block.page, block.marks["file"]]
+                assert problems(kind, tomllib.loads(block.text)) == [], block.place
+                seen.add(kind)
+    assert seen == set(WRITTEN.values())
+
+
+def test_what_restock_itself_writes_is_accepted() -> None:
+    assert problems("train", _without_null(msgspec.to_builtins(TrainConfig()))) == []
+    for perturbation in PERTURBATIONS.values():
+        assert problems("perturbation", _without_null(msgspec.to_builtins(perturbation))) == []
+
+
+def _without_null(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_null(item) for key, item in value.items() if item is not None}
+    return value
+
+
+@pytest.mark.parametrize(
+    ("name", "toml", "said"),
+    [
+        ("train", "[loss]\nn_steps = 3", "n_steps"),
+        ("train", "[loss]\nn_step = 0", "less than the minimum"),
+        ("train", "record.trackers = ['comet']", "is not one of"),
+        ("mixture", "n_step = 'three'", "is not of type 'integer'"),
+        ("study", "seeds = [0]", "'arms' is a required property"),
+        ("profile", "name = 'x'\n[task.body]\nlength_m = 1", "'width_m' is a required property"),
+        ("layout", "width_m = 3\ndepth_m = 3\nracks = [[0, 0, 1]]", "too short"),
+        ("missions", "[[missions]]\nkind = 'nominal'\nmissions = 2\nzones = 'a'", "zones"),
+    ],
+)
+def test_what_restock_refuses_is_underlined(name: str, toml: str, said: str) -> None:
+    assert said in "; ".join(problems(name, tomllib.loads(toml)))
+
+
+def test_a_condition_has_its_rule_or_names_its_file() -> None:
+    whole = (ROOT / "ingest/profile/profiles/warehouse_amr.toml").read_text()
+    for own, accepted in (("file = 'a.sql'", True), ("sql = 'true'", True), ("doc = 'a'", False)):
+        text = f"{whole}\n[[condition]]\nname = 'mine'\n{own}\n"
+        assert (problems("profile", tomllib.loads(text)) == []) == accepted, own
+
+
+def test_keys_have_the_comments_beside_them_as_descriptions() -> None:
+    record = SCHEMAS["train"]["$defs"]["RecordConfig"]["properties"]
+    assert record["every_updates"]["description"] == "one logging interval"
+    assert json.loads(shipped_schema()) == SCHEMAS["mixture"]
+
+
+def test_the_command_prints_lists_and_writes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["schema", "--json"]) == 0
+    assert [row["name"] for row in json.loads(capsys.readouterr().out)] == list(CONFIGS)
+    assert cli.main(["schema", "study"]) == 0
+    assert json.loads(capsys.readouterr().out) == SCHEMAS["study"]
+    assert cli.main(["schema", "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {f"{n}.schema.json" for n in CONFIGS}
+    assert cli.main(["schema", "robot"]) == 2
+    assert "there are train" in capsys.readouterr().err
