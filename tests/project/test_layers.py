@@ -18,7 +18,7 @@ from support.paths import ROOT
 
 MOST_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
-SHARED = {"arrays", "errors", "files", "imports", "public", "state", "stats", "toml"}
+SHARED = {"arrays", "errors", "files", "imports", "public", "state", "stats", "toml", "toml_schema"}
 MAY_IMPORT = {
     "ingest": "containers profile steps store task",
     "ingest/decoding": "",
