@@ -16,6 +16,7 @@ from restock import cli
 from restock.cli.start import stages
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
+from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store
 from restock.train.twin.floors.occupancy_map import write_pgm
 
@@ -75,6 +76,40 @@ def test_a_damaged_recording_is_read_as_far_as_it_is_intact_where_that_is_asked_
     assert "100% lie off the map" in floor["errors"][0]
     assert "cannot be the floor" in document["stopped"]["why"]
     assert not (out / "floor.toml").exists()
+
+
+CART = """<robot name='cart'><link name='base_link'>
+<inertial><mass value='20'/></inertial>
+<collision><geometry><box size='0.6 0.4 0.2'/></geometry></collision></link>{}</robot>"""
+WHEEL = """<link name='{0}'><collision><geometry><cylinder radius='0.09' length='0.03'/></geometry>
+</collision></link><joint name='{0}_joint' type='continuous'><parent link='base_link'/>
+<child link='{0}'/><origin xyz='0 {1} -0.05'/><axis xyz='0 1 0'/></joint>"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urdf, hall, out = tmp_path / "cart.urdf", tmp_path / "hall.yaml", tmp_path / "out"
+    urdf.write_text(CART.format(WHEEL.format("left", 0.22) + WHEEL.format("right", -0.22)))
+    write_pgm(tmp_path / "hall.pgm", np.pad(np.full((80, 300), 254, np.uint8), 2))
+    hall.write_text("image: hall.pgm\nresolution: 0.05\norigin: [-1.0, -1.0, 0]\n")
+    bag = write_bag(Drive(20.0), tmp_path / "bag")
+    argv = (str(bag), "--out", str(out), "--urdf", str(urdf), "--map", str(hall))
+    code, document = start(capsys, *argv, "--minutes", "0.1")
+    assert code == 0
+    assert Path(document["report"]).is_file()
+    said = {stage["name"]: stage["outcome"] for stage in document["stages"]}
+    assert said["floor"][0].startswith(f"made from {hall}: 15 x 4 m")
+    robot = load_profile(str(out / "profile.toml")).robot
+    assert robot is not None
+    assert (robot.wheel_radius_m, robot.track_m, robot.mass_kg) == (0.09, 0.44, 20.0)
+    assert robot.origin_of("track_m") == "urdf"
+    # Once the profile is a person's, a proposal's flags are said to change nothing.
+    (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
+    assert cli.main(["start", *argv, *UP_TO_THE_PANEL]) == 3
+    assert "--urdf and --footprint are for a proposal" in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
