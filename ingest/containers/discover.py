@@ -43,10 +43,13 @@ def recordings_in(path: Path | str) -> list[Path]:
     if path.is_dir():
         recordings = _in_folder(path)
         if not recordings:
+            links = sum(item.is_symlink() and item.is_dir() for item in path.iterdir())
             raise RecordingError(
                 "no recording in this folder",
                 where=str(path),
-                remedy=f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
+                remedy=f"links to folders ({links} in it) are not followed: name them, as {path}/*"
+                if links
+                else f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
             )
         return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207

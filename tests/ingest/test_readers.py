@@ -237,6 +237,15 @@ def test_finding_recordings(tmp_path: Path) -> None:
         recordings_in(tmp_path / "empty")
 
 
+def test_links_to_folders_are_not_followed_and_said(tmp_path: Path) -> None:
+    """They may lead round in a circle."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "bags").mkdir()
+    (tmp_path / "bags" / "a").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RecordingError, match=r"links to folders \(1 in it\) are not followed"):
+        recordings_in(tmp_path / "bags")
+
+
 # -- bad input ------------------------------------------------------------------------------
 
 
