@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo site test test-docs test-slow neighbours lint sample-logs clean
+.PHONY: demo site test test-docs test-slow neighbours lint notebook sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -13,6 +13,7 @@ help:
 	@echo "make test-docs    run every block of the documentation as it is printed"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
+	@echo "make notebook     run docs/tutorial.md, and write its outputs and docs/tutorial.ipynb"
 	@echo "make sample-logs  record sample_logs/ again from its seed"
 
 # The stamp files make each target install only what it needs, once per change of pyproject.toml.
@@ -57,6 +58,10 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The page is the source of both; a test fails where they no longer agree.
+notebook: $(VENV)/.dev
+	PYTHONPATH=tests $(BIN)/python -m support.notebook docs/tutorial.md
 
 sample-logs: $(VENV)/.runtime
 	$(BIN)/python sample_logs/make.py

@@ -109,8 +109,8 @@ MAY_IMPORT = {
     ),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
-        "cli ingest/containers ingest/profile ingest/propose ingest/task train/dqn train/twin/env"
-        " train/twin/floors"
+        "cli ingest/containers ingest/profile ingest/propose ingest/task replay/panel replay/trace"
+        " train/dqn train/run train/twin/env train/twin/floors"
     ),
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose ingest/store"

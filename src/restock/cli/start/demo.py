@@ -12,23 +12,27 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from restock.cli.start import stages
+from restock.cli.start import stages, story
 from restock.cli.start.stage import Stage
 from restock.cli.start.stages import Settings
 from restock.errors import ExitCode, RestockError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 MARKER = ".restock-demo"
 
 
 @dataclass
 class DemoCommand:
-    """Run every stage on sample_logs/, explain each, and end with a report.
+    """Run every stage on sample_logs/, explain each, and end with what came of it and a report.
 
     Takes recordings through info, ingest, sql, audit, mix, train, eval and report: at most five
     minutes on two cores. Every stage shows its command, so that you can run it on
-    your own recordings.
+    your own recordings. At the end stand the policy before and after fine-tuning, the shelves
+    before and after mixing, and one rare event from its message to an update.
 
     Example: `restock demo --out build/demo`
     """
@@ -62,22 +66,23 @@ class DemoCommand:
             record = ["record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
             why = "This installation has no sample recordings: a simulated robot drives some."
             plan.append(Stage("record", "Record", why, record))
-        plan += plan_of(
-            Settings(
-                logs=(str(logs),),
-                out=self.out,
-                profile=self.profile,
-                seconds=self.seconds,
-                episodes=self.episodes,
-                device=self.device,
-                train=("practice.rule=success",),
-            )
+        to = Settings(
+            logs=(str(logs),),
+            out=self.out,
+            profile=self.profile,
+            seconds=self.seconds,
+            episodes=self.episodes,
+            device=self.device,
+            train=("practice.rule=success",),
         )
+        plan += plan_of(to)
         if self.dry_run:
             sys.stdout.writelines(f"{stage.line()}\n" for stage in plan)
             return None
         prepare(self.out)
         console = stdout()
+        if not self.json:
+            console.print(f"[bold]What you are about to see[/bold]\n\n{story.OPENING}")
         code = run_demo(plan, main, say=console.print)
         if code:
             return code
@@ -86,8 +91,32 @@ class DemoCommand:
             parts = {name: str(self.out / name) for name in ("store", "panel", "run")}
             print_json({"report": str(report), **parts})
         else:
-            console.print(f"The report: [bold]{report}[/bold] (open it in a browser)")
+            tell(to, console)
+            console.print(f"\nThe report: [bold]{report}[/bold] (open it in a browser)")
         return None
+
+
+def tell(to: Settings, console: Console) -> None:
+    """What came of it, from what the stages wrote."""
+    from restock.cli.output import print_table
+
+    def show(title: str, lines: list[str]) -> None:
+        if lines:
+            console.print(f"\n[bold]{title}[/bold]")
+            for line in lines:
+                console.print(line, markup=False, soft_wrap=True)
+        sys.stdout.flush()
+
+    if rows := story.before_and_after(to):
+        console.print("\n[bold]Before and after fine-tuning[/bold]")
+        console.print(
+            "[dim]Missions that reached their goal without a contact; in brackets, in percent,"
+            " what\nother missions of the kind might give (95 %).[/dim]"
+        )
+        print_table(rows)
+    show("The shelves, before and after mixing", story.shelves(to.panel))
+    show("One rare event, from its message to an update", story.rare_event(to))
+    show("What to try next", story.next_steps(to))
 
 
 def plan_of(to: Settings) -> list[Stage]:
@@ -98,7 +127,9 @@ def plan_of(to: Settings) -> list[Stage]:
         stages.coverage(to),
         stages.audit(to),
         stages.mix(to),
+        stages.train_on_logs(to),
         stages.train(to),
+        stages.evaluate_logs_alone(to),
         stages.evaluate(to),
         stages.report(to),
     ]
@@ -130,7 +161,9 @@ def find_logs() -> Path | None:
     """`sample_logs/` of the source tree that this code runs from, if it runs from one."""
     here = Path(__file__).resolve()
     logs = here.parents[4] / "sample_logs"
-    return logs if logs.is_dir() and any(logs.iterdir()) else None
+    if not logs.is_dir() or not any(logs.iterdir()):
+        return None
+    return logs.relative_to(Path.cwd()) if logs.is_relative_to(Path.cwd()) else logs
 
 
 def prepare(out: Path) -> None:

@@ -13,6 +13,8 @@ COVERAGE = (
     " FROM coverage_by_condition"
 )
 
+UPDATES = 2000  # of a policy from the logs alone: as many as one has that goes on in the twin
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -43,6 +45,11 @@ class Settings:
     @property
     def run(self) -> Path:
         return self.out / "run"
+
+    @property
+    def logs_alone(self) -> Path:
+        """The run that never drives: what fine-tuning is compared with."""
+        return self.out / "logs-alone"
 
     @property
     def fitted(self) -> Path:
@@ -256,6 +263,34 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
         outcome=outcomes.train,
         shows_progress=True,
         resume=("train", "--resume", str(to.run)),
+    )
+
+
+def train_on_logs(to: Settings) -> Stage:
+    """The policy before fine-tuning: of the same panel, and never in the twin."""
+    settings = ("env.twin=false", "teacher.source=none", f"schedule.offline_updates={UPDATES}")
+    return Stage(
+        "logs-alone",
+        "Before fine-tuning: a policy from the logs alone",
+        f"{UPDATES:,} updates on the panel; nothing is driven.",
+        [
+            *("train", "--panel", str(to.panel), "--out", str(to.logs_alone)),
+            *("--device", to.device),
+            *(word for setting in settings for word in ("--set", setting)),
+        ],
+        writes=(to.logs_alone,),
+    )
+
+
+def evaluate_logs_alone(to: Settings) -> Stage:
+    return Stage(
+        "eval-logs-alone",
+        "Evaluate the policy from the logs alone",
+        "On the missions that the fine-tuned one drives next.",
+        [
+            *("eval", str(to.logs_alone), "--episodes", str(to.episodes)),
+            *("--policies", "agent", "--perturbations", "none"),
+        ],
     )
 
 

@@ -1,0 +1,216 @@
+"""What the demo tells around its stages: what one is about to see, and what came of it.
+
+All of it is read from what the stages wrote: the panel, the runs' tables, the store's rows and the
+recording's messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from restock.cli.start.stages import Settings
+from restock.stats import wilson
+
+if TYPE_CHECKING:
+    from restock.replay.panel.panel import Panel
+    from restock.replay.trace.trace import Trace
+
+OPENING = """\
+Recordings of a robot in a warehouse become a policy. Most of such driving is
+an easy aisle; wet floor, blocked aisles and people who step out are rare, and
+a learner hardly sees them.
+
+  1. Recordings become rows, each labelled with what happened at that moment.
+  2. Rare rows get shelves of their own; every batch is filled from all shelves.
+  3. A network learns from the logs alone: the policy before fine-tuning.
+  4. Another goes on in a simulation of the robot, the twin: the one after.
+  5. Both drive the same missions as the scripted planner of the robot.
+
+At the end: before and after, the shelves before and after, one rare event
+followed from the recording's message to the update that learnt from it, and
+what to try with your own recordings."""
+
+_CELLS = 30  # of a bar of 100 %
+RARE = "all rare ones"
+
+
+def before_and_after(to: Settings) -> list[dict[str, str]]:
+    """Per kind of mission, how many succeeded before and after fine-tuning, and the planner's.
+
+    On the floor as it was trained on. Empty where the task has no goal: nothing succeeds or fails.
+    """
+    from restock.train.run.kept_evaluations import read_evaluations
+
+    before, after = read_evaluations(to.logs_alone), read_evaluations(to.run)
+    driven = {
+        name: [
+            row
+            for row in table.to_pylist()
+            if row["policy"] == policy and row["perturbation"] == "none"
+        ]
+        for name, table, policy in (
+            ("logs alone", before, "agent"),
+            ("fine-tuned", after, "agent"),
+            ("planner", after, "planner"),
+        )
+    }
+    if any(row["success"] is None for rows in driven.values() for row in rows):
+        return []
+    kinds = sorted(
+        {row["condition"] for rows in driven.values() for row in rows},
+        key=lambda kind: (kind != "nominal", kind),
+    )
+    return [
+        {"mission": kind} | {name: _arrived(rows, kind) for name, rows in driven.items()}
+        for kind in [*kinds, RARE]
+    ]
+
+
+def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
+    """Of the missions of a kind, those that arrived without a contact, with a 95 % interval."""
+    of = [
+        bool(row["success"])
+        for row in rows
+        if row["condition"] == kind or (kind == RARE and row["condition"] != "nominal")
+    ]
+    if not of:
+        return ""
+    low, high = wilson(sum(of), len(of))
+    return f"{sum(of)} of {len(of)} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def shelves(panel: Path) -> list[str]:
+    """A line a shelf: its share of the logs, its share of what is drawn, and both as a bar."""
+    from restock.replay.panel.panel import Panel
+
+    strata = Panel.open(panel).strata
+    width = max(len(stratum.name) for stratum in strata)
+    lines = [f"{'shelf':<{width}}    rows  in the logs  in a batch"]
+    for stratum in strata:
+        natural, drawn = (round(_CELLS * s) for s in (stratum.natural_share, stratum.share))
+        bar = "█" * min(natural, drawn) + "▒" * (drawn - natural) + "·" * (natural - drawn)
+        lines.append(
+            f"{stratum.name:<{width}}  {stratum.rows:>6,}  {stratum.natural_share:>11.1%}"
+            f"  {stratum.share:>10.1%}  {bar}".rstrip()
+        )
+    return [*lines, "█ as before   ▒ added by its quota   · left out for it"]
+
+
+def rare_event(to: Settings) -> list[str]:
+    """One logged row of a rare condition, from its message to an update; none where none is."""
+    row = _chosen(to.run)
+    if row is None:
+        return []
+    from restock.errors import RestockError
+    from restock.replay.trace.trace import TracePlaces, trace_row
+
+    name = f"{row['gradient_step']}/{row['batch_row']}"
+    trace = trace_row(to.run, name)
+    recording = trace.origin.transition["source_file"] if trace.origin is not None else ""
+    command = f"restock trace {to.run} {name}"
+    if recording and Path(recording).exists():
+        command += f" --recording {recording}"
+        with suppress(RestockError):  # one that changed since is no reason to end the demo
+            trace = trace_row(to.run, name, TracePlaces(recording=Path(recording)))
+    return [*_told(trace, to), f"All of it: {command}"]
+
+
+def _chosen(run: Path) -> dict[str, Any] | None:
+    """The audited logged row of the rarest condition with the largest TD error."""
+    from restock.train.run.run import Run
+
+    rows = [
+        row
+        for row in Run.open(run).table("audit").to_pylist()
+        if row["source"] == "logs" and row["condition"] not in (None, "nominal", "unlabelled")
+    ]
+    if not rows:
+        return None
+    often: dict[str, int] = {}
+    for row in rows:
+        often[row["condition"]] = often.get(row["condition"], 0) + 1
+    rarest = min(often, key=lambda condition: (often[condition], condition))
+    return max(
+        (row for row in rows if row["condition"] == rarest),
+        key=lambda row: (abs(row["td"]), row["gradient_step"]),
+    )
+
+
+def _told(trace: Trace, to: Settings) -> list[str]:
+    """The chain, a line or two a link."""
+    from restock.replay.panel.panel import Panel
+
+    assert trace.audit is not None
+    audit, origin, lines = trace.audit, trace.origin, []
+    if origin is not None:
+        moment = origin.moment["log_time"].replace("T", " ").split("+")[0]
+        lines.append(f"recording  {origin.transition['source_file']}, {moment} UTC")
+        for message in origin.messages:
+            if said := _message(message.input, message.fields):
+                lines.append(f"message    {message.topic}, {message.age_s:.2f} s before: {said}")
+    panel = Panel.open(to.panel)
+    stratum = next(stratum for stratum in panel.strata if stratum.name == audit["stratum"])
+    ended = ", and its episode ends here" if audit["discount"] == 0 else ""
+    drawn, even = _draws(to.run, panel, audit["episode"])
+    target = audit["q"] - audit["td"]
+    return [
+        *lines,
+        f"row        {audit['transition_id']}, driven by the {audit['behaviour_policy']}",
+        f"           labelled {audit['condition']}; reward {audit['reward']:.2f}{ended}",
+        f"shelf      {stratum.name}: {stratum.natural_share:.1%} of the logs,"
+        f" {stratum.share:.1%} of what is drawn of them",
+        f"           its episode's rows were drawn {drawn:,} times; all rows alike: {even:,.0f}",
+        f"update     {audit['gradient_step']:,}, row {audit['batch_row']} of its batch",
+        f"           the critic expected {audit['q']:.2f}, its target said {target:.2f}",
+    ]
+
+
+def _draws(run: Path, panel: Panel, episode: str) -> tuple[int, float]:
+    """How often an episode's rows were drawn, and how often if all rows had been drawn alike."""
+    from restock.train.run.run import Run
+
+    logged = [
+        row
+        for row in Run.open(run).table("sampled_episodes").to_pylist()
+        if row["source"] == "logs"
+    ]
+    drawn = sum(row["drawn_rows"] for row in logged if row["episode"] == episode)
+    share = float((panel.meta_column("episode_id") == episode).mean())
+    return drawn, share * sum(row["drawn_rows"] for row in logged)
+
+
+def _message(name: str, fields: dict[str, Any]) -> str:
+    """What a message says in a few words; "" of those that would say little here."""
+    if name == "scan":
+        ranges = [r for r in fields.get("ranges", ()) if r is not None and math.isfinite(r)]
+        return f"the nearest return is {min(ranges):.2f} m away" if ranges else "no return"
+    if name == "command":
+        return (
+            f"asked for {fields.get('linear.x', 0.0):.2f} m/s and"
+            f" {fields.get('angular.z', 0.0):.2f} rad/s"
+        )
+    return ""
+
+
+def next_steps(to: Settings) -> list[str]:
+    """What to try on one's own logs: a command and what it does, a line each."""
+    run, store = to.run, to.store
+    return [
+        "restock start BAG --out mine",
+        "    the same stages on your own bag or MCAP file; it proposes how topics become signals",
+        f'restock sql {store} "FROM coverage_by_condition"',
+        "    your questions, in SQL: docs/sql.md says what there is to ask",
+        f"restock gaps {store} --mixture coverage",
+        "    what the logs lack, and which missions would fill it",
+        f"restock diagnose {run}",
+        "    where a critic fails: by what it was fed, or by its target?",
+        "docs/tutorial.md, docs/your-robot.md",
+        "    what replay and target do, cell by cell; your robot, from bags to a policy",
+    ]
+
+
+__all__ = ["OPENING", "RARE", "before_and_after", "next_steps", "rare_event", "shelves"]

@@ -1,0 +1,102 @@
+"""What the demo tells at its end, of a store, a panel and runs as its stages leave them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.paths import ROOT
+
+from restock import cli
+from restock.cli.start import story
+from restock.cli.start.stages import Settings
+from restock.replay.panel.panel import Panel
+from restock.train.run.kept_evaluations import FILE
+from restock.train.run.run_tables import EVAL_EPISODES
+
+LOGS = ROOT / "sample_logs" / "amr_tuesday"
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Settings:
+    to = Settings((str(LOGS),), tmp_path_factory.mktemp("demo"))
+    for command in (
+        ["ingest", str(LOGS), "--store", str(to.store)],
+        ["mix", str(to.store), "--mixture", "steps", "--out", str(to.panel)],
+        ["train", "--panel", str(to.panel), "--out", str(to.run)]
+        + [f"--set={setting}" for setting in ("env.twin=false", "teacher.source=none")]
+        + ["--set=schedule.offline_updates=6", "--set=record.audit_share=1"],
+    ):
+        assert cli.main(command) in (0, 3), command
+    return to
+
+
+def test_a_shelf_is_told_by_its_share_before_and_after(told: Settings) -> None:
+    head, *lines, legend = story.shelves(told.panel)
+    strata = {stratum.name: stratum for stratum in Panel.open(told.panel).strata}
+    assert [line.split()[0] for line in lines] == list(strata)
+    for line in lines:
+        name, rows, natural, drawn, *bar = line.split()
+        stratum = strata[name]
+        assert rows == f"{stratum.rows:,}"
+        assert (natural, drawn) == (f"{stratum.natural_share:.1%}", f"{stratum.share:.1%}")
+        added = "".join(bar).count("▒") - "".join(bar).count("·")
+        assert abs(added - 30 * (stratum.share - stratum.natural_share)) <= 1
+    assert max(map(len, [head, *lines, legend])) <= 80
+
+
+def test_a_rare_event_is_followed_from_its_message_to_an_update(told: Settings) -> None:
+    lines = story.rare_event(told)
+    links = [line.split()[0] for line in lines if not line.startswith(" ")]
+    assert links == ["recording", *["message"] * 2, "row", "shelf", "update", "All"]
+    assert str(LOGS) in lines[0]
+    assert any("/scan" in line and "m away" in line for line in lines)
+    assert "nominal" not in "".join(lines)
+    command = lines[-1].removeprefix("All of it: restock ").split()
+    assert cli.main([*command, "--json"]) == 0
+
+
+def driven(policy: str, condition: str, success: bool | None, seed: int) -> dict[str, Any]:
+    known = {
+        "policy": policy,
+        "perturbation": "none",
+        "condition": condition,
+        "success": success,
+        "episode_seed": seed,
+    }
+    return {name: known.get(name) for name in EVAL_EPISODES.names}
+
+
+def write(run: Path, rows: list[dict[str, Any]]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    (run / FILE).parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist(rows, schema=EVAL_EPISODES), run / FILE)
+
+
+def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
+    to = Settings(("logs",), tmp_path)
+    write(to.logs_alone, [driven("agent", "wheel_slip", n < 1, n) for n in range(4)])
+    after = [driven("agent", "wheel_slip", n < 3, n) for n in range(4)]
+    easy = [driven("planner", "nominal", True, n) for n in range(2)]
+    write(to.run, [*after, *easy, *(driven("planner", "wheel_slip", n < 2, n) for n in range(4))])
+    easy_row, slip, rare = story.before_and_after(to)
+    assert (easy_row["mission"], slip["mission"], rare["mission"]) == (
+        "nominal",
+        "wheel_slip",
+        story.RARE,
+    )
+    assert slip["logs alone"].startswith("1 of 4 [")
+    assert slip["fine-tuned"].startswith("3 of 4 [")
+    assert slip["planner"] == rare["planner"]
+    assert easy_row["planner"].startswith("2 of 2 [")
+    assert easy_row["logs alone"] == ""
+
+
+def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:
+    to = Settings(("logs",), tmp_path)
+    write(to.logs_alone, [driven("agent", "nominal", None, 0)])
+    write(to.run, [driven("agent", "nominal", None, 0), driven("planner", "nominal", None, 0)])
+    assert story.before_and_after(to) == []

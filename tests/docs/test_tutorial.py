@@ -1,0 +1,72 @@
+"""The tutorial: one source for page and notebook, executed as it is, with nothing cut short."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from support.notebook import cells_of, executed, filled, notebook_of, pictures_of, text_of
+from support.paths import ROOT
+
+PAGE = ROOT / "docs/tutorial.md"
+REMEDY = "`make notebook` writes both again"
+
+
+def test_page_and_notebook_have_the_same_cells_and_outputs() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    notebook = nbformat.read(PAGE.with_suffix(".ipynb"), as_version=4)
+    nbformat.validate(notebook)
+    assert [(c.cell_type, c.source) for c in notebook.cells] == cells_of(page), REMEDY
+    assert filled(page, notebook, "tutorial") == page, REMEDY
+    for name, picture in pictures_of(page, notebook).items():
+        assert (PAGE.with_suffix("") / name).read_bytes() == picture, REMEDY
+
+
+def test_a_page_becomes_cells_and_takes_their_outputs() -> None:
+    page = """# A page
+
+```python
+print("one")
+```
+
+<!-- output -->
+
+```text
+old
+```
+
+<!-- end of output -->
+
+<!-- exit codes: 1 -->
+```sh
+false
+```
+
+The end.
+"""
+    assert cells_of(page) == [
+        ("markdown", "# A page"),
+        ("code", 'print("one")'),
+        ("code", "%%bash --no-raise-error\nfalse"),
+        ("markdown", "The end."),
+    ]
+    notebook = notebook_of(page)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    code[0].outputs = [nbformat.v4.new_output("stream", text="one\n")]
+    assert filled(page, notebook, "pictures") == page.replace("old", "one")
+
+
+@pytest.mark.docs
+def test_the_tutorial_runs_and_its_verdicts_stand(tmp_path: Path) -> None:
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
+    notebook = executed(notebook_of(PAGE.read_text(encoding="utf-8")), docs)
+    said = {cell.source: text_of(cell) for cell in notebook.cells if cell.cell_type == "code"}
+    assert "REFUSED" in said["%%bash --no-raise-error\nrestock compare ours dueling"]
+    (fair,) = [text for source, text in said.items() if "fair = compare" in source]
+    assert fair == "comparable\n"
+    (frozen,) = [text for source, text in said.items() if "diagnose frozen" in source]
+    assert "\nTARGET\n" in frozen
+    assert "\nBUFFER\n" in said["%%bash\nrestock diagnose dry --no-rows"]
