@@ -32,6 +32,8 @@ _PIECE = re.compile(
     re.DOTALL,
 )
 
+_STYLE = re.compile("\x1b\\[[0-9;]*m")
+
 
 def cells_of(page: str) -> list[tuple[str, str]]:
     """The cells of a page in order, each ("markdown" | "code", its source)."""
@@ -70,6 +72,10 @@ def executed(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.Notebook
     )
     client.execute(cwd=str(folder), env={**os.environ, "PATH": path, "COLUMNS": "100"})
     notebook.metadata.pop("language_info", None)  # the version of Python says nothing here
+    for cell in notebook.cells:
+        for output in cell.get("outputs", ()):
+            if output.output_type == "stream":
+                output.text = _STYLE.sub("", output.text)  # a page has no colours of a terminal
     return notebook
 
 
