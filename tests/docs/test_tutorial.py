@@ -58,6 +58,7 @@ The end.
 
 
 @pytest.mark.docs
+@pytest.mark.timeout(900)
 def test_the_tutorial_runs_and_its_verdicts_stand(tmp_path: Path) -> None:
     docs = tmp_path / "docs"
     docs.mkdir()
