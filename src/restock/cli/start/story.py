@@ -123,9 +123,10 @@ def _chosen(run: Path) -> dict[str, Any] | None:
     """The audited logged row of the rarest condition with the largest TD error."""
     from restock.train.run.run import Run
 
+    audit: list[dict[str, Any]] = Run.open(run).table("audit").to_pylist()
     rows = [
         row
-        for row in Run.open(run).table("audit").to_pylist()
+        for row in audit
         if row["source"] == "logs" and row["condition"] not in (None, "nominal", "unlabelled")
     ]
     if not rows:
