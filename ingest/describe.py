@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,13 @@ from restock.ingest.containers.topic_reading import LATEST_NS
 from restock.ingest.steps.clocks import STAMP, topic_clock
 
 NANOSECONDS = 1_000_000_000
+# rmw's numbers, which rosbag2 wrote before it wrote names
+_QOS = {
+    "reliability": ("system_default", "reliable", "best_effort"),
+    "durability": ("system_default", "transient_local", "volatile"),
+    "history": ("system_default", "keep_last", "keep_all"),
+}
+MOST_PROFILES = 20  # of a topic: publishers that offer others
 JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles
 
 
@@ -45,6 +53,7 @@ def describe_recording(
             "start_ns": span[0] if span else None,
             "end_ns": span[1] if span else None,
             "start": _date(span[0]) if span else None,
+            "end": _date(span[1]) if span else None,
             "duration_s": duration_s,
             "messages": recording.messages,
             "topics": {
@@ -55,10 +64,12 @@ def describe_recording(
                     "encoding": topic.encoding,
                     "definition": topic.definition,
                     "skipped": topic.skipped,
+                    "qos": offered(recording.qos(topic.name)),
                     **({"clock": compared.get(topic.name)} if clocks else {}),
                 }
                 for topic in recording.topics.values()
             },
+            "chunks": [packed._asdict() for packed in recording.packed],
             "attachments": [
                 {"name": extra.name, "media_type": extra.media_type, "size_bytes": extra.size_bytes}
                 for extra in recording.extras
@@ -72,6 +83,25 @@ def describe_recording(
             "notes": notes,
             "damage": [item.what for item in recording.damage],
         }
+
+
+def offered(text: str) -> list[dict[str, Any]]:
+    """The quality of service that publishers offered, each once: reliability, durability, history
+    and depth, as far as the file's text says them. It is not read as YAML: that is slow, and it may
+    be damaged."""
+    found: list[dict[str, Any]] = []
+    for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MOST_PROFILES + 1]:
+        said = dict(re.findall(r"^\s*(\w+):\s*(\w+)\s*$", block, re.MULTILINE))
+        one: dict[str, Any] = {}
+        for key, names in _QOS.items():
+            if (value := said.get(key)) is not None:
+                known = value.isascii() and value.isdigit() and int(value) < len(names)
+                one[key] = names[int(value)] if known else value
+        if (depth := said.get("depth", "")).isascii() and depth.isdigit():
+            one["depth"] = int(depth)
+        if one and one not in found:
+            found.append(one)
+    return found
 
 
 def _clocks(recording: Recording) -> dict[str, dict[str, Any]]:

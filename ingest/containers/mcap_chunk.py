@@ -289,6 +289,7 @@ class ChannelRecord(NamedTuple):
     topic: str
     encoding: str
     schema_id: int  # 0: none
+    qos: str = ""
 
 
 @dataclass
@@ -308,7 +309,10 @@ class Definitions:
         elif opcode == Op.CHANNEL:
             record = parse(Op.CHANNEL, buffer, at, stop)
             self.channels[record["id"]] = ChannelRecord(
-                record["topic"], record["message_encoding"], record["schema_id"]
+                record["topic"],
+                record["message_encoding"],
+                record["schema_id"],
+                dict(record["metadata"]).get("offered_qos_profiles", ""),
             )
 
     def add_chunk(self, records: bytes) -> None:
@@ -336,6 +340,7 @@ class Definitions:
                 channel.encoding,
                 schema.encoding,
                 schema.data,
+                channel.qos,
             )
             for number, channel in self.channels.items()
         }

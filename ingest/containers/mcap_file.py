@@ -19,6 +19,7 @@ from restock.ingest.containers.storage import (
     NOT_KEPT,
     Integrity,
     Metadata,
+    Packed,
     custom_data,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
@@ -53,6 +54,7 @@ class McapFile:
         self.counts = self._count()
         self.channels = self._channels()
         self.span_ns = self._span()
+        self.packed = self._packed()
 
     def _refuse_cut(self, salvage: bool) -> None:
         cut = self._contents.cut
@@ -127,6 +129,15 @@ class McapFile:
             return None
         low, high = min(low for low, _ in spans), max(high for _, high in spans)
         return min(low, LATEST_NS), min(high, LATEST_NS)
+
+    def _packed(self) -> list[Packed]:
+        by: dict[str, list[Chunk]] = {}
+        for chunk in self._contents.chunks:
+            by.setdefault(chunk.compression, []).append(chunk)
+        return [
+            Packed(name, len(some), sum(c.stop - c.start for c in some), sum(c.size for c in some))
+            for name, some in by.items()
+        ]
 
     # -- integrity -------------------------------------------------------------------------
 

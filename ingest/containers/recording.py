@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Storage
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed, Storage
 from restock.ingest.containers.topic_reading import (
     Account,
     LostMessages,
@@ -149,6 +149,20 @@ class Recording:
     def size_bytes(self) -> int:
         """Of all its files."""
         return sum(file.stat().st_size for file in self.files)
+
+    @property
+    def packed(self) -> list[Packed]:
+        """The chunks of all its files, by how they are compressed; none where files have none."""
+        found: dict[str, Packed] = {}
+        for one in (one for storage in self._storages for one in storage.packed):
+            had = found.get(one.compression, Packed(one.compression, 0, 0, 0))
+            sums = (a + b for a, b in zip(had[1:], one[1:], strict=True))
+            found[one.compression] = Packed(one.compression, *sums)
+        return list(found.values())
+
+    def qos(self, topic: str) -> str:
+        """The quality of service that a topic's publishers offered, as its file has it: YAML."""
+        return next((one.channel.qos for one in self._streams[topic] if one.channel.qos), "")
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
 
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 # A chunk's size is the file's claim: what decompresses to more than both is refused.
@@ -42,6 +42,7 @@ class Ros1File:
         self.notes: list[str] = []
         self.extras: list[Extra] = []
         self.metadata: list[Metadata] = []  # the format has no place for it
+        self.packed: list[Packed] = []
         self._reader = _Bag(path)
         try:
             self._reader.open()
@@ -62,6 +63,7 @@ class Ros1File:
             )
             for connection in self._reader.connections
         }
+        self.packed = self._reader.packed()
         self._counts = self._by_index()  # messages of each channel in each chunk
         self.counts = dict.fromkeys(self.channels, 0)
         for counts in self._counts.values():
@@ -196,6 +198,21 @@ class _Bag(Reader):
         self._entries += self.bio.tell() - start
         if self._entries > self._size:
             raise ReaderError("its index is larger than the bag")
+
+    def packed(self) -> list[Packed]:
+        """Its chunks, by how they are compressed."""
+        by: dict[str, list[int]] = {}
+        for position, (compression, _) in self._chunks.items():
+            by.setdefault("" if compression == "none" else compression, []).append(position)
+        return [
+            Packed(
+                name,
+                len(some),
+                sum(self.chunks[one].datasize for one in some if one in self.chunks),
+                sum(self._chunks[one][1] for one in some),
+            )
+            for name, some in by.items()
+        ]
 
     def inflated(self, position: int) -> bytes:
         """A chunk's records."""

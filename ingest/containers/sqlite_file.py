@@ -28,6 +28,7 @@ from restock.ingest.containers.storage import (
     Extra,
     Integrity,
     Metadata,
+    Packed,
     custom_data,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
@@ -38,6 +39,7 @@ BYTES_PER_BATCH = 8 << 20
 LARGE_ROW = 1 << 20  # bytes: larger ones are not fetched some at a time
 LARGEST_MESSAGE = 256 << 20
 LARGEST_METADATA = 2 << 20  # characters
+LONGEST_QOS = 8192  # characters of a topic's offered profiles
 MOST_FOUND = 10  # by the check: one is enough to refuse the file
 STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
 FEWEST_STEPS = 10_000_000
@@ -90,6 +92,7 @@ class SqliteFile:
         self.notes: list[str] = []
         self.extras: list[Extra] = []
         self.metadata: list[Metadata] = []
+        self.packed: list[Packed] = []
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._refuse_short()
         self._connection = self._connect()
@@ -170,8 +173,10 @@ class SqliteFile:
         names = {row[1] for row in self._connection.execute("PRAGMA table_info(topics)")}
         # Before rosbag2 0.0.5 there was no such column: all was CDR.
         encoding = "serialization_format" if "serialization_format" in names else "'cdr'"
+        qos = f"substr(offered_qos_profiles, 1, {LONGEST_QOS})"
+        qos = qos if "offered_qos_profiles" in names else "''"
         rows = self._connection.execute(
-            f"SELECT id, name, type, {encoding} FROM topics WHERE typeof(id) = 'integer'"
+            f"SELECT id, name, type, {encoding}, {qos} FROM topics WHERE typeof(id) = 'integer'"
         )
         return {
             number: Channel(
@@ -180,8 +185,9 @@ class SqliteFile:
                 str(kind),
                 str(encoding),
                 *definitions.get(str(kind), ("", b"")),
+                qos=str(offered or ""),
             )
-            for number, name, kind, encoding in rows
+            for number, name, kind, encoding, offered in rows
         }
 
     def _count(self) -> tuple[dict[int, int], tuple[int, int] | None]:

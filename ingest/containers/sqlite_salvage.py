@@ -20,7 +20,7 @@ import numpy as np
 
 from restock.arrays import Bools, Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata
+from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 BYTES_PER_BATCH = 8 << 20
@@ -48,6 +48,7 @@ class SalvagedSqliteFile:
         self.integrity: Integrity = "damaged"
         self.damage = [Damage(what)]
         self.notes, self.extras = list[str](), list[Extra]()
+        self.packed: list[Packed] = []
         self.metadata = list[Metadata]()  # what of it is in the file is not looked for
         self._pages = Pages(Path(copy.name) / path.name if copy else path)
         self._taken = np.zeros(self._pages.count + 2, np.bool_)

@@ -57,6 +57,15 @@ class Extra:
             object.__setattr__(self, name, visible(getattr(self, name)))
 
 
+class Packed(NamedTuple):
+    """Chunks of a file that are compressed alike."""
+
+    compression: str  # "" for none
+    chunks: int
+    stored_bytes: int
+    plain_bytes: int  # as the chunks say
+
+
 class Metadata(NamedTuple):
     """What a recorder, or who came after it, says of a whole recording: text by name."""
 
@@ -117,7 +126,8 @@ class Storage(Protocol):
     `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
     last log time, or None when it holds no message. `damage` is final once everything wanted
     has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read;
-    `metadata` is what of them says something of the whole recording.
+    `metadata` is what of them says something of the whole recording. `packed` is empty where a file
+    has no chunks.
     """
 
     channels: dict[int, Channel]
@@ -127,6 +137,7 @@ class Storage(Protocol):
     notes: list[str]
     extras: list[Extra]
     metadata: list[Metadata]
+    packed: list[Packed]
 
     @property
     def integrity(self) -> Integrity:

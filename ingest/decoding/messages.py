@@ -28,6 +28,7 @@ class Channel:
     encoding: str  # of the messages: "cdr", "json", "protobuf", "ros1", …
     definition_format: str = ""  # "ros2msg", "ros2idl", "ros1msg", "jsonschema", "protobuf" or ""
     definition: bytes = b""
+    qos: str = ""  # the profiles that its publishers offered, as the file has them: YAML
 
     def __post_init__(self) -> None:
         for name in ("topic", "type", "encoding", "definition_format"):

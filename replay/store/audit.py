@@ -17,7 +17,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -128,8 +128,9 @@ def run_audits(
     thresholds: Thresholds,
     *,
     beside: Iterable[str] = (),
+    done: Callable[[str], None] = lambda name: None,
 ) -> list[Finding]:
-    """Run audits over a connection with a store's views, worst findings first.
+    """Run audits over a connection with a store's views, worst findings first; `done` is told each.
 
     `beside` names the schemas that are there: "run", "panel". Audits that need another, or a table
     that an older run does not have, are skipped.
@@ -143,12 +144,13 @@ def run_audits(
     available |= {
         f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
     }
-    findings = [
-        _run(connection, audit, thresholds.get(audit.name, {}))
-        if audit.needs is None or audit.needs in available
-        else Finding(audit, "skipped", 0, [], [], {})
-        for audit in audits
-    ]
+    findings = []
+    for audit in audits:
+        finding = Finding(audit, "skipped", 0, [], [], {})
+        if audit.needs is None or audit.needs in available:
+            finding = _run(connection, audit, thresholds.get(audit.name, {}))
+        findings.append(finding)
+        done(audit.name)
     order = ["fail", "warn", "info", "pass", "skipped"]
     return sorted(findings, key=lambda finding: (order.index(finding.status), finding.audit.name))
 

@@ -120,7 +120,9 @@ def test_many_rows_are_cut_on_a_terminal_and_whole_in_a_pipe(sample_rows, monkey
     assert lines[-1].count(",") == 29
     few = f"FROM ({query}) LIMIT 3"
     assert cli.main(["sql", str(store), few]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:5:2]] == ["0", "1"]
+    lines = capsys.readouterr().out.splitlines()  # too wide for a table: one below the other
+    assert [line for line in lines if line.startswith("row ")] == ["row 1", "row 2", "row 3"]
+    assert max(map(len, lines)) <= 120
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     assert cli.main(["sql", str(store), query]) == 0

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 from support.bag_samples import TOPICS, write_bag, write_mcap
-from support.paths import SHARED
+from support.paths import ROOT, SHARED
 
 from restock.cli import main
+from restock.ingest.describe import offered
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +97,74 @@ def test_topics_that_cannot_be_decoded_are_still_counted(
     assert metrics["messages"] == 142
     assert "gazebo_msgs/msg/PerformanceMetrics" in metrics["skipped"]
     assert "wrong_format" in printed.err
+
+
+def test_it_says_when_it_ends_and_how_an_mcap_file_is_packed(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mcap.reader import make_reader
+
+    assert main(["info", str(folder), "--json"]) == 0
+    bag, mcap = json.loads(capsys.readouterr().out)["recordings"]
+    assert [entry["end"] for entry in (bag, mcap)] == ["2023-11-14T22:13:20Z"] * 2
+    assert bag["chunks"] == []
+    with (folder / "one.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    indexes = summary.chunk_indexes
+    assert mcap["chunks"] == [
+        {
+            "compression": indexes[0].compression,
+            "chunks": len(indexes),
+            "stored_bytes": sum(one.compressed_size for one in indexes),
+            "plain_bytes": sum(one.uncompressed_size for one in indexes),
+        }
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "profiles"),
+    [
+        ("", []),
+        ("not yaml: [", []),
+        (
+            "- history: 1\n  depth: 10\n  reliability: 2\n  durability: 2\n  deadline:\n   sec: 9",
+            [
+                {
+                    "reliability": "best_effort",
+                    "durability": "volatile",
+                    "history": "keep_last",
+                    "depth": 10,
+                }
+            ],
+        ),
+        (
+            "- depth: 1\n  durability: transient_local\n  reliability: reliable\n"
+            "- depth: 1\n  durability: transient_local\n  reliability: reliable\n"
+            "- reliability: 7\n",
+            [
+                {"reliability": "reliable", "durability": "transient_local", "depth": 1},
+                {"reliability": "7"},
+            ],
+        ),
+    ],
+)
+def test_offered_qos_is_named_whatever_version_wrote_it(
+    text: str, profiles: list[dict[str, object]]
+) -> None:
+    assert offered(text) == profiles
+
+
+def test_sample_logs_say_what_their_publishers_offered(capsys: pytest.CaptureFixture[str]) -> None:
+    """As `ros2 bag info --verbose` and the MCAP channel's metadata have it."""
+    assert main(["info", str(ROOT / "sample_logs"), "--json"]) == 0
+    for entry in json.loads(capsys.readouterr().out)["recordings"]:
+        assert entry["topics"]["/map"]["qos"] == [
+            {
+                "reliability": "reliable",
+                "durability": "transient_local",
+                "history": "keep_last",
+                "depth": 1,
+            }
+        ]
+        assert entry["topics"]["/imu"]["qos"][0]["reliability"] == "best_effort"

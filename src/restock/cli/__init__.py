@@ -11,6 +11,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from restock.errors import ExitCode, RestockError
 from restock.imports import hidden, when_imported
@@ -44,6 +45,7 @@ VERBS = {
     "demo": "all of the above, on sample_logs/",
     "schema": "what a TOML file may say, as a JSON Schema for editors",
     "doctor": "what is installed here, what works, and is a store well?",
+    "completion": "a script that completes verbs and options in bash or zsh",
 }
 # folder -> the verbs whose modules it holds
 FOLDERS = {
@@ -116,13 +118,11 @@ def _dispatch(args: list[str]) -> int:
 
     import tyro
 
-    module = importlib.import_module(f"restock.cli.{_FOLDER_OF.get(verb, '')}{verb}")
-    command = getattr(module, f"{verb.capitalize()}Command")
     from restock.cli.command_line import prepared
 
     try:
         parsed = tyro.cli(
-            prepared(command),
+            prepared(command_of(verb)),
             prog=f"restock {verb}",
             args=_without_ros(args[1:]) if verb == "node" else args[1:],
             use_underscores=False,
@@ -132,6 +132,13 @@ def _dispatch(args: list[str]) -> int:
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     code: int | None = parsed.run()
     return int(code or ExitCode.OK)
+
+
+def command_of(verb: str) -> type[Any]:
+    """The dataclass that is a verb's command line."""
+    module = importlib.import_module(f"restock.cli.{_FOLDER_OF.get(verb, '')}{verb}")
+    command: type[Any] = getattr(module, f"{verb.capitalize()}Command")
+    return command
 
 
 def _settle_pandas() -> None:
@@ -150,4 +157,6 @@ def _without_ros(args: list[str]) -> list[str]:
 
 
 def _complain(message: str) -> None:
-    sys.stderr.write(f"restock: {message}\n")
+    red = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    name = "\x1b[1;31mrestock:\x1b[0m" if red else "restock:"
+    sys.stderr.write(f"{name} {message}\n")

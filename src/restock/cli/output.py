@@ -18,11 +18,33 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 
 
+PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
+# A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
+_STYLES = {
+    **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),
+    **dict.fromkeys(("not allowed", "different"), "bold red"),
+    **dict.fromkeys(("warn", "missing", "inconclusive", "undetermined", "unknown"), "yellow"),
+    **dict.fromkeys(
+        ("pass", "ok", "trusted", "agrees", "better", "comparable", "HEALTHY"), "green"
+    ),
+    "skipped": "dim",
+}
+
+
 def stdout() -> Console:
-    """The console for data. As wide as it needs to be when it is not a terminal."""
+    """The console for data. Prose is not wrapped when it is not a terminal."""
     from rich.console import Console  # slow to import, and a count needs none
 
-    return Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 240)
+    if sys.stdout.isatty():
+        return Console(file=sys.stdout, highlight=False)
+    return Console(
+        file=sys.stdout, highlight=False, width=PIPE_WIDTH, soft_wrap=True, force_terminal=False
+    )
+
+
+def table_width() -> int:
+    """Columns of a table: the terminal's, or those of a file or a pipe."""
+    return stdout().width if sys.stdout.isatty() else PIPE_WIDTH
 
 
 def stderr() -> Console:
@@ -70,26 +92,60 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
-    """A table on stdout, its title on a line of its own; numbers to the right."""
+    """A table on stdout, its title on a line of its own; numbers to the right.
+
+    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. Words that say how something
+    is (fail, pass) are coloured on a terminal.
+    """
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    if not sys.stdout.isatty() and _fits(rows, names):
+        if title is not None:
+            sys.stdout.write(visible(title).rstrip() + "\n")
+        print_plain(rows, names)
+        return
     from rich import box
     from rich.table import Table
 
-    names = list(columns if columns is not None else rows[0] if rows else ())
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in names:
         numeric = any(_is_number(row[name]) for row in rows)
-        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        table.add_column(
+            name, justify="right" if numeric else "left", overflow="fold", no_wrap=numeric
+        )
     for row in rows:
-        table.add_row(*(cell(row[name]) for name in names))
+        table.add_row(*(_styled(cell(row[name])) for name in names))
     console = stdout()
     with console.capture() as captured:
         if title is not None:  # rich's own would be wrapped to the table's width
-            console.print(visible(title), style="table.title", markup=False, soft_wrap=True)
-        console.print(table)
+            console.print(
+                visible(title),
+                style=_STYLES.get(title.split(":")[0], "table.title"),
+                markup=False,
+                soft_wrap=True,
+            )
+        console.print(table, soft_wrap=False)
     # rich pads every line to the table's width; a pipe has no use for that.
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
     sys.stdout.write(text.strip("\n") + "\n")
+
+
+def _styled(text: str) -> str:
+    style = _STYLES.get(text)
+    return f"[{style}]{text}[/]" if style else text
+
+
+def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
+    """Whether every row is one line of PIPE_WIDTH; else a table is laid out by rich."""
+    if not rows or any("\n" in name for name in names):
+        return False
+    total = 1 - 3
+    for name in names:
+        texts = [cell(row[name]) for row in rows]
+        if any(not text.isascii() or "\n" in text or "\t" in text for text in texts):
+            return False
+        total += max(len(name), *map(len, texts)) + 3
+    return total <= PIPE_WIDTH
 
 
 def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:

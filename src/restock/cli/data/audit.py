@@ -93,8 +93,10 @@ class AuditCommand:
             findings = reward.findings
         else:
             place = open_place(self.store, beside=given, only_store=True, version=version)
-            with place as connection:
-                findings = run_audits(connection, audits, thresholds, beside=given)
+            with place as connection, output.progress("audits", len(audits)) as advance:
+                findings = run_audits(
+                    connection, audits, thresholds, beside=given, done=lambda name: advance(1, name)
+                )
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = [finding for finding in findings if finding.status in failing]
         if self.junit is not None:

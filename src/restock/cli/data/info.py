@@ -17,7 +17,7 @@ LONGEST = 60  # characters of an entry's value that are shown
 
 @dataclass
 class InfoCommand:
-    """What is in these recordings: format, duration, topics, types, counts and rates.
+    """What is in these recordings: format, times, compression, topics, types, counts, rates, QoS.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
     recordings, or a quoted glob. Nothing is decoded (but for --clocks) and nothing is written. A
@@ -77,6 +77,24 @@ class InfoCommand:
         return code
 
 
+def _packed(chunks: dict[str, Any]) -> str:
+    """How a file's messages are packed, in a line."""
+    stored, plain = chunks["stored_bytes"], chunks["plain_bytes"]
+    share = f", {stored / plain:.0%} of {plain / 1e6:.1f} MB" if chunks["compression"] else ""
+    kind = chunks["compression"] or "not compressed"
+    number = f"{chunks['chunks']:,} chunk{'s' if chunks['chunks'] != 1 else ''}"
+    return visible(f"{number}, {kind}: {stored / 1e6:.1f} MB{share if plain else ''}")
+
+
+def _qos(profile: dict[str, Any]) -> str:
+    """reliable, volatile, 10: how many messages are kept last, or keep_all."""
+    kept = profile.get("history")
+    if kept == "keep_last" and "depth" in profile:
+        kept = str(profile["depth"])
+    words = (profile.get("reliability"), profile.get("durability"), kept)
+    return ", ".join(word for word in words if word)
+
+
 def _print(entry: dict[str, Any]) -> None:
     from restock.cli import output
 
@@ -89,6 +107,7 @@ def _print(entry: dict[str, Any]) -> None:
             "messages": topic["messages"],
             "rate Hz": topic["rate_hz"],
             "encoding": topic["encoding"],
+            "offered QoS": "; ".join(map(_qos, topic["qos"])),
             "": f"skipped: {topic['skipped']}" if topic["skipped"] else "",
         }
         for name, topic in entry["topics"].items()
@@ -98,14 +117,19 @@ def _print(entry: dict[str, Any]) -> None:
         entry["format"],
         f"{entry['messages']:,} messages",
         f"{entry['duration_s']:.1f} s" if entry["duration_s"] is not None else "",
-        f"from {entry['start']}" if entry["start"] else "",
+        f"{entry['start']} to {entry['end']}" if entry["start"] else "",
         f"{entry['size_bytes'] / 1e6:.1f} MB",
     )
     sys.stdout.write("  ".join(part for part in about if part) + "\n")
     clock = output.CLOCK_COLUMNS if clocked else []
     mixed = {topic["encoding"] for topic in entry["topics"].values()} - {"cdr"}
     coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
-    output.print_table(rows, ["topic", "type", *coded, "messages", "rate Hz", *clock, ""])
+    qos = ["offered QoS"] if any(row["offered QoS"] for row in rows) else []
+    last = [""] if any(row[""] for row in rows) else []
+    shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos, *last]
+    for packed in entry["chunks"]:
+        sys.stdout.write(_packed(packed) + "\n")
+    output.print_table(rows, shown)
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),
         ("metadata records", entry["metadata"]),

@@ -98,7 +98,7 @@ class MixCommand:
         if self.json:
             output.print_json(document)
             return
-        wide = output.stdout().width >= _WIDE
+        wide = output.table_width() >= _WIDE
         output.print_table(
             _table(document["strata"], wide=wide),
             title=f"{self.mixture}: the logs' part of a batch",

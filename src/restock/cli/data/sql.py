@@ -161,4 +161,4 @@ def _too_wide(rows: list[dict[str, Any]], columns: list[str]) -> bool:
     widths = (
         max([len(name), *(len(output.cell(row[name])) for row in rows)]) + 3 for name in columns
     )
-    return sum(widths) > output.stdout().width
+    return sum(widths) > output.table_width()
