@@ -17,7 +17,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -164,12 +164,30 @@ def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
 
 def junit_xml(findings: Sequence[Finding], suite: str) -> str:
     """The findings as JUnit XML: failed audits fail, skipped ones are skipped."""
+    return _xml(_suite(findings, suite, {"fail"}))
+
+
+def junit_suites(suites: Mapping[str, Sequence[Finding]], failing: Collection[str]) -> str:
+    """Several suites of findings in one document; those whose status is in `failing` fail."""
+    root = ElementTree.Element("testsuites")
+    root.extend(_suite(findings, name, failing) for name, findings in suites.items())
+    return _xml(root)
+
+
+def _xml(root: ElementTree.Element) -> str:
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _suite(
+    findings: Sequence[Finding], suite: str, failing: Collection[str]
+) -> ElementTree.Element:
     suite = _printable(suite)
     root = ElementTree.Element(
         "testsuite",
         name=suite,
         tests=str(len(findings)),
-        failures=str(sum(finding.status == "fail" for finding in findings)),
+        failures=str(sum(finding.status in failing for finding in findings)),
         errors="0",
         skipped=str(sum(finding.status == "skipped" for finding in findings)),
     )
@@ -177,14 +195,13 @@ def junit_xml(findings: Sequence[Finding], suite: str) -> str:
         case = ElementTree.SubElement(root, "testcase", classname=suite, name=finding.audit.name)
         lines = [f"{finding.rows} rows. {finding.audit.advice}", *map(str, finding.sample)]
         text = _printable("\n".join(lines))
-        if finding.status == "fail":
+        if finding.status in failing:
             ElementTree.SubElement(case, "failure", message=finding.audit.doc).text = text
         elif finding.status == "skipped":
             ElementTree.SubElement(case, "skipped", message=f"needs a {finding.audit.needs}")
         elif finding.rows:
             ElementTree.SubElement(case, "system-out").text = text
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
+    return root
 
 
 def _printable(text: str) -> str:

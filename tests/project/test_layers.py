@@ -107,6 +107,7 @@ MAY_IMPORT = {
         "cli report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"
         " train/twin/physics"
     ),
+    "cli/pipeline": ("cli ingest/store replay replay/fleet replay/store train/evaluation"),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
         "cli ingest/containers ingest/profile ingest/propose ingest/task replay/panel replay/trace"

@@ -40,6 +40,7 @@ VERBS = {
     "trace": "trace a sampled row to its source, down to the messages",
     "diagnose": "buffer failure or target failure?",
     "report": "one HTML page with all of it",
+    "check": "a gate for pipelines: audits, what changed, is the last run worse? exit 1 if so",
     "node": "an exported policy on a robot: a ROS 2 node, in shadow or driving",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
@@ -56,6 +57,7 @@ FOLDERS = {
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "schema"),
     "pages": ("coverage", "report"),
     "twin": ("record", "twin"),
+    "pipeline": ("check",),
     "robot": ("node",),
     "start": ("start", "demo"),
 }

@@ -1,0 +1,167 @@
+"""What `restock check` found, whatever looked: audits' findings, and the like of them for what
+`restock diff` and `restock eval --baseline` say. So one JUnit writer and one table serve all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from restock.errors import RestockError
+from restock.replay.store.audit import SAMPLE_ROWS, Audit, Finding, Severity, Status
+
+_STATUS: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
+_MARKS = {"fail": "❌", "warn": "⚠️", "info": "ℹ️", "pass": "✅", "skipped": "–"}
+_ORDER = ("fail", "warn", "info", "pass", "skipped")
+SHOWN = 5  # rows of a finding in a summary
+
+
+class Part(NamedTuple):
+    """One of the things that were looked at."""
+
+    name: str
+    findings: list[Finding]
+
+
+def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
+    """A difference of two stores (`StoreDifference.document`) as findings.
+
+    What the old store had and the new one lacks is a failure; changed definitions and labels are a
+    warning, for they may be meant; what came is for information.
+    """
+    recordings, episodes = document["recordings"], document["episodes"]
+    gone = [row for row in recordings if row["change"] == "out"]
+    changes = episodes["changes"]
+    with_recordings = {row["recording_id"] for row in gone}
+    lost = [
+        row
+        for row in changes
+        if row["change"] == "out" and row.get("recording_id") not in with_recordings
+    ]
+    labels = document["labels"]["changes"]
+    shifted = [row for row in document["signals"]["shifts"] if (row["p_adjusted"] or 1) < 0.05]
+    return [
+        _finding(
+            "recordings_lost",
+            "error",
+            f"Recordings that {old} has and this store has not",
+            "ingest them again, or compare with a store without them",
+            gone,
+        ),
+        _finding(
+            "episodes_lost",
+            "error",
+            f"Episodes that {old} has, of recordings that both have",
+            "find out what changed on the way: profile, conditions, or a damaged recording",
+            lost,
+        ),
+        _finding(
+            "definitions_changed",
+            "warning",
+            "Conditions, labels or profiles that are defined otherwise than before",
+            "where it was not meant, go back to the old ones and ingest again",
+            [row for row in document["definitions"] if row["what"] != "restock_version"],
+        ),
+        _finding(
+            "labels_changed",
+            "warning",
+            "Rows whose condition is another one than before",
+            "`restock diff` shows them whole; `restock label STORE --review` asks a person",
+            labels,
+        ),
+        _finding(
+            "signals_shifted",
+            "warning",
+            "Signals whose mean over episodes shifted (false discovery rate 5 %)",
+            "`restock drift` says which robot, week and part",
+            shifted,
+        ),
+        _finding(
+            "recordings_new",
+            "info",
+            "Recordings that came, or were written again",
+            "nothing: this is what the difference is made of",
+            [row for row in recordings if row["change"] != "out"],
+        ),
+    ]
+
+
+def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Finding]:
+    """What `restock eval --baseline` says of a run (`regression`), a finding a row of it."""
+    found = []
+    for row in rows:
+        severity: Severity = "error" if row["verdict"] in ("worse", "refused") else "warning"
+        bad = row["verdict"] in ("worse", "refused", "inconclusive")
+        told = f"Success in {row['condition']}, {row['perturbation']}, against {baseline}"
+        shown = {key: value for key, value in row.items() if value is not None}
+        found.append(
+            _finding(
+                f"{row['perturbation']}.{row['condition']}",
+                severity,
+                told,
+                row["reason"] or "`restock compare` and `restock diagnose` say why",
+                [shown] if bad else [],
+            )
+        )
+    return found
+
+
+def refused(name: str, error: RestockError) -> list[Finding]:
+    """What could not be looked at, as a failure: a pipeline must not pass over it."""
+    row = {"what": error.what, "where": error.where or ""}
+    return [_finding(name, "error", error.what, error.remedy or "mend it, or leave it out", [row])]
+
+
+def _finding(
+    name: str, severity: Severity, doc: str, advice: str, rows: Iterable[dict[str, Any]]
+) -> Finding:
+    every = list(rows)
+    status: Status = _STATUS[severity] if every else "pass"
+    audit = Audit(name, severity, advice, doc, None, "")
+    columns = list(every[0]) if every else []
+    return Finding(audit, status, len(every), columns, every[:SAMPLE_ROWS], {})
+
+
+def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
+    """A summary for people, of Markdown as pipelines show it: failures first."""
+    every = [(part.name, one) for part in parts for one in part.findings]
+    every.sort(key=lambda pair: _ORDER.index(pair[1].status))
+    failed = sum(one.status in failing for _, one in every)
+    passed = sum(one.status == "pass" for _, one in every)
+    verdict = f"**{failed} failed**" if failed else "**passed**"
+    lines = [
+        f"## {_MARKS['fail' if failed else 'pass']} {title}",
+        "",
+        f"{verdict}; of {len(every)} checks {passed} passed,"
+        f" {sum(one.status == 'skipped' for _, one in every)} were skipped.",
+        "",
+    ]
+    shown = [(name, one) for name, one in every if one.status not in ("pass", "skipped")]
+    if shown:
+        lines += ["| | check | rows | what |", "| --- | --- | ---: | --- |"]
+        lines += [
+            f"| {_MARKS[one.status]} {one.status} | {name}: `{one.audit.name}` | {one.rows:,} |"
+            f" {_cell(one.audit.doc)} |"
+            for name, one in shown
+        ]
+    for name, one in shown:
+        if one.status not in failing:
+            continue
+        lines += ["", f"### {name}: {one.audit.name}", "", f"{one.audit.advice}", ""]
+        columns = one.columns
+        lines += [f"| {' | '.join(map(_cell, columns))} |", f"|{' --- |' * len(columns)}"]
+        lines += [
+            f"| {' | '.join(_cell(row[column]) for column in columns)} |"
+            for row in one.sample[:SHOWN]
+        ]
+        if one.rows > SHOWN:
+            lines.append(f"\n… {one.rows - SHOWN:,} more")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    """A value in a Markdown table: one line, and nothing that a page would take for markup."""
+    text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+    text = " ".join(text.split())
+    text = text if len(text) <= 100 else f"{text[:99]}…"
+    return re.sub(r"([\\`|*_\[\]])", r"\\\1", text).replace("<", "&lt;").replace(">", "&gt;")

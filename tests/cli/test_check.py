@@ -1,0 +1,115 @@
+"""`restock check`: a store and a run that may go on, and those that may not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock.cli import main
+from restock.cli.pipeline.findings import Part, markdown, of_regression
+from restock.train.evaluation.regression import Evaluated, regression
+
+ONLY = "-- severity: error\n-- advice: Record more.\n-- doc: Stores of few rows.\n"
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """`both` has two drives, `one` the first of them alone; and two folders of audits."""
+    folder = tmp_path_factory.mktemp("check")
+    bags = [
+        write_bag(Drive(duration_s=seconds), folder / f"bag_{seconds:.0f}")
+        for seconds in (6.0, 9.0)
+    ]
+    made = {name: folder / name for name in ("both", "one")}
+    for name, some in (("both", bags), ("one", bags[:1])):
+        command = ["ingest", *map(str, some), "--store", str(made[name]), "--json"]
+        assert main(command) == 0
+    for name, limit in (("strict", 1_000_000), ("easy", 1)):
+        made[name] = folder / name
+        made[name].mkdir()
+        rows = f"SELECT * FROM (SELECT count(*) AS n FROM transitions) WHERE n < {limit}\n"
+        (made[name] / "few_rows.sql").write_text(ONLY + rows, encoding="utf-8")
+    return made
+
+
+def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict[str, str]]:
+    """The exit code, and each check's status."""
+    code = main(["check", *map(str, args), "--json"])
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    return code, {f"{one['part']}.{one['check']}": one["status"] for one in checks}
+
+
+def test_what_was_lost_since_the_last_store_fails(
+    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    junit, summary = tmp_path / "check.xml", tmp_path / "check.md"
+    summary.write_text("above\n", encoding="utf-8")
+    to = ("--junit", junit, "--summary", summary)
+    code, found = check(capsys, stores["one"], "--against", stores["both"], *to)
+    assert code == 1
+    assert found["diff.recordings_lost"] == "fail"
+    assert found["diff.episodes_lost"] == "pass"
+    root = ElementTree.parse(junit).getroot()
+    suites = {suite.get("name", "").split()[0]: suite for suite in root}
+    assert list(suites) == ["audit", "diff"]
+    assert suites["diff"].get("failures") == "1"
+    failed = [case.get("name") for case in suites["diff"] if case.find("failure") is not None]
+    assert failed == ["recordings_lost"]
+    page = summary.read_text(encoding="utf-8")
+    assert page.startswith("above\n## ❌")
+    assert "| ❌ fail | diff: `recordings_lost` | 1 |" in page
+    assert "bag\\_9" in page
+
+    code, found = check(capsys, stores["both"], "--against", stores["one"])
+    assert found["diff.recordings_new"] == "info"
+    assert "fail" not in {status for name, status in found.items() if name.startswith("diff")}
+
+
+def test_an_audit_that_fails_fails_the_check(
+    stores: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    code, found = check(capsys, stores["both"], "--audits", stores["strict"])
+    assert code == 1
+    assert found["audit.few_rows"] == "fail"
+    _, found = check(capsys, stores["both"], "--audits", stores["easy"])
+    assert found["audit.few_rows"] == "pass"
+
+
+def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
+    stores: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    code, found = check(capsys, stores["one"], "--against", tmp_path / "gone")
+    assert code == 1
+    assert found["diff.comparable"] == "fail"
+    assert main(["check", str(tmp_path / "gone")]) == 2
+    assert "no such store" in capsys.readouterr().err
+    assert main(["check", str(stores["one"]), "--baseline", "released"]) == 2
+    assert "--run" in capsys.readouterr().err
+    assert main(["check", str(stores["one"]), "--run", str(tmp_path)]) == 2
+    assert "is not a run directory" in capsys.readouterr().err
+
+
+def evaluated(name: str, successes: int) -> Evaluated:
+    """40 episodes of one condition, so many of them at the goal."""
+    episodes = {
+        (seed, ""): (float(seed < successes), float(seed < successes)) for seed in range(40)
+    }
+    return Evaluated(name, "task", {("none", "nominal"): episodes})
+
+
+@pytest.mark.parametrize(("successes", "status"), [(10, "fail"), (40, "pass"), (39, "pass")])
+def test_a_run_that_is_worse_than_the_baseline_fails(successes: int, status: str) -> None:
+    """By `restock eval --baseline`'s own verdicts."""
+    rows = regression(evaluated("released", 40), evaluated("nightly", successes))
+    (finding,) = of_regression(rows, baseline="released")
+    assert finding.status == status
+    page = markdown("a", [Part("regression", [finding])], failing={"fail"})
+    assert ("❌" in page) == (status == "fail")
+    assert ("none.nominal" in page) == (status == "fail")

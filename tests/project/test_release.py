@@ -1,0 +1,101 @@
+"""Releases: one version everywhere, workflows and a container file whose commands exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+from support.paths import ROOT
+
+from restock import cli
+from restock.cli.completion import every_verb
+
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def workflow(name: str) -> dict[str, Any]:
+    text = (ROOT / ".github" / "workflows" / f"{name}.yml").read_text(encoding="utf-8")
+    document: dict[str, Any] = YAML(typ="safe", pure=True).load(text)
+    return document
+
+
+def steps(document: dict[str, Any]) -> list[dict[str, Any]]:
+    return [step for job in document["jobs"].values() for step in job["steps"]]
+
+
+def test_the_version_is_the_same_wherever_it_is_told() -> None:
+    version = PROJECT["version"]
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"^version: (.*)$", citation, re.MULTILINE)[1] == version  # type: ignore[index]
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## (\S+?),? ", changes, re.MULTILINE)[1] == version  # type: ignore[index]
+    for path in (ROOT / ".github" / "workflows" / "restock-check.yml", ROOT / "docs" / "ci.md"):
+        named = re.findall(r"restock-check\.yml@v([\d.]+\d)", path.read_text(encoding="utf-8"))
+        assert set(named) == {version}, path
+
+
+def test_a_release_is_checked_on_each_python_that_is_promised() -> None:
+    promised = [
+        line.rsplit(" ", 1)[1] for line in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", line)
+    ]
+    release = workflow("release")
+    assert release["jobs"]["check"]["strategy"]["matrix"]["python"] == promised
+    assert release["jobs"]["check"]["needs"] == "build"
+    built = " ".join(step.get("run", "") for step in steps(release))
+    assert "python -m build" in built
+    assert "publish" not in built
+    assert "upload dist" not in built
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_every_command_of_a_workflow_exists(path: Any) -> None:
+    document = workflow(path.stem)
+    assert document["permissions"] == {"contents": "read"}
+    commands = 0
+    for step in steps(document):
+        assert ("run" in step) != ("uses" in step)
+        for line in step.get("run", "").replace("\\\n", " ").splitlines():
+            commands += check_command(line)
+    assert commands > 0
+
+
+def check_command(line: str) -> int:
+    """A `restock` call's verb and options are those that there are; 1 where it is one."""
+    found = re.search(r"(?:^|/)restock ([\w-]+)(.*)", line.strip())
+    if found is None:
+        return "python -m" in line
+    verb, rest = found[1], found[2]
+    if verb.startswith("--"):
+        return 1
+    assert verb in cli.VERBS, line
+    options = set(re.findall(r"(?<=[\s+])--[a-z][\w-]*", rest))
+    assert options <= set(every_verb()[verb].options), line
+    return 1
+
+
+def test_inputs_reach_the_shell_by_the_environment_only() -> None:
+    """A text of the caller in `run:` would be a command of the caller's."""
+    for path in WORKFLOWS:
+        for step in steps(workflow(path.stem)):
+            assert "${{" not in step.get("run", ""), step
+
+
+def test_the_container_file_runs_the_demo() -> None:
+    lines = (ROOT / "Containerfile").read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
+    told = dict(line.split(" ", 1) for line in lines if line and not line.startswith("#"))
+    minor = re.search(r"python:3\.(\d+)", told["FROM"])
+    assert minor is not None
+    assert f"Programming Language :: Python :: 3.{minor[1]}" in PROJECT["classifiers"]
+    entry, command = told["ENTRYPOINT"].strip('[]" '), told["CMD"].strip("[] ").replace(",", " ")
+    verb, *options = shlex.split(command)
+    assert entry in PROJECT["scripts"]
+    assert set(option for option in options if option.startswith("--")) <= set(
+        every_verb()[verb].options
+    )
+    ignored = (ROOT / ".containerignore").read_text(encoding="utf-8").split()
+    assert not {"sample_logs", "src", "ingest", "replay", "train", "README.md"} & set(ignored)
