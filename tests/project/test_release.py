@@ -94,7 +94,7 @@ def test_the_container_file_runs_the_demo() -> None:
     entry, command = told["ENTRYPOINT"].strip('[]" '), told["CMD"].strip("[] ").replace(",", " ")
     verb, *options = shlex.split(command)
     assert entry in PROJECT["scripts"]
-    assert set(option for option in options if option.startswith("--")) <= set(
+    assert {option for option in options if option.startswith("--")} <= set(
         every_verb()[verb].options
     )
     ignored = (ROOT / ".containerignore").read_text(encoding="utf-8").split()
