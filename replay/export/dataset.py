@@ -18,6 +18,7 @@ from typing import Any
 
 from restock.errors import StoreError
 from restock.ingest.store.version import Version
+from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
 
@@ -40,6 +41,7 @@ def export_dataset(
     panel: str | Path | None = None,
     version: Version | None = None,
     continuous: bool = False,
+    license: str | None = None,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
     """Write a data set; all or nothing.
@@ -49,6 +51,7 @@ def export_dataset(
         to: one of FORMATS.
         out: a file or directory that must not exist yet.
         query, panel, version, continuous: see `open_selection`.
+        license: its identifier (`cc-by-4.0`), for the card of a data set that is a directory.
         advance: called with the number of steps written, as it goes on.
 
     Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
@@ -66,6 +69,7 @@ def export_dataset(
             f"the format {to} needs {needs}, which is not installed",
             remedy=f"pip install {needs}, or `pip install restock[libraries]`",
         )
+    check_license(license)
     out = Path(out)
     if ending and out.suffix != ending:
         raise StoreError(f"the format {to} is a file that ends in {ending}", where=str(out))
@@ -76,7 +80,9 @@ def export_dataset(
     with open_selection(
         source, query=query, panel=panel, version=version, continuous=continuous
     ) as selection:
-        episodes = _advancing(_trajectories(selection, counts), advance)
+        contents = Contents()
+        written = contents.counted(_trajectories(selection, counts))
+        episodes = _advancing(written, advance)
         if (first := next(episodes, None)) is None:
             raise StoreError("no whole transition is left of the rows", where=selection.where)
         if first.observations.shape[1] != selection.observation_size:
@@ -91,6 +97,9 @@ def export_dataset(
         _remove(partial)
         try:
             notes = write(selection, chain([first], episodes), partial, counts)
+            if not ending:
+                text = card(selection, counts, contents, to, license)
+                (partial / "README.md").write_text(text, encoding="utf-8")
             partial.rename(out)
         finally:
             _remove(partial)

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from ruamel.yaml import YAML
 from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
 
@@ -29,6 +30,7 @@ from restock.replay.export.dataset import FORMATS, export_dataset
 from restock.replay.export.selection import open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, trajectories
 from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store
 
 TESTS = Path(__file__).parent
 SLIP = "FROM transitions WHERE condition = 'wheel_slip'"
@@ -490,3 +492,41 @@ def test_the_verb_says_what_it_wrote(
     captured = capsys.readouterr()
     assert "already there" in captured.err
     assert captured.out == ""
+
+
+@pytest.mark.parametrize("to", ["lerobot", "minari"])
+def test_a_directory_has_a_card_with_what_a_hub_reads(
+    store_path: Path, tmp_path: Path, to: str
+) -> None:
+    if to == "minari":
+        pytest.importorskip("minari", reason="minari is not installed: restock[libraries]")
+    where = "FROM transitions WHERE behaviour_policy = 'operator'"
+    made = export_dataset(store_path, to, tmp_path / "set", query=where, license="cc-by-4.0")
+    _, front, text = (tmp_path / "set" / "README.md").read_text().split("---\n", 2)
+    said = YAML(typ="safe", pure=True).load(front)
+    assert said["license"] == "cc-by-4.0"
+    assert {"robotics", "restock"} <= set(said["tags"])
+    assert said["size_categories"] == ["n<1K" if made["transitions"] < 1000 else "1K<n<10K"]
+    if to == "lerobot":
+        assert "LeRobot" in said["tags"]
+        (files,) = said["configs"]
+        assert list((tmp_path / "set").glob(files["data_files"]))
+    assert f"{made['transitions']:,} transitions" in text
+    assert f"| operator | {made['transitions']:,} | 100.0% |" in text
+    with Store(store_path) as store:
+        count = store.sql(
+            "SELECT count(*) FROM transitions WHERE behaviour_policy = 'operator'"
+            " AND condition = 'nominal'"
+        ).fetchone()[0]
+    assert f"| nominal | {count:,} |" in text
+    assert str(store_path) not in text
+
+
+def test_a_card_without_a_licence_says_so(store_path: Path, tmp_path: Path) -> None:
+    export_dataset(store_path, "lerobot", tmp_path / "set")
+    text = (tmp_path / "set" / "README.md").read_text()
+    assert "license:" not in text
+    assert "No licence was given" in text
+    with pytest.raises(StoreError, match="no identifier of a licence"):
+        export_dataset(store_path, "lerobot", tmp_path / "b", license="CC BY 4.0")
+    assert not (tmp_path / "b").exists()

@@ -34,6 +34,8 @@ class ExportCommand:
     """Of a store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
+    license: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
+    """The licence that the card of a minari or lerobot data set names: cc-by-4.0, apache-2.0, …"""
     json: bool = False
     """Print what was written as one JSON document."""
 
@@ -68,6 +70,7 @@ class ExportCommand:
                 panel=self.panel,
                 version=given_version(self.version),
                 continuous=self.action == "continuous",
+                license=self.license,
                 advance=lambda steps: advance(steps),
             )
         if self.json:
