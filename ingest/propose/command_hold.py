@@ -188,7 +188,8 @@ def turn_reading(
         told_s, told_mps, turn: of the commands, in order, on the clock of `poses`.
         wheelbase_m, steering_rad: of the robot; the angle is the largest, None: the usual one.
     """
-    ticks = np.arange(poses.stamp_ns[0], poses.stamp_ns[-1], 100_000_000, np.int64)
+    first_ns, last_ns = int(poses.stamp_ns[0]), int(poses.stamp_ns[-1])
+    ticks = np.arange(first_ns, last_ns, 100_000_000, dtype=np.int64)
     window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
     motion = motion_at(poses, ticks, window_s, 1.0)
     middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps

@@ -144,8 +144,8 @@ class ProfileCommand:
                 errors.append(error)
         if not recordings and errors:
             raise errors[0]
-        for error in errors:
-            sys.stderr.write(f"restock: left out of the proposal: {error}\n")
+        for unread in errors:
+            sys.stderr.write(f"restock: left out of the proposal: {unread}\n")
         return recordings
 
     def _open(self, path: Path | str) -> Recording:
