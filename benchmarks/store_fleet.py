@@ -1,8 +1,8 @@
 """Synthetic fleets for `benchmarks/store.py`: any number of recordings, by the store's own writer.
 
 The rows of a few recordings are drawn at random by the tests' builder, which has every column of
-the schema. Every further recording has those rows under other ids, stamps and poses, so that no two
-hold the same steps; what is written, and how, is `StoreWriter.write_all`'s.
+the schema. Every further recording has those rows under other ids, stamps, poses and wheel speeds, so
+that no two hold the same steps or drive; what is written, and how, is `StoreWriter.write_all`'s.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ def drive(template: pa.Table, number: int, task: Task) -> tuple[pa.Table, pa.Tab
     episodes = template["episode_index"].combine_chunks().dictionary_encode()
     names = pa.array([f"{recording_id}/{index}" for index in episodes.dictionary.to_pylist()])
     stamps = template["stamp_ns"].to_numpy()
+    speeds = template["wheel_speed_mps"].to_numpy()
     rows = replaced(
         template,
         {
@@ -69,6 +70,7 @@ def drive(template: pa.Table, number: int, task: Task) -> tuple[pa.Table, pa.Tab
             "stamp_ns": stamps - stamps[0] + int(started.timestamp()) * 10**9,
             "pose_x_m": rng.uniform(0, 40, count).astype(np.float32),
             "pose_y_m": rng.uniform(0, 25, count).astype(np.float32),
+            "wheel_speed_mps": (speeds + rng.normal(0, 0.01, count)).astype(np.float32),
             "ingest_id": f"{recording_id}-a",
             "source_file": f"logs/{number}.mcap",
         },

@@ -1,12 +1,13 @@
 """What is kept of a recording in its manifest, so that common questions need not scan its rows.
 
-Its episodes, how many rows and episodes each cell of coverage has, the ends of its episodes and its
-sketch. Every writer of rows writes them, so they are true for as long as the rows are there.
+Its episodes, how many rows and episodes each cell of coverage has, what drift compares, the rows that
+are flawed, the ends of its episodes and its sketch. Every writer of rows writes them, so they are true for as long as the rows are there.
 """
 
 from __future__ import annotations
 
 import atexit
+import re
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -15,9 +16,10 @@ import duckdb
 import pyarrow as pa
 
 from restock.ingest.store.repeated import sketch
+from restock.ingest.task.schema import COLUMNS
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
-VERSION = 1  # of summary.sql: a summary by another one is not used
+VERSION = 2  # of summary.sql: a summary by another one is not used
 
 
 def _rows_of(**columns: pa.DataType) -> pa.DataType:
@@ -73,6 +75,14 @@ TABLES = {  # of summary.sql, each a column
     ),
     "held_cells": _rows_of(condition=_TEXT, action=pa.int16(), rows=_COUNT),
     "held_episodes": _rows_of(condition=_TEXT, episodes=_COUNT),
+    "measured_signals": _rows_of(episode_id=_TEXT, signal=_TEXT, value=_NUMBER, steps=_COUNT),
+    "flawed_rows": _rows_of(
+        transition_id=_COUNT,
+        episode_id=_TEXT,
+        step_index=pa.int32(),
+        is_null=pa.bool_(),
+        is_not_finite=pa.bool_(),
+    ),
 }
 # Beside the columns of `recording_schema`; null in manifests of an older store.
 SUMMARY_SCHEMA = pa.schema(
@@ -83,7 +93,9 @@ SUMMARY_SCHEMA = pa.schema(
         *(pa.field(name, kind) for name, kind in TABLES.items()),
     ]
 )
-_READ = (
+
+
+_READ = (  # by the statements on episodes and coverage
     *("episode_id", "episode_index", "step_index", "stamp_ns", "action", "reward", "terminated"),
     *("truncated", "condition", "conditions", "behaviour_policy", "zone", "bumped", "goal_source"),
     *("clearance_m", "progress_m"),
@@ -100,7 +112,8 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     with _database().cursor() as connection:  # with temporary tables of its own
         read = rows.select([name for name in _READ if name in rows.schema.names])
         connection.register("recording_rows", read)
-        connection.register("manifest", manifest.select(["task_json"]))
+        connection.register("transitions", _complete(rows))
+        connection.register("recordings", manifest)
         connection.execute(_definitions())
         tables = {name: connection.table(name).to_arrow_table() for name in TABLES}
     for field in SUMMARY_SCHEMA:
@@ -111,6 +124,14 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
         )
         manifest = manifest.append_column(field, column)
     return manifest
+
+
+def _complete(rows: pa.Table) -> pa.Table:
+    """Rows with the columns that an older Restock did not write, null."""
+    for column in COLUMNS:
+        if column.name not in rows.schema.names:
+            rows = rows.append_column(column.name, pa.nulls(len(rows), column.type))
+    return rows
 
 
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
@@ -128,14 +149,13 @@ def _database() -> duckdb.DuckDBPyConnection:
 
 @cache
 def _definitions() -> str:
-    return with_episode_columns(
-        (files("restock.ingest.store") / "summary.sql").read_text(encoding="utf-8")
-    )
+    return with_included(_sql("summary.sql"))
 
 
-def with_episode_columns(text: str) -> str:
-    """SQL with the columns of an episode where it says so: their one definition."""
-    return text.replace("-- include: episode_columns.sql", _sql("episode_columns.sql"))
+def with_included(text: str) -> str:
+    """SQL with the files of this folder that it names: definitions which summaries share with the
+    views that scan."""
+    return re.sub(r"-- include: (\w+\.sql)", lambda named: with_included(_sql(named[1])), text)
 
 
 def _sql(name: str) -> str:

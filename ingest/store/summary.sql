@@ -1,6 +1,6 @@
--- What the common views need of a recording, from its transitions (`recording_rows`) and its
--- `manifest`. Kept in its manifest; summaries.sql adds them up over the store. Cells are counted as
--- views.sql, which scans, counts them: a test holds that both give the same.
+-- What the common views need of a recording, from its `transitions` (`recording_rows` are a few of
+-- their columns) and its manifest (`recordings`). Kept in its manifest; summaries.sql adds them up over
+-- the store. Cells are counted as views.sql, which scans, counts them: a test holds that both give the same.
 CREATE TEMP TABLE steps AS
 SELECT
     *,
@@ -24,7 +24,7 @@ CROSS JOIN (
     SELECT
         CAST(json_extract_string(task_json, '$.rewards.goal') AS DOUBLE) AS goal_reward,
         json_extract_string(task_json, '$.goal') = 'route' AS has_goal
-    FROM manifest
+    FROM recordings
 );
 
 CREATE TEMP TABLE episode_rows AS
@@ -85,3 +85,11 @@ SELECT condition, action, count(*) AS rows FROM held GROUP BY condition, action 
 
 CREATE TEMP TABLE held_episodes AS
 SELECT condition, count(DISTINCT episode_id) AS episodes FROM held GROUP BY condition ORDER BY ALL;
+
+CREATE TEMP TABLE measured_signals AS
+-- include: measured_signals.sql
+ORDER BY episode_id, signal;
+
+CREATE TEMP TABLE flawed_rows AS
+-- include: flawed_rows.sql
+ORDER BY transition_id;

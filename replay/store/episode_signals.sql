@@ -2,11 +2,10 @@
 -- each condition began (episode_conditions). drift.sql compares them over weeks. docs/drift.md says what
 -- each signal tells. Not in Spark's list of views.
 
--- The names of the profiles' own signals (as JSON: recordings of an older store have no such column).
+-- The names of the profiles' own signals.
 CREATE OR REPLACE VIEW custom_signals AS
-SELECT DISTINCT unnest(CAST(json_extract_string(to_json(kept), '$.signals[*].name') AS VARCHAR[])) AS signal
-FROM recordings AS kept
-ORDER BY signal;
+-- include: custom_signals.sql
+;
 
 -- What is compared: the part of the robot that a signal tells of, and the least change that matters.
 -- A `ratio` is compared as now / before, a `difference` as now - before, a `spread` as a difference in
@@ -41,241 +40,24 @@ FROM (VALUES
 UNION ALL
 SELECT signal, 'custom', 'spread', 0.8, 1 FROM custom_signals;
 
--- One value an episode of each signal, and the steps that it is from: none where those are too few
--- or the robot has no such sensor. What tells of the robot leaves slipping steps out. Recordings without
--- tags are taken for one robot, "untagged".
+-- One value an episode of each signal, and the steps that it is from: none where those are too few.
+-- Recordings without tags are taken for one robot, "untagged".
 CREATE OR REPLACE VIEW episode_signals AS
-WITH tasks AS (
-    SELECT DISTINCT
-        task_hash,
-        top_mps,
-        top_radps,
-        actions,
-        CAST(json_extract_string(task_json, '$.sectors') AS INTEGER) AS sectors,
-        CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) AS period_s,
-        CAST(json_extract_string(task_json, '$.range_max_m') AS DOUBLE) AS range_max_m
-    FROM recordings
-    JOIN (
-        SELECT
-            task_hash,
-            count(*) AS actions,
-            max(abs(speed_mps)) AS top_mps,
-            max(abs(yaw_rate_radps)) AS top_radps
-        FROM actions
-        GROUP BY task_hash
-    ) USING (task_hash)
-), cleared AS (
-    SELECT
-        * EXCLUDE (observation, next_observation),
-        list_transform(
-            observation[13 + actions:12 + actions + sectors], lambda nearness: nearness * nearness * range_max_m
-        ) AS sector_m
-    FROM transitions
-    JOIN tasks USING (task_hash)
-), steps AS (
-    SELECT
-        *,
-        lag(sector_m) OVER episode AS sector_before_m,
-        lag(sector_m, 2) OVER episode AS sector_long_before_m,
-        (stamp_ns - lag(stamp_ns) OVER episode) / 1e9 AS elapsed_s,
-        (wheel_speed_mps + lag(wheel_speed_mps) OVER episode) / 2 AS mean_wheel_mps,
-        (wheel_yaw_rate_radps + lag(wheel_yaw_rate_radps) OVER episode) / 2 AS mean_wheel_radps,
-        (gyro_yaw_rate_radps + lag(gyro_yaw_rate_radps) OVER episode) / 2 AS mean_gyro_radps,
-        wheel_speed_mps - lag(wheel_speed_mps) OVER episode AS wheel_change_mps,
-        (pose_yaw_rad - lag(pose_yaw_rad) OVER episode + 3 * pi()) % (2 * pi()) - pi() AS turned_rad,
-        lag(command_speed_mps) OVER episode AS command_mps, -- in force until this step
-        lag(command_speed_mps, 2) OVER episode AS command_before_mps,
-        lag(command_speed_mps, 3) OVER episode AS command_long_before_mps,
-        -- Where there is no new pose, or no gyroscope, the wheels stand in for it.
-        localised_speed_mps <> wheel_speed_mps AS has_pose,
-        gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro,
-        NOT list_contains(conditions, 'wheel_slip') AS grips
-    FROM cleared
-    WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index)
-), kinds AS (
-    SELECT
-        *,
-        grips AND elapsed_s < 1.5 * period_s
-        AND greatest(abs(mean_wheel_radps), abs(wheel_yaw_rate_radps)) < 0.1 * top_radps AS straight,
-        least(abs(mean_wheel_mps), abs(wheel_speed_mps)) > 0.3 * top_mps AS moving,
-        grips AND has_gyro AND abs(wheel_yaw_rate_radps) > 0.3 * top_radps AS turning,
-        grips AND command_mps > 0.3 * top_mps
-        AND command_mps = command_before_mps AND command_mps = command_long_before_mps AS held,
-        grips AND abs(command_mps - command_before_mps) > 0.3 * top_mps
-        AND command_before_mps = command_long_before_mps AS stepped
-    FROM steps
-), flagged AS (
-    SELECT
-        *,
-        straight AND moving AND has_pose AS tracked,
-        straight AND has_gyro AS gyro_straight,
-        straight AND moving AND abs(wheel_change_mps) < 0.05 * top_mps AND accel_x_mps2 <> 0 AS steady,
-        -- A straight wall's range changes evenly: what is left of the change is noise.
-        CASE WHEN straight THEN list_median(list_transform(
-            list_zip(sector_m, sector_before_m, sector_long_before_m),
-            lambda m: CASE WHEN greatest(m[1], m[2], m[3]) < range_max_m
-                THEN abs(m[1] - 2 * m[2] + m[3]) END
-        )) END AS unevenness_m
-    FROM kinds
-), silent AS ( -- dead, covered, or open space: they look the same
-    SELECT episode_id, count(*) FILTER (spread_m < 0.005) AS silent_sectors
-    FROM (
-        SELECT episode_id, sector, max(m) - min(m) AS spread_m
-        FROM (
-            SELECT episode_id, unnest(sector_m) AS m, generate_subscripts(sector_m, 1) AS sector
-            FROM cleared
-        )
-        GROUP BY episode_id, sector
-    )
-    GROUP BY episode_id
-), summed AS (
-    SELECT
-        any_value(robot) AS robot,
-        any_value(site) AS site,
-        recording_id,
-        episode_id,
-        min(logged_time) AS start_time,
-        unnest([
-            {
-                signal: 'odometry_scale',
-                value: sum(localised_speed_mps) FILTER (tracked) / sum(mean_wheel_mps) FILTER (tracked),
-                steps: count(*) FILTER (tracked)
-            },
-            {
-                signal: 'wheel_yaw_scale',
-                value: median(gyro_yaw_rate_radps / wheel_yaw_rate_radps) FILTER (turning),
-                steps: count(*) FILTER (turning)
-            },
-            {
-                signal: 'wheel_pull_radpm',
-                value: sum(turned_rad - mean_wheel_radps * elapsed_s) FILTER (tracked)
-                    / sum(abs(mean_wheel_mps) * elapsed_s) FILTER (tracked),
-                steps: count(*) FILTER (tracked)
-            },
-            {
-                signal: 'command_gain',
-                value: sum(wheel_speed_mps) FILTER (held) / sum(command_mps) FILTER (held),
-                steps: count(*) FILTER (held)
-            },
-            {
-                signal: 'command_response',
-                value: sum(wheel_change_mps * sign(command_mps - command_before_mps)) FILTER (stepped)
-                    / sum(abs(command_mps - command_before_mps)) FILTER (stepped),
-                steps: count(*) FILTER (stepped)
-            },
-            {
-                signal: 'gyro_bias_radps',
-                value: sum(mean_gyro_radps * elapsed_s - turned_rad) FILTER (gyro_straight)
-                    / sum(elapsed_s) FILTER (gyro_straight),
-                steps: count(*) FILTER (gyro_straight)
-            },
-            {
-                signal: 'accel_bias_mps2',
-                value: median(accel_x_mps2) FILTER (steady),
-                steps: count(*) FILTER (steady)
-            },
-            {
-                signal: 'vibration_mps2', -- normal noise has a median of .6745 standard deviations
-                value: mad(accel_x_mps2) FILTER (steady) / 0.6745,
-                steps: count(*) FILTER (steady)
-            },
-            {
-                signal: 'localiser_jitter_mps',
-                value: median(abs(localised_lateral_mps)) FILTER (tracked),
-                steps: count(*) FILTER (tracked)
-            },
-            {
-                signal: 'localiser_age_s',
-                value: avg((stamp_ns - pose_stamp_ns) / 1e9),
-                steps: count(pose_stamp_ns)
-            },
-            {
-                signal: 'lidar_noise_m',
-                value: median(unevenness_m) / 0.6745 / sqrt(6),
-                steps: count(unevenness_m)
-            },
-            {signal: 'silent_sectors', value: any_value(silent_sectors)::DOUBLE, steps: count(*)},
-            {signal: 'wheel_speed_mps', value: avg(wheel_speed_mps), steps: count(wheel_speed_mps)},
-            {
-                signal: 'wheel_yaw_rate_radps',
-                value: avg(wheel_yaw_rate_radps),
-                steps: count(wheel_yaw_rate_radps)
-            },
-            {
-                signal: 'gyro_yaw_rate_radps',
-                value: avg(gyro_yaw_rate_radps),
-                steps: count(*) FILTER (has_gyro)
-            },
-            {signal: 'localised_speed_mps', value: avg(localised_speed_mps), steps: count(*) FILTER (has_pose)},
-            {
-                signal: 'localised_lateral_mps',
-                value: avg(localised_lateral_mps),
-                steps: count(*) FILTER (has_pose)
-            },
-            {signal: 'accel_x_mps2', value: avg(accel_x_mps2), steps: count(nullif(accel_x_mps2, 0))},
-            {signal: 'command_speed_mps', value: avg(command_speed_mps), steps: count(command_speed_mps)},
-            {
-                signal: 'command_yaw_rate_radps',
-                value: avg(command_yaw_rate_radps),
-                steps: count(command_yaw_rate_radps)
-            },
-            {signal: 'clearance_m', value: avg(clearance_m), steps: count(clearance_m)},
-            {signal: 'clearance_ahead_m', value: avg(clearance_ahead_m), steps: count(clearance_ahead_m)},
-            {signal: 'reward', value: avg(reward), steps: count(reward)}
-        ], recursive := true)
-    FROM flagged
-    LEFT JOIN silent USING (episode_id)
-    GROUP BY recording_id, episode_id
-    UNION ALL BY NAME
-    SELECT
-        any_value(robot) AS robot,
-        any_value(site) AS site,
-        recording_id,
-        episode_id,
-        min(logged_time) AS start_time,
-        signal,
-        avg(value) AS value,
-        count(value) AS steps
-    FROM (
-        SELECT
-            robot,
-            site,
-            recording_id,
-            episode_id,
-            logged_time,
-            signal,
-            -- A flag is 0 or 1; texts are no numbers.
-            coalesce(
-                TRY_CAST(told AS DOUBLE), CASE told WHEN 'true' THEN 1 WHEN 'false' THEN 0 END
-            ) AS value
-        FROM (
-            SELECT
-                robot,
-                site,
-                recording_id,
-                episode_id,
-                logged_time,
-                signal,
-                json_extract_string(to_json(rows), '$."' || signal || '"') AS told
-            FROM (SELECT * EXCLUDE (observation, next_observation) FROM transitions) AS rows
-            CROSS JOIN custom_signals
-        )
-    )
-    GROUP BY recording_id, episode_id, signal
-)
 SELECT
     coalesce(robot, 'untagged') AS robot,
     coalesce(site, 'untagged') AS site,
     recording_id,
     episode_id,
-    start_time,
+    logged_start_time AS start_time,
     part,
     signal,
     value,
-    steps
-FROM summed
+    measured_signals.steps AS steps
+FROM measured_signals
 JOIN drift_signals USING (signal)
-WHERE isfinite(value) AND steps >= min_steps AND (compared <> 'ratio' OR value > 0);
+JOIN (SELECT recording_id, episode_id, robot, site, logged_start_time FROM episodes)
+    USING (recording_id, episode_id)
+WHERE measured_signals.steps >= min_steps AND (compared <> 'ratio' OR value > 0);
 
 -- How each signal is distributed, between the episodes of a robot's week.
 CREATE OR REPLACE VIEW signal_weeks AS

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import duckdb
 
 from restock.errors import QueryError
-from restock.ingest.store.summary import with_episode_columns
+from restock.ingest.store.summary import with_included
 from restock.replay.store.column_docs import install_columns
 
 T = TypeVar("T")
@@ -21,9 +21,11 @@ T = TypeVar("T")
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
 MACROS = (
     "macros.sql",
+    "flawed_rows.sql",
     "capacity.sql",
     "repeated_rows.sql",
     "corrections.sql",
+    "measured_signals.sql",
     "episode_signals.sql",
     "drift.sql",
     "return_order.sql",
@@ -33,7 +35,8 @@ _INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.
 # To bind these takes more than half of the time to open a store: only for queries that name them.
 ON_DEMAND = (
     ("events.sql", "fleet.sql"),
-    ("episode_signals.sql", "drift.sql"),
+    ("measured_signals.sql", "episode_signals.sql", "drift.sql"),
+    ("flawed_rows.sql",),
     ("exposure.sql",),
     ("return_order.sql", "returns.sql"),
     ("capacity.sql",),
@@ -81,8 +84,9 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
     if "recordings" not in there:  # a run's or a panel's
         return
     for group in named:
-        if not _names(group) & there:
-            connection.execute(definitions(names=group))
+        missing = [name for name in group if not _names((name,)) & there]
+        if missing:
+            connection.execute(definitions(names=missing))
     if every and "columns" not in there:
         install_columns(connection)
 
@@ -98,7 +102,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    whole = with_episode_columns("\n".join(text))
+    whole = with_included("\n".join(text))
     return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 

@@ -12,7 +12,7 @@ WITH places AS (
     SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
     FROM transitions
     GROUP BY place
-    HAVING min(recording_id) < max(recording_id)
+    HAVING min(hash(recording_id)) < max(hash(recording_id))
 ), distinctive AS (
     SELECT
         recording_id,

@@ -115,6 +115,27 @@ FULL JOIN held_rows USING (condition)
 FULL JOIN held USING (condition)
 ORDER BY rows DESC, condition;
 
+CREATE OR REPLACE VIEW measured_signals AS
+SELECT
+    recording_id,
+    one.episode_id AS episode_id,
+    one.signal AS signal,
+    one.value AS value,
+    one.steps AS steps
+FROM (SELECT ingest_id, unnest(measured_signals) AS one FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+
+CREATE OR REPLACE VIEW flawed_rows AS
+SELECT
+    one.transition_id AS transition_id,
+    recording_id,
+    one.episode_id AS episode_id,
+    one.step_index AS step_index,
+    one.is_null AS is_null,
+    one.is_not_finite AS is_not_finite
+FROM (SELECT ingest_id, unnest(flawed_rows) AS one FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+
 CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
 WITH held AS (
     SELECT cell.condition AS condition, cell.action AS action, CAST(sum(cell.rows) AS BIGINT) AS rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 import pytest
 from deltalake import DeltaTable, write_deltalake
@@ -57,6 +58,8 @@ COMMON = (
     "coverage_by_condition",
     "missing_cells",
     "cells_below(5)",
+    "episode_signals ORDER BY episode_id, signal",
+    "flawed_rows ORDER BY transition_id",
 )
 
 
@@ -97,6 +100,17 @@ def test_views_over_summaries_are_those_over_rows(tmp_path):
     compacted_by_delta(tmp_path / "s")
     writer.write(*one(2, "c", seed=5))
     same_as_scanned(tmp_path / "s")
+
+
+def test_rows_that_no_network_survives_are_named_in_the_manifest(tmp_path):
+    manifest, rows = one(2)
+    reward = rows["reward"].to_numpy().copy()
+    reward[[4, 9]] = np.nan, np.inf
+    StoreWriter(tmp_path / "s").write(manifest, replaced(rows, {"reward": reward}))
+    with Store(tmp_path / "s") as store:
+        flawed = store.sql("SELECT transition_id, is_null, is_not_finite FROM flawed_rows")
+        assert flawed.fetchall() == [(rows["transition_id"][n].as_py(), False, True) for n in (4, 9)]
+        assert "stored_transitions" not in str(store.sql("EXPLAIN FROM flawed_rows").fetchall())
 
 
 def test_a_compacted_store_goes_on(place):

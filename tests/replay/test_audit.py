@@ -114,6 +114,12 @@ def null_reward(table: pa.Table, recordings: pa.Table) -> Tables:
     return replaced(table, "reward", reward), recordings
 
 
+def null_in_an_observation(table: pa.Table, recordings: pa.Table) -> Tables:
+    observation = table["next_observation"].to_pylist()
+    observation[17] = [*observation[17][:-1], None]
+    return replaced(table, "next_observation", observation), recordings
+
+
 def nan_observation(table: pa.Table, recordings: pa.Table) -> Tables:
     observation = table["observation"].to_pylist()
     observation[5] = [float("nan"), *observation[5][1:]]
@@ -301,6 +307,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("stale_data", old_slip, 1, {"condition": "wheel_slip"}),
     ("single_behaviour_policy", only_planner_slips, 1, {"condition": "wheel_slip"}),
     ("null_values", null_reward, 1, {"transition_id": (1 << 25) + 17}),
+    ("null_values", null_in_an_observation, 1, {"transition_id": (1 << 25) + 17}),
     ("non_finite_values", nan_observation, 2, {"transition_id": (1 << 25) + 5}),
     ("duplicate_transitions", twice, 2, {"copies": 2}),
     ("several_tasks", two_tasks, 2, {"task_hash": TASK.hash}),

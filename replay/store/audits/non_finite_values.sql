@@ -2,8 +2,6 @@
 -- advice: One such row makes every weight of the network NaN: leave it out with the mixture's `where`, and mend the profile.
 -- doc: Rows with NaN or infinity in an observation or the reward.
 SELECT transition_id, recording_id, episode_id, step_index
-FROM transitions
--- NaN and infinity survive a sum.
-WHERE NOT isfinite(list_sum(observation::FLOAT[]))
-    OR NOT isfinite(list_sum(next_observation::FLOAT[]))
-    OR NOT isfinite(reward)
+FROM flawed_rows
+WHERE is_not_finite
+ORDER BY transition_id
