@@ -1,8 +1,8 @@
 """Synthetic fleets for `benchmarks/store.py`: any number of recordings, by the store's own writer.
 
 The rows of a few recordings are drawn at random by the tests' builder, which has every column of
-the schema. Every further recording has those rows under other ids, stamps, poses and wheel speeds, so
-that no two hold the same steps or drive; what is written, and how, is `StoreWriter.write_all`'s.
+the schema. Every further recording has those rows under other ids, stamps, poses and wheel speeds,
+so that no two hold the same steps or drive; what is written, and how, is `StoreWriter.write_all`'s.
 """
 
 from __future__ import annotations

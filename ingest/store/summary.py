@@ -1,7 +1,8 @@
 """What is kept of a recording in its manifest, so that common questions need not scan its rows.
 
-Its episodes, how many rows and episodes each cell of coverage has, what drift compares, the rows that
-are flawed, the ends of its episodes and its sketch. Every writer of rows writes them, so they are true for as long as the rows are there.
+Its episodes, how many rows and episodes each cell of coverage has, what drift compares, the rows
+that are flawed, the ends of its episodes and its sketch. Every writer of rows writes them, so they
+are true for as long as the rows are there.
 """
 
 from __future__ import annotations

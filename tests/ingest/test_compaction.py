@@ -109,7 +109,8 @@ def test_rows_that_no_network_survives_are_named_in_the_manifest(tmp_path):
     StoreWriter(tmp_path / "s").write(manifest, replaced(rows, {"reward": reward}))
     with Store(tmp_path / "s") as store:
         flawed = store.sql("SELECT transition_id, is_null, is_not_finite FROM flawed_rows")
-        assert flawed.fetchall() == [(rows["transition_id"][n].as_py(), False, True) for n in (4, 9)]
+        ids = [rows["transition_id"][n].as_py() for n in (4, 9)]
+        assert flawed.fetchall() == [(one, False, True) for one in ids]
         assert "stored_transitions" not in str(store.sql("EXPLAIN FROM flawed_rows").fetchall())
 
 
