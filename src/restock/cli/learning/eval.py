@@ -49,6 +49,9 @@ class EvalCommand:
     """Keep the evaluation as baselines/NAME.parquet (or in the .parquet file that is named)."""
     drive: bool = True
     """--no-drive uses the episodes in RUN/eval/episodes.parquet."""
+    video: bool = False
+    """Film the agent's worst failure and a rescue of each condition, from above, into
+    RUN/eval/films: episodes of the evaluation, driven again. `restock report` shows them."""
     on_logs: str | None = None
     """Off-policy evaluation on a store's episodes, or on those that a panel holds out. "own": its
     own panel."""
@@ -121,6 +124,12 @@ class EvalCommand:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
             document = {**settings(plan), "results": rows, "clones": clones}
+        if self.video:
+            from restock.train.evaluation.film import film_evaluation
+
+            with progress("filming", None) as advance:
+                films, missing = film_evaluation(plan, advance)
+            document |= {"films": [str(path) for path in films], "not_filmed": missing}
         compared = None
         if beside is not None:
             baseline = of_run(self.run_path, beside)
@@ -145,6 +154,10 @@ class EvalCommand:
             for clone in document["clones"]:
                 say(clone["text"])
             say(f"added to {self.run_path / 'eval' / 'episodes.parquet'}")
+        for path in document.get("films", ()):
+            say(f"filmed {path}")
+        for why in document.get("not_filmed", ()):
+            say(f"not filmed: {why}")
         if "regression" in document:
             show_regression(document["regression"], document["baseline"], self.margin)
         if "saved" in document:

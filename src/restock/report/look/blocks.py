@@ -22,6 +22,7 @@ class Figure:
     title: str = ""
     caption: str = ""
     name: str = ""
+    moving: str = ""  # a data URI of an animation, which is shown above the drawing
 
     @property
     def widest(self) -> str:

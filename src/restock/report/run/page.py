@@ -9,6 +9,7 @@ from restock.report.run import logs_alone
 from restock.report.run.actions import actions_section
 from restock.report.run.capacity import capacity_section
 from restock.report.run.facts import Facts
+from restock.report.run.films import films_section
 from restock.report.run.headline import headline, lead
 from restock.report.run.labels import labels_section
 from restock.report.run.practice import practice_section
@@ -29,6 +30,7 @@ def page(facts: Facts) -> dict[str, Any]:
     sections = [
         success(facts) if facts.twin else logs_alone.judged_section(facts),
         ways_section(facts),
+        films_section(facts),
         sampled(facts),
         practice_section(facts),
         actions_section(facts),

@@ -1,0 +1,91 @@
+"""Films of an evaluation: an episode driven again is the recorded one, or it is not shown."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+from support.kept_run import kept_run
+
+from restock.cli import main
+from restock.report.run.films import films_section
+from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
+from restock.train.evaluation.film import RESCUE, WORST, drive_again, scenes, unlike
+from restock.train.run.kept_evaluations import FILE, read_evaluations
+
+KINDS = "wheel_slip=2,blocked_aisle=1"
+
+
+def row(condition: str, seed: int, policy: str, success: bool, returned: float) -> dict[str, Any]:
+    return {
+        **{"condition": condition, "episode_seed": seed, "policy": policy, "success": success},
+        **{"return": returned, "perturbation": "none", "layouts": "default"},
+    }
+
+
+def test_the_worst_failure_and_the_best_rescue_of_each_condition() -> None:
+    rows = [
+        row("wheel_slip", 1, "agent", False, -1.0),
+        row("wheel_slip", 2, "agent", False, -3.0),
+        row("wheel_slip", 3, "agent", True, 4.0),
+        row("wheel_slip", 4, "agent", True, 5.0),  # the planner arrived, too: no rescue
+        row("wheel_slip", 3, "planner", False, 0.0),
+        row("wheel_slip", 4, "planner", True, 5.0),
+        row("nominal", 1, "agent", True, 1.0),
+        {**row("nominal", 9, "agent", False, -9.0), "perturbation": "friction"},
+    ]
+    found = {(s.row["condition"], s.kind): s.row["episode_seed"] for s in scenes(rows)}
+    assert found == {("wheel_slip", WORST): 2, ("wheel_slip", RESCUE): 3}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose policy is nobody's: it fails, with several environments at a time."""
+    path = kept_run(tmp_path_factory.mktemp("film") / "run")
+    plan = plan_evaluation(path, policies=("agent",), episodes=KINDS)
+    drive_evaluation(plan)
+    return path
+
+
+def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
+    plan = plan_evaluation(run, policies=("agent",), episodes=KINDS)
+    for recorded in read_evaluations(run).to_pylist()[:2]:
+        result, frames, states = drive_again(plan, recorded)
+        assert unlike(recorded, result) == []
+        assert result.undiscounted_return == pytest.approx(recorded["return"], abs=1e-4)
+        assert len(frames) == len(states) == round(recorded["time_s"] / 0.2) + 1
+        end = states[-1]["robot"]
+        assert end[:2] == pytest.approx([recorded["end_x_m"], recorded["end_y_m"]], abs=0.3)
+
+
+def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = read_evaluations(run)
+    rows = table.to_pylist()
+    for one in rows:  # as if another episode had been recorded
+        if one["condition"] == "blocked_aisle":
+            one["time_s"] += 1.0
+    pq.write_table(table.from_pylist(rows, schema=table.schema), run / FILE)
+    argv = ["eval", str(run), "--no-drive", "--video", "--policies", "agent", "--json"]
+    assert main(argv) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [Path(path).name for path in said["films"]] == ["wheel_slip-worst.webp"]
+    assert said["not_filmed"] == ["blocked_aisle-worst: driven again it has another time_s"]
+    with Image.open(said["films"][0]) as film:
+        assert getattr(film, "n_frames", 1) > 3
+    facts = SimpleNamespace(run=run, missing=[])
+    section = films_section(cast(Any, facts))
+    assert section is not None
+    (figure,) = section.figures
+    assert figure.title == "wheel slip: worst failure"
+    assert figure.moving.startswith("data:image/webp;base64,")
+    assert figure.widest.count("<g transform") == 6
+    (run / "eval" / "films" / "films.json").write_text("{}")
+    assert films_section(cast(Any, facts)) is None
+    assert "could not be read" in facts.missing[0]

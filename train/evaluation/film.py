@@ -1,0 +1,237 @@
+"""Episodes of an evaluation driven again, to be looked at: worst failures and rescues by condition.
+
+An episode follows from its spec alone, so what `restock eval` recorded can be driven again with the
+policy that is kept. A film whose outcome is not the recorded one is not made: it would show another
+episode. Pictures are drawn from above and need no OpenGL.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from PIL import Image
+
+from restock.arrays import F32, Ints
+from restock.errors import RunError
+from restock.files import write_bytes, write_text
+from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
+from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.run.kept_evaluations import shown_evaluation
+from restock.train.run.run_profile import profile_of_run
+from restock.train.twin.env.draw import draw_map
+from restock.train.twin.env.interface import Step
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.physics.model import PEOPLE
+
+FOLDER = Path("eval") / "films"  # in a run
+DOCUMENT = "films.json"
+WORST, RESCUE = "worst failure", "rescue"
+RESCUED_FROM = ("planner", "cloned", "operator")
+MOST_FRAMES = 60
+FRAME_MS = 100
+STRIP = 6  # frames of the strip, first and last among them
+_SAME = ("success", "bumps", "time_s", "failure")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An episode that is worth looking at, as it was recorded."""
+
+    kind: str  # WORST or RESCUE
+    row: dict[str, Any]  # the agent's, of RUN/eval/episodes.parquet
+    other: dict[str, Any] | None = None  # of a rescue: whoever failed where the agent arrived
+
+    @property
+    def name(self) -> str:
+        return f"{self.row['condition']}-{self.kind.split()[0]}"
+
+
+def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
+    """Of each condition, unperturbed: the agent's failure of the lowest return, and the episode of
+    the highest that it ended well and another policy did not. Those that there are."""
+    clean = [row for row in rows if row["perturbation"] == CLEAN and row["success"] is not None]
+    others = {
+        (row["policy"], row["condition"], row["episode_seed"], row["layouts"]): row
+        for row in clean
+        if row["policy"] in RESCUED_FROM and not row["success"]
+    }
+    found = []
+    for condition in dict.fromkeys(row["condition"] for row in clean):
+        own = [r for r in clean if r["policy"] == "agent" and r["condition"] == condition]
+        failed = [row for row in own if not row["success"]]
+        if failed:
+            found.append(Scene(WORST, min(failed, key=lambda row: row["return"])))
+        rescued = [
+            Scene(RESCUE, row, others[key])
+            for row in own
+            if row["success"]
+            for policy in RESCUED_FROM
+            if (key := (policy, condition, row["episode_seed"], row["layouts"])) in others
+        ]
+        if rescued:
+            found.append(max(rescued, key=lambda scene: scene.row["return"]))
+    return found
+
+
+def film_evaluation(
+    plan: EvaluationPlan, progress: Callable[[int], None] | None = None
+) -> tuple[list[Path], list[str]]:
+    """Film the scenes of what is recorded of a run: files below RUN/eval/films, and what is not
+    filmed with the reason.
+
+    Raises:
+        RunError: nothing was driven on the plan's floors, or the run kept no policy.
+    """
+    table, _ = shown_evaluation(plan.run.path)
+    rows = [row for row in table.to_pylist() if row["layouts"] == plan.layouts]
+    chosen = scenes(rows)
+    if not rows:
+        raise RunError(
+            f"has no episode on floors {plan.layouts} to film",
+            where=str(plan.run.path),
+            remedy=f"`restock eval {plan.run.path}` drives some",
+        )
+    folder = plan.run.path / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    paths, films, missing = [], [], []
+    for scene in chosen:
+        result, frames, states = drive_again(plan, scene.row)
+        if progress is not None:
+            progress(1)
+        if differing := unlike(scene.row, result):
+            missing.append(f"{scene.name}: driven again it has another {', '.join(differing)}")
+            continue
+        file = folder / f"{scene.name}.webp"
+        write_bytes(file, _animation(frames))
+        paths.append(file)
+        films.append(_document(scene, file.name, states))
+    write_text(folder / DOCUMENT, json.dumps({"films": films}) + "\n")
+    return paths, missing
+
+
+def drive_again(
+    plan: EvaluationPlan, row: dict[str, Any]
+) -> tuple[EpisodeResult, list[NDArray[np.uint8]], list[dict[str, Any]]]:
+    """Drive the agent's episode once more: how it went, a picture of each step (H, W, 3), and where
+    everything was (metres and radians, in the map frame)."""
+    profile = profile_of_run(plan.run)
+    task = profile.task
+    env = WarehouseVectorEnv(
+        1,
+        task=task,
+        robot=profile.robot,
+        layouts=plan.layouts,
+        conditions={row["condition"]: 1.0},
+        nav_command=profile.inputs.nav_command is not None,
+        autoreset_mode=AutoresetMode.DISABLED,
+    )
+    frames: list[NDArray[np.uint8]] = []
+    states: list[dict[str, Any]] = []
+
+    def look() -> None:
+        frames.append(draw_map(env, 0))
+        states.append(_state(env, len(states) * task.control_period_s))
+
+    def step(_: F32, action: Ints) -> Step:
+        if not frames:
+            look()
+        made = env.step(action)
+        look()
+        return made
+
+    (result,) = run_episodes(
+        env,
+        make_policy("agent", plan),
+        [EpisodeSpec(row["condition"], row["episode_seed"])],
+        control_period_s=task.control_period_s,
+        time_limit_steps=task.time_limit_steps,
+        goal=task.goal != "none",
+        discount=plan.config.loss.discount,
+        step=step,
+    )
+    env.close()
+    return result, frames, states
+
+
+def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
+    """In what an episode that was driven again is not the recorded one; empty where it is."""
+    now = {**result.row, "failure": result.failure}
+    differing = [name for name in _SAME if now[name] != row[name]]
+    ends = np.array([result.end_x_m - row["end_x_m"], result.end_y_m - row["end_y_m"]])
+    return differing + (["end"] if float(np.abs(ends).max()) > 1e-3 else [])
+
+
+def _state(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
+    sim, navigation = env.simulation, env.navigation
+    traffic = sim.traffic
+    here = np.isfinite(sim.traffic.gaps_m(sim.middle(sim.pose()))[0])
+    agents = [
+        [*traffic.position_m[0, agent].tolist(), float(traffic.heading_rad[0, agent])]
+        for agent in range(len(here))
+    ]
+    floor = env.floor_of(0)
+
+    def rounded(values: Any) -> Any:
+        return np.round(np.asarray(values, np.float64), 3).tolist()
+
+    def inside(place: Sequence[float]) -> bool:
+        return 0 <= place[0] <= floor.width_m and 0 <= place[1] <= floor.depth_m
+
+    return {
+        "time_s": round(time_s, 2),
+        "robot": rounded(sim.middle(sim.pose())[0]),
+        "people": rounded([a for i, a in enumerate(agents) if i < PEOPLE and inside(a)]),
+        "forklifts": rounded([a for i, a in enumerate(agents) if i >= PEOPLE and inside(a)]),
+        "pallets": rounded([p for p in sim.pallets[0].tolist() if inside(p)]),
+        "patches": rounded([p[:4] for p in sim.patches[0].tolist() if inside(p)]),
+        "plan": rounded(navigation.plans_m[0]),
+        "goal": rounded(navigation.goals_m[0]),
+    }
+
+
+def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str, Any]:
+    picked = np.unique(np.linspace(0, len(states) - 1, STRIP).round().astype(int))
+    row = scene.row
+    return {
+        "kind": scene.kind,
+        "file": file,
+        "condition": row["condition"],
+        "block": row["block"],
+        "episode_seed": row["episode_seed"],
+        "layouts": row["layouts"],
+        "layout": row["layout"],
+        "success": row["success"],
+        "failure": row["failure"],
+        "time_s": row["time_s"],
+        "bumps": row["bumps"],
+        "version": row["version"],
+        "rescued_from": None if scene.other is None else scene.other["policy"],
+        "other_failure": None if scene.other is None else scene.other["failure"],
+        "track": [state["robot"][:2] for state in states],
+        "strip": [{**states[i], "step": i} for i in picked.tolist()],
+    }
+
+
+def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """An endless WebP of at most MOST_FRAMES frames; the last one stays for a second."""
+    from io import BytesIO
+
+    picked = np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))
+    images = [Image.fromarray(frames[i]) for i in picked.tolist()]
+    durations = [FRAME_MS] * (len(images) - 1) + [1000]
+    out = BytesIO()
+    images[0].save(
+        out, "WEBP", save_all=True, append_images=images[1:], duration=durations, loop=0, quality=70
+    )
+    return out.getvalue()
+
+
+__all__ = ["Scene", "drive_again", "film_evaluation", "scenes", "unlike"]
