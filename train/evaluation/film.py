@@ -23,7 +23,7 @@ from restock.errors import RunError
 from restock.files import write_bytes, write_text
 from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.run.kept_evaluations import shown_evaluation
+from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
@@ -90,8 +90,13 @@ def film_evaluation(
     Raises:
         RunError: nothing was driven on the plan's floors, or the run kept no policy.
     """
-    table, _ = shown_evaluation(plan.run.path)
-    rows = [row for row in table.to_pylist() if row["layouts"] == plan.layouts]
+    version = make_policy("agent", plan).version
+    rows = [
+        row
+        for row in read_evaluations(plan.run.path).to_pylist()
+        if row["layouts"] == plan.layouts
+        and (row["policy"] != "agent" or row["version"] == version)
+    ]
     chosen = scenes(rows)
     if not rows:
         raise RunError(

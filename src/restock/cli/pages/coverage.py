@@ -58,7 +58,7 @@ class CoverageCommand:
 
     def _write(self, store: Any, out: Path) -> Path:
         from restock.errors import ConfigError, RestockError
-        from restock.replay.fleet.drift import measure_drift
+        from restock.replay.fleet.drift import Drift, measure_drift
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.shopping_list import document, shopping_list
         from restock.replay.mixture.mixture import load_mixture
@@ -80,6 +80,7 @@ class CoverageCommand:
             "mixture": self.mixture,
             **document(shopping_list(yields, gaps)),
         }
+        drift: Drift | str
         try:
             drift = measure_drift(store, every=self.every)
         except ConfigError:  # what was asked for is wrong

@@ -61,7 +61,7 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
 def differences(rows: Rows) -> Drawing:
     """Outcomes of a comparison: difference in success by condition, perturbations side by side."""
     shown = _outcomes(rows)
-    return _forest(shown, "difference", "difference in success (points)", 0.0, scale=None)
+    return _forest(shown, "difference", "difference in success (points)", 0.0, scale=alt.Scale())
 
 
 def improvements(rows: Rows) -> Drawing:
@@ -70,9 +70,7 @@ def improvements(rows: Rows) -> Drawing:
     return _forest(shown, "improvement", "P(higher return)", 0.5, scale=alt.Scale(domain=[0, 1]))
 
 
-def _forest(
-    rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Scale | None
-) -> Drawing:
+def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Scale) -> Drawing:
     """A dot and its interval a condition, beside the value that says nothing."""
     conditions = _conditions(rows)
     perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
@@ -91,14 +89,13 @@ def _forest(
                 else None,
             ),
         )
-        position = {"scale": scale} if scale is not None else {}
         dots = base.mark_circle(size=70, opacity=1).encode(
-            x=alt.X(f"{value}:Q", title=title, **position)
+            x=alt.X(f"{value}:Q", title=title, scale=scale)
         )
         bars = (
             base.transform_filter(f"isValid(datum.{low})")
             .mark_rule(strokeWidth=3, opacity=0.5)
-            .encode(x=alt.X(f"{low}:Q", title=title, **position), x2=f"{high}:Q")
+            .encode(x=alt.X(f"{low}:Q", title=title, scale=scale), x2=f"{high}:Q")
         )
         rule = charts.plot([{"at": neutral}]).mark_rule(strokeDash=[4, 3], color="#475569")
         layers = alt.layer(rule.encode(x="at:Q"), bars, dots)
