@@ -23,7 +23,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import Split, split
-from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.needs import as_recorded, read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.corrections import (
     correction_rows,
@@ -99,6 +99,7 @@ def ingest(
         StoreError: the store cannot be written.
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
+        profile = as_recorded(profile, recording.topics)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}
         told = resolve_tags(profile.tags, Path(path), recording.metadata, tags or {}, tagged)

@@ -39,7 +39,9 @@ from restock.ingest.task.conditions import (
     of_kind,
     primary,
     runnable,
+    told,
     too_near_to_call,
+    unknown_rows,
 )
 from restock.ingest.task.label_scores import LabelScore, label_scores
 from restock.ingest.task.schema import recording_schema
@@ -131,12 +133,15 @@ def relabel_rows(
             remedy="ingest the recording again",
         )
     stored = rows.select(ends.column_names)  # the signals, and the profile's own
-    every_condition = conditions = of_kind(definitions, "outcome")
-    every_exposure = of_kind(definitions, "exposure")
+    every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
+    task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
+    conditions, situations_told = (
+        told(several, lidar=task.lidar) for several in (every_condition, every_exposure)
+    )
     if row["format"] == TWIN:  # which fills none of the profile's own signals
         conditions = runnable(stored, conditions)
     # An older store has not all signals that exposures are told by: then they stay unknown.
-    exposures = runnable(stored, every_exposure)
+    exposures = runnable(stored, situations_told)
     steps = pa.concat_tables([stored, ends.cast(stored.schema)])
     begin = np.arange(len(rows))
     try:
@@ -161,7 +166,7 @@ def relabel_rows(
         "probabilities": by_name(probable, begin),
         "uncertain": names_of(too_near_to_call(probable, conditions), begin),
         "exposures": names_of(situations, begin)
-        if exposures or not every_exposure
+        if exposures or not situations_told
         else pa.nulls(len(rows), pa.list_(pa.string())),
         "labels_version": labels_version(definitions),
         "ingest_id": ingest_id,
@@ -170,14 +175,14 @@ def relabel_rows(
     corrections = corrections_in(row)
     rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()
-    period_s = msgspec.json.decode(row["task_json"], type=Task, strict=False).control_period_s
-    scores = label_scores(rows, labels, period_s)
+    scores = label_scores(rows, labels, task.control_period_s)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
         "labels_version": rows["labels_version"][0].as_py(),
         "label_scores": score_rows(scores),
         "label_counts": count_rows(scores),
+        "unknown_conditions": unknown_rows(definitions, lidar=task.lidar),
         "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
         "exposures_json": conditions_json(every_exposure),

@@ -13,6 +13,7 @@ import msgspec
 from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
@@ -88,7 +89,9 @@ class Prepared:
             run,
             self.config,
             task=self.profile.task,
-            conditions=conditions_in_twin(self.profile.conditions, self.profile.signals)[0],
+            conditions=conditions_in_twin(
+                self.profile.conditions, self.profile.signals, lidar=self.profile.task.lidar
+            )[0],
             env=env,
             evaluation_env=make_twin(
                 self.config,
@@ -133,7 +136,12 @@ class Prepared:
             + _describe_teacher(config, self.panel)
             + "".join(
                 f"\ncondition {name!r} is not evaluated in the twin, which has no"
-                f" {', '.join(signals)}: its stratum is of logs alone"
+                f" {', '.join(signals)}: "
+                + (
+                    "no log tells it"
+                    if LIDAR_SIGNALS.issuperset(signals)
+                    else "its stratum is of logs alone"
+                )
                 for name, signals in self.document.get("not_evaluated", {}).items()
             )
             + "".join(f"\n{line}" for line in self._sealed())
@@ -416,7 +424,9 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "update_path": update_path(config.network, config.device),
         **profile_document(profile),
         # Conditions of logs alone, with the signals that the twin does not fill.
-        "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
+        "not_evaluated": conditions_in_twin(
+            profile.conditions, profile.signals, lidar=profile.task.lidar
+        )[1],
         "seeds": {"run": config.seed, "evaluation": config.evaluation.seed},
         "versions": software_versions(),
     }

@@ -291,6 +291,8 @@ class PolicyNode:
                 given[name] = asked
         if not self._value("limiter"):
             return None
+        if not profile.task.lidar:
+            self._log("no lidar: the limiter keeps speed and acceleration, and sees nothing near")
         try:
             return Limits.of(profile.task, profile.robot, msgspec.convert(given, Limiter))
         except (ValueError, msgspec.ValidationError) as error:

@@ -36,7 +36,7 @@ COMMAND_SOURCE_FIELDS = {**INPUT_FIELDS["nav_command"], "speed_mps": False, "pre
 
 # What is used instead of an input that is left out, or is optional and the recording lacks.
 FALLBACKS: dict[str, str] = {
-    "scan": "no lidar: every bearing counts as free up to range_max_m",
+    "scan": "no lidar: clearance is unknown (null), and the observation has no sectors",
     "imu": "gyro yaw rate taken from the wheels, acceleration 0",
     "bumper": "never pressed",
     "nav_command": "unknown: null, and 0 in the observation",

@@ -303,8 +303,19 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     for name, table in signals.items() if isinstance(signals, dict) else ():
         typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
     profile = typed(document, Profile, where=where)
+    if profile.inputs.scan is None:
+        profile = without_lidar(profile)  # whatever number of sectors it gives
     _check(profile, where)
     return profile
+
+
+def without_lidar(profile: Profile) -> Profile:
+    """The same of a robot without a lidar: no scan, and no sectors in its observation."""
+    return msgspec.structs.replace(
+        profile,
+        inputs=msgspec.structs.replace(profile.inputs, scan=None),
+        task=msgspec.structs.replace(profile.task, sectors=0),
+    )
 
 
 def _check(profile: Profile, where: str) -> None:
@@ -328,6 +339,12 @@ def _check(profile: Profile, where: str) -> None:
         raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
     for name, source in profile.inputs.items():
         check_input(name, source, where, framed=profile.frames is not None)
+    if profile.inputs.scan is not None and not profile.task.sectors:
+        raise ConfigError(
+            "`task.sectors` is 0, which is of a robot without a lidar, and `inputs.scan` is given",
+            where=where,
+            remedy="give the number of sectors (36 by default), or leave [inputs.scan] out",
+        )
     for name, source in profile.command_sources.items():
         check_command_source(name, source, profile.inputs.command, where)
     if profile.inputs.pose is None and profile.frames is None:

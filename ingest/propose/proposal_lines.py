@@ -24,6 +24,7 @@ from restock.ingest.propose.robot_lines import RobotProposal
 from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.scanned_outline import OWN_SPREAD_M, ScannedOutline
 from restock.ingest.propose.trial import Trial
+from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 
 LEAST_RANGE_M = 0.01
@@ -107,6 +108,7 @@ def profile_lines(
         *_topic_lines(recording, seen.roles, seconds),
         f'name = "{name}"',
         f"conditions = {json.dumps(_conditions(seen))}",
+        *_unknown_lines(seen),
         f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
         f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
         "",
@@ -141,6 +143,15 @@ def _conditions(seen: Evidence) -> list[str]:
     """The shipped conditions that this robot's signals can show."""
     slip = ["wheel_slip"] if seen.motion is None else []
     return ["recovery", "near_collision", *slip, "blocked_aisle"]
+
+
+def _unknown_lines(seen: Evidence) -> list[str]:
+    """Which of them nothing tells of a robot without a lidar."""
+    if seen.roles["scan"]:
+        return []
+    known = shipped()
+    names = unseen([known[name] for name in _conditions(seen)])
+    return [f"# No lidar: {', '.join(names)} are unknown (null, neither true nor false)."]
 
 
 def _exposures(seen: Evidence) -> list[str]:
@@ -196,7 +207,6 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
 
 def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
-    low, high, why = _lidar_range(seen)
     kind = "speeds" if commands.measured else "commands"
     held_back = [
         f"# {told} beyond {reached:g} {unit} were commanded, which the robot did not reach."
@@ -211,8 +221,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         *_bump_lines(seen.recording, roles),
         *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
-        f"range_min_m = {low:g}{why}",
-        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
+        *_range_lines(seen),
         *held_back,
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
         *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands, seen.robot)),
@@ -300,10 +309,26 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
         *_said(trial, "task.body"),
         f"length_m = {round(footprint.length_m, 4):g}",
         f"width_m = {round(footprint.width_m, 4):g}",
-        f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
-        + ("; a guess" if x is None else f"; {footprint.lidar_source}"),
+        *(
+            [
+                f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
+                + ("; a guess" if x is None else f"; {footprint.lidar_source}")
+            ]
+            if seen.roles["scan"]
+            else []
+        ),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
         "",
+    ]
+
+
+def _range_lines(seen: Evidence) -> list[str]:
+    if not seen.roles["scan"]:
+        return ["sectors = 0  # no lidar: clearance is unknown, and no part of the observation"]
+    low, high, why = _lidar_range(seen)
+    return [
+        f"range_min_m = {low:g}{why}",
+        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
     ]
 
 
@@ -312,8 +337,6 @@ def _lidar_range(seen: Evidence) -> tuple[float, float, str]:
 
     Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
     """
-    if not seen.roles["scan"]:
-        return 0.05, 4.0, ""
     topic = seen.roles["scan"][0][0].name
     columns = seen.recording.read({topic: ["range_min", "range_max"]})[topic].fields
     low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))

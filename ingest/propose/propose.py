@@ -59,7 +59,7 @@ from restock.ingest.propose.scanned_outline import lidar_place, scanned_outline,
 from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.motion import PoseSeries
-from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.needs import as_recorded, read_topics
 
 LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
 
@@ -197,7 +197,7 @@ def _by_rate(
 def tried(recording: Recording, toml: str) -> Trial:
     """What the profile of this TOML makes of the recording."""
     try:
-        profile = parse_profile(toml, where="the proposal")
+        profile = as_recorded(parse_profile(toml, where="the proposal"), recording.topics)
         return try_profile(profile, read_topics(recording, profile))
     except (ConfigError, RecordingError) as error:
         return Trial(problem=error.what)

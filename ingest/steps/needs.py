@@ -13,7 +13,7 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path
@@ -52,6 +52,17 @@ def read_topics(
     if by_stamp and CLOCK_TOPIC in readable and clock_drifts(columns, half_period_s):
         columns |= recording.read({CLOCK_TOPIC: [CLOCK_FIELD]})
     return columns
+
+
+def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
+    """The profile as a recording with these topics is read by it, `available` as `wanted_fields`
+    has it: without a lidar where its scan is optional and there is no message of it, so that rows
+    with and without clearance are never of one task."""
+    scan = profile.inputs.scan
+    if scan is None or not scan.optional:
+        return profile
+    topic = available.get(scan.topic)
+    return profile if topic is not None and topic.expected else without_lidar(profile)
 
 
 def wanted_fields(

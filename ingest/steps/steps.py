@@ -271,9 +271,13 @@ class Filling:
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
     def _scan(self) -> None:
+        """Clearance by the scan. A robot without a lidar has none, and what has one may not go
+        without: recordings without scans are read by `as_recorded`, of a task without sectors."""
         count = len(self.tick_ns)
-        sectors = np.full((count, self.task.sectors), float(self.task.range_max_m))
         source = self.inputs.by_name.get("scan")
+        sectors = np.full((count, self.task.sectors), float(self.task.range_max_m))
+        if source is None and self.task.lidar:
+            self._mark_invalid(np.ones(count, np.bool_), "scan: not yet received")
         if source is not None:
             latest = self._required("scan")
             fields: Fields = self.inputs.topics[source.topic].fields
@@ -285,7 +289,8 @@ class Filling:
                 beams[fresh] = np.asarray(fields[BEAMS])[rows]
                 self._mark_invalid(fresh & (beams == 0), "scan: no beams")
                 sectors[fresh] = np.asarray(fields[SECTORS])[rows]
-        self.signals |= {"sector_clearance_m": sectors, "clearance_m": sectors.min(axis=1)}
+        nearest = sectors.min(axis=1) if self.task.sectors else np.full(count, np.nan)
+        self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
 
     def _bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]

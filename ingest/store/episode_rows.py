@@ -14,7 +14,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.summary import ENDS
-from restock.ingest.task.conditions import label_with_probabilities
+from restock.ingest.task.conditions import label_with_probabilities, told
 from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.signals import Signals
 
@@ -30,7 +30,7 @@ class EpisodeRows:
     step: Ints  # (R,) in its episode, from 0
     is_end: Bools  # (R,)
     signals: Signals  # leading axis R, as the row's episode sees them
-    labels: dict[str, Bools]  # condition -> (R,)
+    labels: dict[str, Bools]  # condition that can be told -> (R,)
     custom: pa.Table  # (R,) the profile's own signals
     probabilities: dict[str, F32]  # condition that has a rule for it -> (R,); NaN: not known
     exposures: dict[str, Bools]  # as `labels`
@@ -111,10 +111,14 @@ def episode_rows(
             signals[name][old] = column
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
-    held, probable = label_with_probabilities(table, profile.definitions)
+    lidar = profile.task.lidar
+    conditions, situations = (
+        told(several, lidar=lidar) for several in (profile.conditions, profile.exposures)
+    )
+    held, probable = label_with_probabilities(table, [*conditions, *situations])
     labels, exposures = (
         {condition.name: held[condition.name] for condition in several}
-        for several in (profile.conditions, profile.exposures)
+        for several in (conditions, situations)
     )
     return EpisodeRows(tick, episode, step, is_end, signals, labels, custom, probable, exposures)
 

@@ -21,7 +21,7 @@ from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
-from restock.ingest.task.conditions import Condition
+from restock.ingest.task.conditions import Condition, unknown_rows
 from restock.ingest.task.label_scores import LabelScore
 
 UNUSED = "not used by the profile"
@@ -75,6 +75,7 @@ def manifest_row(
         "label_counts": count_rows(scores),
         "clocks": [],
         "signals": [],
+        "unknown_conditions": unknown_rows(profile.definitions, lidar=profile.task.lidar),
         "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
         "conditions_json": conditions_json(profile.conditions),

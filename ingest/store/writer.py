@@ -42,6 +42,7 @@ from restock.ingest.store.repeated import (
 from restock.ingest.store.summary import SUMMARY_SCHEMA, summarised, with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
+from restock.ingest.task.signals import LIDAR_SIGNALS
 
 TRANSITIONS, RECORDINGS = "transitions", "recordings"
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
@@ -219,6 +220,7 @@ class StoreWriter:
                     self.create(RECORDINGS, schemas[0])
                     self.create(TRANSITIONS, schemas[1])
                     created = schemas
+                self._allow_nulls(rows)
                 for table, what, added in (
                     (manifest, RECORDINGS, manifests),
                     (rows, TRANSITIONS, transitions),
@@ -314,6 +316,22 @@ class StoreWriter:
                 table.alter.add_columns(Schema.from_arrow(pa.schema(extra)).fields)
 
         self.again_on_conflict(create)
+
+    def _allow_nulls(self, rows: pa.Table) -> None:
+        """Let signals be null where they are in these rows: in a store of an older Restock the
+        clearance of a robot without a lidar was a number."""
+        names = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]
+        names = [name for name in names if rows[name].null_count]
+
+        def allow() -> None:
+            table = self.path.open_table(TRANSITIONS)
+            strict = {field.name for field in table.schema().fields if not field.nullable}
+            for name in names:
+                if name in strict:
+                    table.alter.drop_column_not_null(name)
+
+        if names:
+            self.again_on_conflict(allow)
 
     def _commit(
         self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]

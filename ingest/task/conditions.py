@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from typing import Annotated, Any, Literal
@@ -47,6 +47,7 @@ from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.task.condition_files import settings_of
 from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_of
+from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
@@ -54,6 +55,7 @@ Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
 Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
+NO_LIDAR = "no lidar"  # why a condition is unknown
 
 
 class Condition(Checked, frozen=True):
@@ -72,10 +74,14 @@ class Condition(Checked, frozen=True):
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition with those of the constants that its SQL names; its own win."""
-        expressions = (self.sql, self.probability, *self.let.values())
-        words = {word for text in expressions for word in re.findall(r"\w+", text)}
-        used = {name: value for name, value in constants.items() if name in words}
+        used = {name: value for name, value in constants.items() if name in self.words}
         return msgspec.structs.replace(self, constants=used | self.constants)
+
+    @property
+    def words(self) -> set[str]:
+        """Every word of its SQL, of its `let`s and its probability."""
+        expressions = (self.sql, self.probability, *self.let.values())
+        return {word for text in expressions for word in re.findall(r"\w+", text)}
 
     def check(self) -> None:
         if not 0 <= self.uncertain[0] <= self.uncertain[1] <= 1:
@@ -144,6 +150,41 @@ def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Conditio
     text = manifest.get("conditions_json" if kind == "outcome" else "exposures_json") or "[]"
     read = msgspec.json.decode(text, type=list[Condition], strict=False)
     return [msgspec.structs.replace(condition, kind=kind) for condition in read]
+
+
+def unseen(
+    conditions: Iterable[Condition], signals: Collection[str] = LIDAR_SIGNALS
+) -> dict[str, list[str]]:
+    """The conditions that no step can be told by where these signals are not known, and which of
+    them each names: by default of a robot without a lidar.
+
+    A condition that names one is null at every step, whatever its SQL makes of a null.
+    """
+    lost = {one.name: sorted(one.words & set(signals)) for one in conditions}
+    return {name: named for name, named in lost.items() if named}
+
+
+def unknown_rows(conditions: Iterable[Condition], *, lidar: bool) -> list[dict[str, Any]]:
+    """What a robot's steps do not tell, as manifests hold it."""
+    definitions = [] if lidar else list(conditions)
+    lost = unseen(definitions)
+    return [
+        {
+            "condition": one.name,
+            "kind": one.kind,
+            "signals": lost[one.name],
+            "because": NO_LIDAR,
+        }
+        for one in definitions
+        if one.name in lost
+    ]
+
+
+def told(conditions: Iterable[Condition], *, lidar: bool) -> list[Condition]:
+    """The conditions that steps can be told by, with a lidar or without."""
+    conditions = list(conditions)
+    lost = {} if lidar else unseen(conditions)
+    return [condition for condition in conditions if condition.name not in lost]
 
 
 def labels_version(conditions: Sequence[Condition]) -> str:

@@ -10,7 +10,8 @@ away:
 
 A command is slowed along its own arc: speed and yaw rate by one factor, so that slowing does not
 steer. Returns are the nearest of each sector, at its middle bearing. What is behind a return is not
-seen, and counts as occupied; what moves is taken to stand still.
+seen, and counts as occupied; what moves is taken to stand still. A robot without a lidar sees
+nothing: of it only `unknown`, `speed` and `acceleration` hold.
 """
 
 from __future__ import annotations
@@ -142,7 +143,7 @@ def limit(
 
     Args:
         proposed: (N, 2) speed in m/s and yaw rate in rad/s.
-        clearance_m: (N, K) the signal `sector_clearance_m`.
+        clearance_m: (N, K) the signal `sector_clearance_m`; K is 0 without a lidar.
         previous: (N, 2) the commands in force until now.
         unknown: (N,) where an input cannot be relied on; None: nowhere.
     """
@@ -174,6 +175,8 @@ def _lower(command: F64, allowed: F64, rule: Ints, by: int) -> tuple[F64, Ints]:
 def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
     """The share (N,) of each command that can come to a stand in time."""
     factor = np.ones(len(command))
+    if not limits.sectors:
+        return factor
     rate = np.abs(command[:, 0]) + np.abs(command[:, 1]) * limits.reach_m  # m/s of the outline
     near = clearance_m.min(axis=1) < limits.way_m
     ids = np.flatnonzero((rate > 1e-6) & near)

@@ -262,6 +262,15 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         nullable=True,
     ),
     Column(
+        "unknown_conditions",
+        _rows_of(
+            condition=pa.string(), kind=pa.string(), signals=pa.list_(pa.string()),
+            because=pa.string(),
+        ),
+        "conditions and exposures that no row of it tells; null: older than that",
+        nullable=True,
+    ),
+    Column(
         "corrections",
         _rows_of(
             condition=pa.string(), value=pa.bool_(), episode_index=pa.int64(),

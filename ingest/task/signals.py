@@ -29,6 +29,11 @@ class Signal:
     per_sector: bool = False  # shape (sectors,) instead of ()
     stored: bool = True  # kept as a column of the transition table
     optional: bool = False  # NaN where it is not known; null in the table
+    lidar: bool = False  # seen by it alone: not known of a robot without one
+
+
+def _of_lidar(name: str, meaning: str) -> Signal:
+    return Signal(name, meaning, optional=True, lidar=True)
 
 
 SIGNALS: tuple[Signal, ...] = (
@@ -46,9 +51,10 @@ SIGNALS: tuple[Signal, ...] = (
         "per sector of bearing, nearest lidar return minus the body's extent that way",
         per_sector=True,
         stored=False,
+        lidar=True,
     ),
-    Signal("clearance_m", "the smallest sector clearance"),
-    Signal("clearance_ahead_m", "the smallest sector clearance toward the near waypoint"),
+    _of_lidar("clearance_m", "the smallest sector clearance"),
+    _of_lidar("clearance_ahead_m", "the smallest sector clearance toward the near waypoint"),
     Signal("waypoint_near_x_m", "near look-ahead point of the plan, body frame, forward"),
     Signal("waypoint_near_y_m", "near look-ahead point of the plan, body frame, left"),
     Signal("waypoint_far_x_m", "far look-ahead point of the plan, body frame, forward"),
@@ -57,17 +63,17 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("goal_distance_m", "straight distance from the pose to the goal"),
     Signal("localised_speed_mps", "forward speed from the last two localised poses"),
     Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
-    Signal(
+    _of_lidar(
         "came_nearer_m",
         "how far something within 2 m came nearer since the step before, the robot's own motion"
         " taken off; 0: nothing",
     ),
-    Signal(
+    _of_lidar(
         "plan_return_m",
         "way along the plan in view to the first lidar return within half the body's width of it;"
         " range_max_m: none",
     ),
-    Signal(
+    _of_lidar(
         "plan_gap_m",
         "from the plan just ahead (1.4 of near_m) to the lidar return nearest to it; range_max_m:"
         " none",
@@ -81,6 +87,7 @@ SIGNALS: tuple[Signal, ...] = (
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
+LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 
 
 def localised_velocity(

@@ -32,9 +32,12 @@ def came_nearer(task: Task, now: Signals, before: Signals) -> F64:
 
     A return of now within NEAR_M is put where the robot was before, by the localised and the
     gyroscope's motion. Where the lidar then saw farther, in that sector and both beside it, it has
-    come. What comes into view behind a corner was hidden then, and does not count.
+    come. What comes into view behind a corner was hidden then, and does not count. NaN without a
+    lidar.
     """
     clearance, count = now["sector_clearance_m"], task.sectors
+    if not count:
+        return np.full(len(clearance), np.nan)
     bearing, reach = _sectors(count, task.body)
     elapsed_s = (now["stamp_ns"] - before["stamp_ns"]) * 1e-9
     turn = elapsed_s * (now["gyro_yaw_rate_radps"] + before["gyro_yaw_rate_radps"]) / 2
@@ -77,10 +80,10 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         gap_m: from the plan just ahead (`GAP_WITHIN` of `near_m`) to the return nearest to it,
             (N,).
         Both are `range_max_m` where there is none. A task without a goal has no plan, and nothing
-        is on it.
+        is on it. NaN without a lidar.
     """
-    none = np.full(len(clearance_m), float(task.range_max_m))
-    if task.goal == "none":
+    none = np.full(len(clearance_m), float(task.range_max_m) if task.sectors else np.nan)
+    if task.goal == "none" or not task.sectors:
         return none, none.copy()
     bearing, reach = _sectors(task.sectors, task.body)
     distance = clearance_m + reach

@@ -48,7 +48,7 @@ class Task(Checked, frozen=True):
     actions: tuple[tuple[float, float], ...]  # (speed m/s, yaw rate rad/s); action 0 must be stop
     goal: Literal["route", "none"] = "route"
     control_period_s: Annotated[float, Meta(gt=0)] = 0.2
-    sectors: Annotated[int, Meta(ge=4)] = 36  # even
+    sectors: Annotated[int, Meta(ge=0)] = 36  # even, 4 or more; 0: the robot has no lidar
     range_min_m: float = 0.05
     range_max_m: float = 4.0
     near_m: float = 1.0  # along the plan, of the near waypoint
@@ -61,13 +61,18 @@ class Task(Checked, frozen=True):
     def check(self) -> None:
         if not self.actions or self.actions[0] != (0.0, 0.0):
             raise ValueError("actions must start with the stop action [0, 0]")
-        if self.sectors % 2:
-            raise ValueError(f"sectors must be even, got {self.sectors}")
+        if self.sectors % 2 or self.sectors == 2:
+            raise ValueError(f"sectors must be even and 4 or more, or 0, got {self.sectors}")
+
+    @property
+    def lidar(self) -> bool:
+        """Whether the robot has one: else clearance is not known, and no part of what it sees."""
+        return self.sectors > 0
 
     @property
     def observation_names(self) -> list[str]:
         """The name of every entry of the observation, in order."""
-        bearings = (np.arange(self.sectors) + 0.5) * (360 / self.sectors) - 180
+        bearings = (np.arange(self.sectors) + 0.5) * (360 / max(self.sectors, 1)) - 180
         return [
             *("near_sin", "near_cos", "far_sin", "far_cos", "goal_distance"),
             *("wheel_speed", "gyro_yaw_rate", "localised_speed", "slip_speed", "slip_yaw_rate"),
@@ -183,7 +188,10 @@ def reward_parts(
     action: Ints,
     previous_action: Ints,
 ) -> dict[str, NDArray[Any]]:
-    """What each event of [t, t + 1) was worth, (N,) each, by the names of `Rewards`."""
+    """What each event of [t, t + 1) was worth, (N,) each, by the names of `Rewards`.
+
+    Where clearance is not known (NaN, of a robot without lidar) nothing is `tight`: 0.
+    """
     weight = task.rewards
     harsh = np.abs(after["wheel_speed_mps"] - now["wheel_speed_mps"]) / task.control_period_s
     slip = np.abs(after["wheel_speed_mps"] - after["localised_speed_mps"])
@@ -203,7 +211,10 @@ def reward_parts(
 def clearance_ahead(
     task: Task, sector_clearance_m: NDArray[Any], waypoint_x_m: Any, waypoint_y_m: Any
 ) -> NDArray[np.float64]:
-    """The smallest clearance (N,) of the three sectors around the bearing of the near waypoint."""
+    """The smallest clearance (N,) of the three sectors around the bearing of the near waypoint;
+    NaN without a lidar."""
+    if not task.sectors:
+        return np.full(len(sector_clearance_m), np.nan)
     bearing = np.arctan2(waypoint_y_m, waypoint_x_m)
     middle = ((bearing + np.pi) * (task.sectors / (2 * np.pi))).astype(np.int64)
     around = (middle[:, None] + np.array([-1, 0, 1])) % task.sectors

@@ -144,6 +144,8 @@ def _of_audits(
         " FROM coverage_by_condition"
     ).fetchall()
     for condition, rows, held_in, episodes, effective in lines:
+        if rows is None:  # unknown of every recording: no drive of these robots brings any
+            continue
         found = yields.rows_of({"condition": condition})
         met = np.asarray(found > 0, np.float64)
         asked = limits["rare_condition"]

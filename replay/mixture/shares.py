@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,28 +32,40 @@ def plan_shares(
     draws: float,
     env_steps: float = 0,
     natural: F64 | None = None,
+    unknown: Mapping[str, str] | None = None,
 ) -> SharePlan:
     """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
 
     `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule,
-    `natural` (S,) the shares that the rows stand for, where that is not their own.
+    `natural` (S,) the shares that the rows stand for, where that is not their own. `unknown` are
+    strata that no row could be in, and why.
 
     Raises:
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
     wanted = wanted_shares(rules, rows if natural is None else natural, env_steps)
     limit = row_limits(mixture, rules, rows, episodes, draws)
+    untold = unknown or {}
     caps = np.array([rule.cap for rule in rules])
 
     def complaints() -> str:
         return "; ".join(
-            f"{rule.name} wants {wanted[i]:.1%}, its {rows[i]} rows in {episodes[i]} episodes allow"
-            f" {limit[i]:.1%}"
+            f"{rule.name} wants {wanted[i]:.1%}, "
+            + (
+                f"and is unknown of every row: {why}"
+                if (why := untold.get(rule.name))
+                else f"its {rows[i]} rows in {episodes[i]} episodes allow {limit[i]:.1%}"
+            )
             for i, rule in enumerate(rules)
             if wanted[i] > limit[i] + 1e-12
         )
 
-    return within_limits(wanted, limit, caps, mixture.shortfall, complaints)
+    shares = within_limits(wanted, limit, caps, mixture.shortfall, complaints)
+    notes = [
+        f"unknown: {untold[rule.name]}" if rule.name in untold else note
+        for rule, note in zip(rules, shares.notes, strict=True)
+    ]
+    return replace(shares, notes=tuple(notes))
 
 
 def within_limits(

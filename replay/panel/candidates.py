@@ -28,6 +28,7 @@ _TEXT = (
 )
 _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
 _CODED = pa.dictionary(pa.int32(), pa.string())
+_VIEWS = "SELECT table_name FROM information_schema.tables"
 BATCH_ROWS = 65_536  # read at a time
 # Of a view of several stores, which one a row is from (`replay.panel.stores`).
 STORE_COLUMN = "mixture_store"
@@ -137,7 +138,7 @@ def without_measured_actions(
     Raises:
         MixtureError: none was commanded.
     """
-    views = connection.sql("SELECT table_name FROM information_schema.tables").fetchall()
+    views = connection.sql(_VIEWS).fetchall()
     if ("recordings",) not in views:  # rows without recordings: nothing says otherwise
         return table, 0
     measured = connection.sql(
@@ -154,6 +155,19 @@ def without_measured_actions(
             remedy="record the commands, or set odometry_as_command = true in the mixture",
         )
     return kept, len(table) - len(kept)
+
+
+def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
+    """The conditions and exposures that no recording's rows tell, and why not."""
+    if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
+        return {}  # rows without recordings: nothing says otherwise
+    rows: list[tuple[str, str]] = connection.sql(
+        "SELECT unknown.condition, any_value(unknown.because)"
+        " FROM (SELECT recording_id, unnest(unknown_conditions) AS unknown FROM recordings)"
+        " GROUP BY unknown.condition"
+        " HAVING count(DISTINCT recording_id) = (SELECT count(*) FROM recordings)"
+    ).fetchall()
+    return dict(rows)
 
 
 def one_task(table: pa.Table) -> str:

@@ -29,6 +29,7 @@ from restock.replay.panel.candidates import (
     codes,
     one_task,
     read_candidates,
+    unknown_conditions,
     without_measured_actions,
 )
 from restock.replay.panel.exclusions import (
@@ -151,8 +152,9 @@ def plan_panel(
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
     occurs = represented_shares(mixture, strata, given, NOMINAL)
+    unknown = unknown_conditions(connection)
     worked_out = [
-        plan_source(connection, mixture, strata, source, natural)
+        plan_source(connection, mixture, strata, source, natural, unknown)
         for source, natural in zip(given, occurs, strict=True)
     ]
     return _joined(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import duckdb
@@ -67,10 +67,12 @@ def plan_source(
     strata: Sequence[ResolvedStratum],
     source: SourceRows,
     natural: F64 | None = None,
+    unknown: Mapping[str, str] | None = None,
 ) -> SourcePlan:
     """Shares, weights and lines of one source.
 
-    `natural` (S,) are the shares that its rows stand for, where that is not their own.
+    `natural` (S,) are the shares that its rows stand for, where that is not their own; `unknown`
+    the conditions that none of them tells, and why.
 
     Raises:
         MixtureError: too few rows, or weights that take a stratum below its natural share, where
@@ -84,7 +86,14 @@ def plan_source(
     episodes = np.array([len(counts) for counts in per_episode], np.int64)
     draws = mixture.planned.updates * mixture.planned.batch_size * source.part
     rules = [stratum.rule for stratum in strata]
-    shares = plan_shares(mixture, rules, rows, episodes, draws=draws, natural=natural)
+    untold = {
+        rule.name: why
+        for rule, count in zip(rules, rows, strict=True)
+        if not count and rule.where is None and (why := (unknown or {}).get(rule.name))
+    }
+    shares = plan_shares(
+        mixture, rules, rows, episodes, draws=draws, natural=natural, unknown=untold
+    )
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
     drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
     kept = np.asarray(drawn[source.code], np.bool_)
@@ -95,6 +104,7 @@ def plan_source(
     )
     after = effective_shares(code, weight, shares.got)
     missing = missing_rows(mixture, rules, rows, episodes, shares.wanted, draws)
+    missing[[rule.name in untold for rule in rules]] = 0  # no drive of such robots brings any
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
     lines = [
         Stratum(

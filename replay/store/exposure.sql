@@ -24,18 +24,19 @@ CREATE OR REPLACE VIEW held_exposures AS
 SELECT transition_id, recording_id, episode_id, unnest(exposures) AS exposure, action, zone, robot
 FROM transitions;
 
--- One line an exposure, those never met included: of all its rows and episodes, whatever came of them.
+-- One line an exposure, those never met included: of all its rows and episodes, whatever came of them;
+-- nulls of one that no row tells.
 CREATE OR REPLACE VIEW coverage_by_exposure AS
 SELECT
     exposure,
-    coalesce(rows, 0) AS rows,
-    coalesce(rows, 0) / nullif(all_rows, 0) AS share,
-    coalesce(episodes, 0) AS episodes,
-    coalesce(episodes, 0) / nullif(all_episodes, 0) AS episode_share,
+    coalesce(rows, least) AS rows,
+    coalesce(rows, least) / nullif(all_rows, 0) AS share,
+    coalesce(episodes, least) AS episodes,
+    coalesce(episodes, least) / nullif(all_episodes, 0) AS episode_share,
     success_share,
     return_mean,
-    coalesce(actions, 0) AS actions,
-    coalesce(zones, 0) AS zones
+    coalesce(actions, least) AS actions,
+    coalesce(zones, least) AS zones
 FROM exposures
 FULL JOIN (
     SELECT
@@ -56,6 +57,11 @@ FULL JOIN (
     JOIN episodes USING (episode_id)
     GROUP BY exposure
 ) AS by_episode USING (exposure)
+LEFT JOIN (
+    SELECT exposure, 0 AS least
+    FROM exposures
+    ANTI JOIN (SELECT condition AS exposure FROM untold_conditions) AS untold USING (exposure)
+) AS told USING (exposure)
 CROSS JOIN (SELECT count(*) AS all_rows, count(DISTINCT episode_id) AS all_episodes FROM transitions)
 ORDER BY episodes DESC, exposure;
 

@@ -7,6 +7,7 @@ FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SEL
 CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
 LEFT JOIN (SELECT condition, action, count(*) AS rows FROM held_conditions GROUP BY ALL)
     USING (condition, action)
+ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;
 

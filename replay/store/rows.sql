@@ -23,6 +23,9 @@ FROM (
         NULL::MAP(VARCHAR, VARCHAR) AS tags,
         NULL::VARCHAR AS exposures_json,
         NULL::STRUCT(
+            condition VARCHAR, kind VARCHAR, signals VARCHAR[], because VARCHAR
+        )[] AS unknown_conditions,
+        NULL::STRUCT(
             condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
             event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT
         )[] AS label_counts

@@ -95,6 +95,10 @@ _LATER = {
     RECORDINGS: {
         "tags": "CAST(NULL AS MAP<STRING, STRING>) AS tags",
         "exposures_json": "CAST(NULL AS STRING) AS exposures_json",
+        "unknown_conditions": (
+            "CAST(NULL AS ARRAY<STRUCT<condition: STRING, kind: STRING, signals: ARRAY<STRING>,"
+            " because: STRING>>) AS unknown_conditions"
+        ),
         "label_counts": (
             "CAST(NULL AS ARRAY<STRUCT<condition: STRING, known: BIGINT, labelled: BIGINT,"
             " support: BIGINT, agreed: BIGINT, event_labelled: BIGINT, event_right: BIGINT,"

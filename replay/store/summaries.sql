@@ -54,6 +54,12 @@ SELECT
 FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
 SEMI JOIN recordings USING (ingest_id)
 GROUP BY ALL
+UNION ALL
+SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+FROM untold_conditions
+WHERE kind = 'outcome' AND condition NOT IN (
+    SELECT cell.condition FROM (SELECT unnest(cells) AS cell FROM stored_summaries)
+)
 ORDER BY condition, action, zone, behaviour_policy;
 
 CREATE OR REPLACE VIEW coverage_by_condition AS
@@ -94,25 +100,27 @@ WITH seen AS (
 SELECT
     condition,
     timing,
-    coalesce(rows, 0) AS rows,
-    coalesce(rows, 0) / nullif(sum(rows) OVER (), 0) AS share,
-    coalesce(episodes, 0) AS episodes,
-    coalesce(rows_held, 0) AS rows_held,
-    coalesce(episodes_held, 0) AS episodes_held,
-    coalesce(effective_episodes, 0) AS effective_episodes,
+    coalesce(rows, least) AS rows,
+    coalesce(rows, least) / nullif(sum(rows) OVER (), 0) AS share,
+    coalesce(episodes, least) AS episodes,
+    coalesce(rows_held, least) AS rows_held,
+    coalesce(episodes_held, least) AS episodes_held,
+    coalesce(effective_episodes, least) AS effective_episodes,
     success_share,
     return_mean,
     reward_mean,
     terminal_fraction,
-    coalesce(recordings, 0) AS recordings,
-    coalesce(actions, 0) AS actions,
-    coalesce(zones, 0) AS zones,
-    coalesce(behaviour_policies, []) AS behaviour_policies
+    coalesce(recordings, least) AS recordings,
+    coalesce(actions, least) AS actions,
+    coalesce(zones, least) AS zones,
+    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies
 FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
 FULL JOIN held_rows USING (condition)
 FULL JOIN held USING (condition)
+LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
+    USING (condition)
 ORDER BY rows DESC, condition;
 
 CREATE OR REPLACE VIEW measured_signals AS
@@ -153,6 +161,7 @@ FROM (
 )
 CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
 LEFT JOIN held USING (condition, action)
+ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;
 

@@ -72,6 +72,33 @@ UNION ALL
 SELECT 'nominal', 'pre', 1000, 'none of the others', labels_version
 FROM (SELECT * FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1);
 
+-- What a recording's rows do not tell: neither that it holds nor that it does not. One line a
+-- recording and condition (or exposure).
+CREATE OR REPLACE VIEW unknown_conditions AS
+SELECT
+    recording_id,
+    source_file,
+    transitions,
+    unknown.condition AS condition,
+    unknown.kind AS kind,
+    unknown.signals AS signals,
+    unknown.because AS because
+FROM (
+    SELECT recording_id, source_file, transitions, unnest(unknown_conditions) AS unknown
+    FROM recordings
+);
+
+-- Those that no recording's rows tell: of them nothing is counted, not even 0.
+CREATE OR REPLACE VIEW untold_conditions AS
+SELECT condition, kind
+FROM (
+    SELECT condition, kind, count(DISTINCT recording_id) AS recordings
+    FROM unknown_conditions
+    GROUP BY condition, kind
+)
+CROSS JOIN (SELECT count(*) AS all_recordings FROM recordings)
+WHERE recordings = all_recordings;
+
 CREATE OR REPLACE VIEW episodes AS
 SELECT *
 FROM (
@@ -120,7 +147,8 @@ SELECT transition_id, recording_id, episode_id, condition, action, zone, robot
 FROM transitions
 WHERE condition = 'nominal';
 
--- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them.
+-- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them. A
+-- condition that no row tells has one line, of nulls.
 CREATE OR REPLACE VIEW coverage AS
 SELECT
     condition,
@@ -137,9 +165,13 @@ SELECT
 FROM transitions
 JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
 GROUP BY condition, action, zone, behaviour_policy
+UNION ALL
+SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+FROM untold_conditions
+WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM transitions)
 ORDER BY condition, action, zone, behaviour_policy;
 
--- One line a condition, those never seen included.
+-- One line a condition, those never seen included; one that no row tells has nulls.
 CREATE OR REPLACE VIEW coverage_by_condition AS
 WITH seen AS (
     SELECT
@@ -171,24 +203,26 @@ WITH seen AS (
 SELECT
     condition,
     timing,
-    coalesce(rows, 0) AS rows,
-    coalesce(rows, 0) / nullif(sum(rows) OVER (), 0) AS share,
-    coalesce(episodes, 0) AS episodes,
-    coalesce(rows_held, 0) AS rows_held,
-    coalesce(episodes_held, 0) AS episodes_held,
-    coalesce(effective_episodes, 0) AS effective_episodes,
+    coalesce(rows, least) AS rows,
+    coalesce(rows, least) / nullif(sum(rows) OVER (), 0) AS share,
+    coalesce(episodes, least) AS episodes,
+    coalesce(rows_held, least) AS rows_held,
+    coalesce(episodes_held, least) AS episodes_held,
+    coalesce(effective_episodes, least) AS effective_episodes,
     success_share,
     return_mean,
     reward_mean,
     terminal_fraction,
-    coalesce(recordings, 0) AS recordings,
-    coalesce(actions, 0) AS actions,
-    coalesce(zones, 0) AS zones,
-    coalesce(behaviour_policies, []) AS behaviour_policies
+    coalesce(recordings, least) AS recordings,
+    coalesce(actions, least) AS actions,
+    coalesce(zones, least) AS zones,
+    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies
 FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
 FULL JOIN held USING (condition)
+LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
+    USING (condition)
 ORDER BY rows DESC, condition;
 
 -- One line a perturbation of the twin; null is hardware, or a simulator that did not say.
@@ -234,6 +268,7 @@ SELECT condition, action, speed_mps, yaw_rate_radps
 FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
 CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
 ANTI JOIN (SELECT DISTINCT condition, action FROM held_conditions) USING (condition, action)
+ANTI JOIN untold_conditions USING (condition)
 ORDER BY condition, action;
 
 CREATE OR REPLACE VIEW reward_mix AS

@@ -183,7 +183,9 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
 
 
 def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison]:
-    conditions = conditions_in_twin(profile.conditions, profile.signals)[0]
+    conditions = conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[
+        0
+    ]
     return list(stored(store, rows, profile, conditions))
 
 
@@ -196,7 +198,9 @@ def _profile_of_store(store: Store, task_hash: str) -> Profile:
 def _drive(
     profile: Profile, perturbation: Perturbation | None, seed: int
 ) -> tuple[FedRows | None, str]:
-    conditions: list[Condition] = conditions_in_twin(profile.conditions, profile.signals)[0]
+    conditions: list[Condition] = conditions_in_twin(
+        profile.conditions, profile.signals, lidar=profile.task.lidar
+    )[0]
     try:
         driven = drive_twin(
             profile.task, conditions, robot=profile.robot, perturbation=perturbation, seed=seed

@@ -103,11 +103,8 @@ class FedRows:
 
     def sectors(self, *, after: bool = False) -> F64:
         """The clearance entries (N, sectors), in [0, 1], by rising bearing."""
-        first = next(
-            place
-            for place, name in enumerate(self.task.observation_names)
-            if name.startswith("clearance_")
-        )
+        names = enumerate(self.task.observation_names)
+        first = next((place for place, name in names if name.startswith("clearance_")), 0)
         rows = self.next_observation if after else self.observation
         return rows[:, first : first + self.task.sectors].astype(np.float64)
 

@@ -38,7 +38,9 @@ _ARRIVED_M = 0.15  # of plan beyond the goal's radius: the plan is never shorter
 def implied_reward(rows: FedRows) -> F64:
     """The reward (N,) that the observations come to; NaN where they do not say."""
     task = rows.task
-    clearance = rows.sectors(after=True).min(axis=1) ** 2 * task.range_max_m
+    clearance = np.full(len(rows), np.nan)
+    if task.lidar:
+        clearance = rows.sectors(after=True).min(axis=1) ** 2 * task.range_max_m
     unknown: Signals = {signal.name: np.zeros(len(rows), signal.dtype) for signal in STORED_SIGNALS}
     now: Signals = unknown | {"wheel_speed_mps": rows.now("wheel_speed")}
     after: Signals = unknown | {

@@ -120,7 +120,7 @@ def _route_speed(rows: FedRows) -> F64:
 def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
     """How sectors changed (N, S), and how they would by a turn (rad/s, (N,)) on the spot."""
     now, after = rows.sectors(), rows.sectors(after=True)
-    width = 2 * np.pi / rows.task.sectors
+    width = 2 * np.pi / max(rows.task.sectors, 1)
     slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
     expected = slope * (turn * rows.task.control_period_s)[:, None]
     changed = after - now

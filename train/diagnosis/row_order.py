@@ -41,9 +41,8 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     )  # fmt: skip
     yield _foresight(rows, joined)
     change = rows.sectors() - rows.sectors()[before]
-    first = rows.task.observation_names.index(
-        next(name for name in rows.task.observation_names if name.startswith("closing_"))
-    )
+    names = enumerate(rows.task.observation_names)
+    first = next((place for place, name in names if name.startswith("closing_")), 0)
     closing = rows.observation[:, first : first + rows.task.sectors]
     unlike = (np.abs(change - closing) > 10 * _EQUAL).any(axis=1) & joined
     yield share_judged(

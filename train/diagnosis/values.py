@@ -45,7 +45,7 @@ def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Compa
         yield not_run("range", "values against the twin's", "no twin to say where they should be")
     else:
         few = len(np.unique(logs.episode)) < FEWEST_CLUSTERS
-        for name in (*MEASURED, CLEARANCES):
+        for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
             for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
                 yield replace(row, status="undecided") if few and row.off else row
     yield _bearing(logs, twin, np.random.default_rng([seed, 3]))
@@ -88,6 +88,8 @@ def _entry(
 def _bearing(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Comparison:
     """By how many degrees the logs' sectors are turned against the twin's (or a cosine)."""
     what = "bearing in which things come nearer when driving on"
+    if not logs.task.lidar:
+        return not_run("lidar bearing", what, "the robot has no lidar")
     task, width = logs.task, 360 / logs.task.sectors
     found = _approach(logs, rng)
     expected = _approach(twin, rng) if twin is not None else None

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from restock.ingest.task.conditions import NOMINAL, Condition, label, primary, runnable
+from restock.ingest.task.conditions import NOMINAL, Condition, label, primary, runnable, unseen
 from restock.ingest.task.schema import signal_arrays, steps_schema
 from restock.ingest.task.signals import STORED_SIGNALS, Signals
 from restock.ingest.task.task import Task
@@ -351,9 +351,11 @@ class Collector(Stateful):
 
 
 def conditions_in_twin(
-    conditions: Sequence[Condition], signals: Collection[str]
+    conditions: Sequence[Condition], signals: Collection[str], *, lidar: bool = True
 ) -> tuple[list[Condition], dict[str, list[str]]]:
     """The conditions that the twin's signals can say, and of the others the `signals` they need.
+
+    Of a robot without a lidar that leaves out those that no log tells either.
 
     The twin fills Restock's own signals and none of a profile's `[signals.*]`: a condition over
     those labels logs, and is not evaluated on fresh episodes, where it would be a guess.
@@ -362,8 +364,9 @@ def conditions_in_twin(
         ConfigError: one does not run for another reason.
     """
     steps = steps_schema().empty_table()
+    needed: dict[str, list[str]] = {} if lidar else unseen(conditions)
+    conditions = [condition for condition in conditions if condition.name not in needed]
     evaluated = runnable(steps, conditions)
-    needed: dict[str, list[str]] = {}
     for condition in conditions:
         if condition not in evaluated:
             words = {word.lower() for word in re.findall(r"\w+", condition.sql)}

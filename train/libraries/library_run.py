@@ -49,7 +49,9 @@ def create_run(
             "panel": mixed,
             **more,
             **profile_document(profile),
-            "not_evaluated": conditions_in_twin(profile.conditions, profile.signals)[1],
+            "not_evaluated": conditions_in_twin(
+                profile.conditions, profile.signals, lidar=profile.task.lidar
+            )[1],
             "seeds": seeds,
             "versions": software_versions() | {name: version(name)},
         },

@@ -93,7 +93,10 @@ class MixedFeed:
         self.seed, self.log_every, self.audit_share = seed, log_every, audit_share
         self.rng = np.random.default_rng([seed, 1])
         self.labels = InfoLabels(
-            conditions_in_twin(definition.conditions, definition.signals)[0], num_envs
+            conditions_in_twin(
+                definition.conditions, definition.signals, lidar=definition.task.lidar
+            )[0],
+            num_envs,
         )
         self.num_envs, self.library = num_envs, library
         self.action_names = definition.task.action_names

@@ -172,7 +172,10 @@ class _OnPolicyFeed(BaseCallback):
         self.updates_a_rollout = self.epochs * math.ceil(rollout / model.batch_size)
         self.updates = self.shown = self.calls = self.fed_calls = 0
         self.labels = InfoLabels(
-            conditions_in_twin(definition.conditions, definition.signals)[0], self.count
+            conditions_in_twin(
+                definition.conditions, definition.signals, lidar=definition.task.lidar
+            )[0],
+            self.count,
         )
         self.keys = np.arange(self.count)
         self.began = np.zeros(self.count, np.int64)  # the call that each episode began with

@@ -193,6 +193,8 @@ def sector_clearance(task: Task, observation: F32) -> F64:
 
     Those beyond the task's range read as its range: an observation does not tell them apart.
     """
+    if not task.lidar:
+        return np.zeros((len(observation), 0))
     first = next(
         place for place, name in enumerate(task.observation_names) if name.startswith("clearance_")
     )

@@ -119,7 +119,8 @@ def one_step(
         _localise(task.control_period_s, now, after, twin)
         if warehouse is None:
             twin["sector_clearance_m"] = after["sector_clearance_m"]
-        twin["clearance_m"] = np.asarray(twin["sector_clearance_m"]).min(axis=1)
+        if task.lidar:
+            twin["clearance_m"] = np.asarray(twin["sector_clearance_m"]).min(axis=1)
         twin |= plans.seen_after(steps, rows, twin)
         moved = twin["route_remaining_m"] - after["route_remaining_m"]
         twin["goal_distance_m"] = np.maximum(after["goal_distance_m"] + moved, 0.0)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.signals import Signals
@@ -129,7 +130,8 @@ class PathFollower:
     """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
 
     It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
-    pallet that blocks part of the aisle stops it for good.
+    pallet that blocks part of the aisle stops it for good. A robot without a lidar follows the plan
+    alone: nothing is known to be near, and it stops for nothing.
 
     Args:
         stop_m: something this near ahead stops it.
@@ -141,6 +143,7 @@ class PathFollower:
     def __init__(self, task: Task, *, stop_m: float = 0.30, slow_m: float = 0.80) -> None:
         self.stop_m, self.slow_m = stop_m, slow_m
         self.table = np.asarray(task.actions, np.float64)  # (A, 2)
+        self.lidar = task.lidar
         half = max(round(task.sectors * 30 / 360), 1)
         self._ahead = slice(task.sectors // 2 - half, task.sectors // 2 + half)
         self._behind = np.r_[0:half, task.sectors - half : task.sectors]
@@ -164,7 +167,7 @@ class PathFollower:
         action[front < self.stop_m] = 0
         if self._steers:
             return self._turned_in_moves(signals, action, front, bend, side)
-        pivot = (bend > 0.9) & (signals["clearance_m"] > self.pivot_m)
+        pivot = (bend > 0.9) & ~(signals["clearance_m"] <= self.pivot_m)  # NaN: not known
         return np.where(pivot, self._pivot[side], action)
 
     def _turned_in_moves(
@@ -173,7 +176,7 @@ class PathFollower:
         """The actions (N,) of robots that steer: forward and back in turns, toward the plan, where
         it leads elsewhere than they drive."""
         backs = signals["wheel_speed_mps"] < -0.05  # what it began it goes on with
-        behind = signals["sector_clearance_m"][:, self._behind].min(axis=1)
+        behind = self._nearest(signals, self._behind)
         turns = (bend > 0.9) | ((bend > 0.3) & (backs | (front < self.stop_m)))
         room = np.where(backs, self.slow_m, self.stop_m)  # ahead, to drive on forward
         back = (front < room) & (behind > self.stop_m / 2)
@@ -181,9 +184,14 @@ class PathFollower:
         return np.where(turns, np.where(back, self._back[side], forward), action)
 
     def front(self, signals: Signals) -> F64:
-        """The smallest clearance (N,) within 30 degrees of straight ahead."""
-        front: F64 = signals["sector_clearance_m"][:, self._ahead].min(axis=1)
-        return front
+        """The smallest clearance (N,) within 30 degrees of straight ahead; inf without a lidar."""
+        return self._nearest(signals, self._ahead)
+
+    def _nearest(self, signals: Signals, sectors: slice | NDArray[np.intp]) -> F64:
+        if not self.lidar:
+            return np.full(len(signals["clearance_m"]), np.inf)
+        nearest: F64 = signals["sector_clearance_m"][:, sectors].min(axis=1)
+        return nearest
 
     def near(self, signals: Signals) -> Bools:
         """Where (N,) anything is near."""

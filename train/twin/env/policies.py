@@ -188,7 +188,7 @@ class Handover:
             )
             self._pass(env, int(index), True, reason)
         clear = (
-            (signals["clearance_m"] > 0.2)
+            ~(signals["clearance_m"] <= 0.2)  # NaN: not known
             & (self._slipping == 0)
             & ~signals["bumped"]
             & (self._since_handover >= MIN_STEPS_BETWEEN_HANDOVERS)

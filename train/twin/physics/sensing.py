@@ -39,7 +39,8 @@ class Sensing(Stateful):
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task
-        self.sectors = SectorMap.build(simulation.bearings_rad, task.sectors, task.body)
+        # Truth is told by the beams of the lidar that the twin has, also where the robot has none.
+        self.beams = SectorMap.build(simulation.bearings_rad, max(task.sectors, 4), task.body)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
         self._scale = np.zeros((num, _SCALARS))
@@ -88,7 +89,7 @@ class Sensing(Stateful):
         noise = self._noise[ids, step]
         scalar = noise[:, :_SCALARS] * self._scale[ids]
         true_ranges = sim.cast(ids)
-        self.true_clearance_m[ids] = np.maximum(true_ranges - self.sectors.reach_m, 0.0).min(axis=1)
+        self.true_clearance_m[ids] = np.maximum(true_ranges - self.beams.reach_m, 0.0).min(axis=1)
         beam = noise[:, _SCALARS:].astype(np.float64)
         lost = np.abs(beam) > self._dropout_beyond[ids, None]
         ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
@@ -96,7 +97,9 @@ class Sensing(Stateful):
         stale = step % self._scan_every[ids] != 0
         ranges[stale] = self.ranges_m[ids[stale]]
         self.ranges_m[ids] = ranges
-        clearance = self.sectors.clearance(ranges, task.range_min_m, task.range_max_m)
+        clearance = np.zeros((len(ids), 0))
+        if task.lidar:
+            clearance = self.beams.clearance(ranges, task.range_min_m, task.range_max_m)
         pose = sim.pose()[ids]
         localised = np.column_stack(
             [
@@ -125,7 +128,7 @@ class Sensing(Stateful):
             "gyro_yaw_rate_radps": sim.qvel[ids, 5] + bias[:, 1] + scalar[:, 7],
             "accel_x_mps2": sim.accel[ids, 0] + scalar[:, 8] + bias[:, 2],
             "sector_clearance_m": clearance,
-            "clearance_m": clearance.min(axis=1),
+            "clearance_m": clearance.min(axis=1) if task.lidar else np.full(len(ids), np.nan),
             "bumped": sim.bumped[ids].copy(),
             "command_speed_mps": sim.controller.commands[ids, 0, 0].copy(),
             "command_yaw_rate_radps": sim.controller.commands[ids, 0, 1].copy(),

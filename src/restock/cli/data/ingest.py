@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -255,6 +256,8 @@ def show(outcome: IngestResult) -> None:
                 for name, count in outcome.exposures.items()
             ]
         )
+    for line in _unknown(row):
+        console.print(line, markup=False, soft_wrap=True)
     console.print(
         f"{_count(row['ticks'], 'tick')} = {_count(row['transitions'], 'transition')}"
         f" + {_count(row['episode_ends'], 'episode end')}"
@@ -271,6 +274,14 @@ def show(outcome: IngestResult) -> None:
     for loss in outcome.lost_messages:
         console.print(f"lost: {loss}", markup=False, soft_wrap=True)
     console.print()
+
+
+def _unknown(row: Mapping[str, Any]) -> list[str]:
+    """What its rows do not tell, a line a reason."""
+    by_reason: dict[str, list[str]] = {}
+    for one in row["unknown_conditions"] or []:
+        by_reason.setdefault(one["because"], []).append(one["condition"])
+    return [f"unknown (null, {why}): {', '.join(names)}" for why, names in by_reason.items()]
 
 
 def _count(number: int, noun: str) -> str:

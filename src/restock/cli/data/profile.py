@@ -199,11 +199,12 @@ class ProfileCommand:
     def _advice(self, profile: Profile, outcome: IngestResult | None) -> list[str]:
         """What of the profile removes most rows or labels most of them, and what to try."""
         from restock.ingest.propose.trial import try_profile
-        from restock.ingest.steps.needs import read_topics
+        from restock.ingest.steps.needs import as_recorded, read_topics
         from restock.ingest.task.conditions import NOMINAL
 
         with self._open(self.paths[1]) as recording:
-            trial = try_profile(profile, read_topics(recording, profile))
+            as_read = as_recorded(profile, recording.topics)
+            trial = try_profile(as_read, read_topics(recording, as_read))
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0
         lines += [

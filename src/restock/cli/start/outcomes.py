@@ -67,6 +67,12 @@ def ingest(document: Document) -> list[str]:
     for row in good:
         for drop in row["drops"]:
             dropped[drop["reason"]] = dropped.get(drop["reason"], 0) + drop["count"]
+    unknown = {
+        one["condition"]: one["because"] for row in good for one in row["unknown_conditions"] or []
+    }
+    if unknown:
+        why = ", ".join(dict.fromkeys(unknown.values()))
+        lines.append(f"unknown of some or all rows ({why}): {', '.join(unknown)}")
     if dropped:
         worst = sorted(dropped.items(), key=lambda item: -item[1])[:3]
         lines.append(f"ticks left out: {', '.join(f'{why} {n:,}' for why, n in worst)}")
@@ -85,9 +91,11 @@ def coverage(document: Document) -> list[str]:
     """Rows by condition."""
     rows = document["rows"]
     held = [f"{row['condition']} {row['rows']:,}" for row in rows if row["rows"]]
-    none = [row["condition"] for row in rows if not row["rows"]]
+    none = [row["condition"] for row in rows if row["rows"] == 0]
+    unknown = [row["condition"] for row in rows if row["rows"] is None]
     lines = [f"rows: {', '.join(held)}"]
-    return [*lines, f"no row of {', '.join(none)}"] if none else lines
+    lines += [f"no row of {', '.join(none)}"] if none else []
+    return lines + ([f"unknown, for want of a signal: {', '.join(unknown)}"] if unknown else [])
 
 
 def audit(document: Document) -> list[str]:

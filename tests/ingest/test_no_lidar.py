@@ -1,0 +1,278 @@
+"""A robot without a lidar: its clearance is unknown, and so is every condition that needs it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.driven_robot import Drive, write_bag
+from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import MixtureError
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.pipeline import IngestResult, ingest
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.relabel import relabel_store
+from restock.ingest.steps.steps import steps_of
+from restock.ingest.store.writer import TRANSITIONS, StoreWriter, delta_columns
+from restock.ingest.task.conditions import shipped, told, unseen
+from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
+from restock.ingest.task.schema import transition_schema
+from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.panel.plan import plan_panel
+from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
+from restock.replay.store.store import Store
+
+NEEDS_ONE = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
+SCAN = re.search(r"\[inputs\.scan\].*?\n\n", WAREHOUSE, re.DOTALL)
+assert SCAN is not None
+BLIND = parse_profile(WAREHOUSE.replace(SCAN[0], ""), where="blind.toml")
+OPTIONAL = parse_profile(
+    WAREHOUSE.replace(SCAN[0], SCAN[0].rstrip() + "\noptional = true\n\n"), where="optional.toml"
+)
+MIXTURE = """
+{more}
+[evaluation_split]
+by = "none"
+[[strata]]
+name = "near_collision"
+share = 0.4
+[[strata]]
+name = "wheel_slip"
+share = "equal"
+[[strata]]
+name = "nominal"
+share = "natural"
+"""
+
+
+class BlindDrive(Drive):
+    """The same drive of a robot that has no lidar."""
+
+    def topics(self) -> Mapping[str, TopicColumns]:
+        return {name: topic for name, topic in super().topics().items() if name != "/scan"}
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings: `seeing` with a scan, `blind` without."""
+    folder = tmp_path_factory.mktemp("drives")
+    write_bag(Drive(), folder / "seeing")
+    write_bag(BlindDrive(duration_s=9.0), folder / "blind")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def blind(drives: Path) -> tuple[Path, IngestResult]:
+    """A store of the drive without a lidar."""
+    store = drives / "store"
+    return store, ingest(drives / "blind", BLIND, store=StoreWriter(store))
+
+
+def test_a_profile_without_a_scan_has_no_sectors_whatever_it_says():
+    assert "sectors = 36" in WAREHOUSE
+    assert (BLIND.task.sectors, BLIND.task.lidar) == (0, False)
+    lidar = [n for n in load_profile("warehouse_amr").task.observation_names if "deg" in n]
+    assert len(lidar) == 72
+    names = load_profile("warehouse_amr").task.observation_names
+    assert BLIND.task.observation_names == [name for name in names if name not in lidar]
+    assert BLIND.task.observation_size == len(names) - 72
+
+
+def test_rows_hold_null_and_what_else_the_robot_knows(drives, blind):
+    path, outcome = blind
+    with Store(path) as store:
+        rows = store.sql("FROM transitions ORDER BY step_index").to_arrow_table()
+        unknown = store.sql("SELECT condition, because FROM unknown_conditions").fetchall()
+    for name in LIDAR_SIGNALS & {signal.name for signal in STORED_SIGNALS}:
+        assert rows[name].null_count == len(rows) > 20, name
+    observation = np.stack(rows["observation"].to_numpy())
+    assert observation.shape == (len(rows), BLIND.task.observation_size)
+    assert np.isfinite(observation).all()
+    assert sorted(unknown) == [(name, "no lidar") for name in NEEDS_ONE]
+    assert not set(outcome.conditions) & set(NEEDS_ONE)
+    assert {*outcome.conditions, *outcome.exposures} >= {"wheel_slip", "slippery_floor"}
+    for row in rows.to_pylist(maps_as_pydicts="strict"):
+        assert not {*row["probabilities"]} & set(NEEDS_ONE)
+
+    seeing = ingest(drives / "seeing", load_profile("warehouse_amr"), store=None)
+    assert seeing.manifest["unknown_conditions"] == []
+
+
+def test_a_wall_beside_the_robot_costs_what_does_not_see_it_nothing(drives, tmp_path):
+    """`tight` is 0 where clearance is unknown; with the lidar the same steps cost .05 each."""
+    from support.driven_robot import columns, scans
+
+    class Tight(Drive):
+        def topics(self) -> Mapping[str, TopicColumns]:
+            near = columns(np.arange(0, 6, 0.1), scans(np.full((60, 72), 0.4)))
+            return {**super().topics(), "/scan": near}
+
+    rewards = {}
+    write_bag(Tight(), tmp_path / "tight")
+    for name, profile in (("lidar", load_profile("warehouse_amr")), ("none", BLIND)):
+        ingest(tmp_path / "tight", profile, store=StoreWriter(tmp_path / name))
+        with Store(tmp_path / name) as store:
+            query = "SELECT reward FROM transitions ORDER BY step_index"
+            rewards[name] = store.sql(query).to_arrow_table()["reward"].to_numpy()
+    assert rewards["none"] - rewards["lidar"] == pytest.approx(np.full(29, 0.05), abs=1e-6)
+
+
+def test_an_optional_scan_that_is_not_there_makes_the_same_task(drives, blind, tmp_path):
+    """Never a clearance that was not measured, and never rows of two kinds under one task."""
+    _, first = blind
+    second = ingest(drives / "blind", OPTIONAL, store=StoreWriter(tmp_path / "store"))
+    assert second.manifest["task_hash"] == first.manifest["task_hash"] == BLIND.task.hash
+    assert ingest(drives / "seeing", OPTIONAL, store=None).manifest["task_hash"] == (
+        load_profile("warehouse_amr").task.hash
+    )
+    again = ingest(drives / "blind", OPTIONAL, store=StoreWriter(tmp_path / "store"))
+    assert again.status == "unchanged"
+
+
+def test_a_policy_that_sees_does_not_act_before_the_first_scan():
+    """On a robot an optional scan may be late: every way free would be a guess."""
+    steps = steps_of(OPTIONAL, BlindDrive().topics())
+    assert set(steps.problem) == {"scan: not yet received"}
+    assert set(steps_of(BLIND, BlindDrive().topics()).problem) == {""}
+
+
+def test_nothing_is_counted_of_what_no_row_tells(blind):
+    path, _ = blind
+    with Store(path) as store:
+        held = dict(store.sql("SELECT condition, rows_held FROM coverage_by_condition").fetchall())
+        cells = store.sql("SELECT condition, action, rows FROM coverage").fetchall()
+        missing = store.sql("SELECT DISTINCT condition FROM missing_cells").fetchall()
+        met = dict(store.sql("SELECT exposure, rows FROM coverage_by_exposure").fetchall())
+        findings = run_audits(store.connection, shipped_audits(), load_thresholds())
+    outcomes = {"blocked_aisle", "near_collision", "recovery"}
+    assert {name for name, rows in held.items() if rows is None} == outcomes
+    assert {line for line in cells if line[2] is None} == {(one, None, None) for one in outcomes}
+    assert ("wheel_slip",) in missing
+    assert not {(name,) for name in outcomes} & set(missing)
+    assert {name for name, rows in met.items() if rows is None} == set(NEEDS_ONE) - outcomes
+    found = {finding.audit.name: finding for finding in findings}
+    assert found["unknown_conditions"].status == "warn"
+    assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(NEEDS_ONE)
+    assert not outcomes & {line["condition"] for line in found["rare_condition"].sample}
+
+
+def test_one_drive_with_a_lidar_and_zero_is_a_count_again(drives, tmp_path):
+    writer = StoreWriter(tmp_path / "store")
+    ingest(drives / "blind", BLIND, store=writer)
+    ingest(drives / "seeing", load_profile("warehouse_amr"), store=writer)
+    with Store(tmp_path / "store") as store:
+        query = "SELECT rows_held FROM coverage_by_condition WHERE condition = 'near_collision'"
+        assert store.sql(query).fetchall() == [(0,)]
+        assert store.sql("FROM untold_conditions").fetchall() == []
+        assert len(store.sql("FROM unknown_conditions").fetchall()) == len(NEEDS_ONE)
+
+
+def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
+    path, _ = blind
+    with Store(path) as store:
+        known = [*store.conditions(), *store.exposures()]
+        text = MIXTURE.format(more="")
+        plan = plan_panel(store.connection, parse_mixture(text, where="mix.toml"), known)
+        line = next(line for line in plan.strata if line.name == "near_collision")
+        assert (line.note, line.rows, line.missing_rows) == ("unknown: no lidar", 0, 0)
+        refusing = parse_mixture(MIXTURE.format(more='shortfall = "refuse"'), where="mix.toml")
+        with pytest.raises(MixtureError, match=r"near_collision wants 40\.0%, and is unknown of"):
+            plan_panel(store.connection, refusing, known)
+
+
+def test_a_store_of_an_older_restock_takes_them(drives, tmp_path):
+    """Its tables say that clearance is never null."""
+    writer = StoreWriter(tmp_path / "store")
+    schema = delta_columns(transition_schema(BLIND.task.observation_size))
+    strict = [f.with_nullable(f.nullable and f.name not in LIDAR_SIGNALS) for f in schema]
+    writer.create(TRANSITIONS, pa.schema(strict))
+    ingest(drives / "blind", BLIND, store=writer)
+    fields = writer.path.open_table(TRANSITIONS).schema().fields
+    assert {field.name for field in fields if not field.nullable}.isdisjoint(LIDAR_SIGNALS)
+    with Store(tmp_path / "store") as store:
+        counted = store.sql("SELECT count(*) > 20, count(clearance_m) FROM transitions")
+        assert counted.fetchall() == [(True, 0)]
+
+
+def test_labels_made_again_stay_unknown(drives, tmp_path):
+    writer = StoreWriter(tmp_path / "store")
+    ingest(drives / "blind", BLIND, store=writer)
+    changed = [shipped()["near_collision"], shipped()["wheel_slip"]]
+    (outcome,), version = relabel_store(writer, lambda profile: changed)
+    assert set(outcome.named) <= {"wheel_slip", "nominal"}
+    with Store(tmp_path / "store", version=version) as store:
+        assert store.sql("SELECT condition FROM unknown_conditions").fetchall() == [
+            ("near_collision",)
+        ]
+
+
+def test_every_shipped_condition_that_names_a_lidar_signal_is_found():
+    every = [*shipped().values(), *shipped(kind="exposure").values()]
+    assert sorted(unseen(every)) == NEEDS_ONE
+    assert [one.name for one in told(every, lidar=False)] == ["wheel_slip", "slippery_floor"]
+    assert told(every, lidar=True) == every
+
+
+def test_the_limiter_of_a_robot_that_sees_nothing_keeps_its_speed_alone():
+    limits = Limits.of(BLIND.task)
+    fast = np.array([[0.5, 0.0], [9.0, 0.0]])
+    limited = limit(limits, fast, np.zeros((2, 0)), np.array([[0.5, 0.0], [1.0, 0.0]]))
+    assert limited.rule.tolist() == [NONE, SPEED]
+    assert limited.command[:, 0].tolist() == [0.5, limits.fastest[0]]
+
+
+def test_a_proposed_profile_says_that_it_has_no_lidar_and_ingests(drives, tmp_path, capsys):
+    profile, store = tmp_path / "mine.toml", tmp_path / "store"
+    assert main(["profile", "new", str(drives / "blind"), "--out", str(profile)]) in (0, 3)
+    text = profile.read_text()
+    assert "sectors = 0  # no lidar" in text
+    assert "# No lidar: recovery, near_collision, blocked_aisle are unknown" in text
+    assert "lidar_x_m" not in text
+    capsys.readouterr()
+    command = ["ingest", str(drives / "blind"), "--profile", str(profile), "--store", str(store)]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "unknown (null, no lidar): recovery, near_collision, blocked_aisle" in said
+    assert main(["sql", str(store), "FROM coverage_by_condition", "--json"]) == 0
+    rows = {row["condition"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["near_collision"]["rows"] is None
+
+
+def test_rows_of_an_older_restock_are_named_by_the_audit(blind, tmp_path):
+    """It took every way for free where there was no scan, and its manifests say so alone."""
+    from support.stores import recording_transitions, write_store
+
+    write_store(tmp_path / "old", [recording_transitions(1)])
+    with Store(tmp_path / "old") as store:
+        connection = store.connection
+        connection.execute(
+            "CREATE OR REPLACE TEMP TABLE recordings AS SELECT * REPLACE (NULL AS"
+            " unknown_conditions, [{'input': 'scan', 'instead': 'free'}] AS stand_ins)"
+            " FROM recordings"
+        )
+        audit = [one for one in shipped_audits() if one.name == "unknown_conditions"]
+        (finding,) = run_audits(connection, audit, {})
+    assert "an older Restock" in finding.sample[0]["because"]
+
+
+HUSKY = ROOT.parent / "shared" / "bags" / "sim-time-husky"
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason="recordings of others are not there")
+def test_a_husky_with_odometry_alone(tmp_path, capsys):
+    profile = tmp_path / "husky.toml"
+    assert main(["profile", "new", str(HUSKY), "--out", str(profile)]) in (0, 3)
+    outcome = ingest(HUSKY, load_profile(profile), store=None)
+    assert outcome.manifest["transitions"] > 50
+    assert [one["condition"] for one in outcome.manifest["unknown_conditions"]] == [
+        *("recovery", "near_collision", "blocked_aisle")
+    ]

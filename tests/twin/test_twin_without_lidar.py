@@ -1,0 +1,86 @@
+"""The twin of a robot without a lidar: the same drive, seen without it, by the logs' contract."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.conditions import unseen
+from restock.ingest.task.signals import LIDAR_SIGNALS
+from restock.train.feed.collector import conditions_in_twin
+from restock.train.twin.env.navigation import PathFollower
+from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+PROFILE = load_profile("warehouse_amr")
+SEES = PROFILE.task
+BLIND = msgspec.structs.replace(SEES, sectors=0)
+STEPS = 12
+
+
+def drive(task):
+    """Observations, rewards and signals of the same actions on the same episodes."""
+    env = WarehouseVectorEnv(2, task=task, seed=3, nav_command=False)
+    observation, _ = env.reset(seed=3)
+    seen, earned, tight, over = [observation], [], [], []
+    for step in range(STEPS):
+        observation, reward, terminated, truncated, _ = env.step(np.array([2, 1 + step % 3]))
+        seen.append(observation)
+        earned.append(reward)
+        over.append(terminated | truncated)  # then the signals are of the next episode
+        tight.append(env.signals["clearance_m"] < task.rewards.tight_clearance_m)
+    env.close()
+    went_on = ~np.array(over)
+    return np.array(seen), np.array(earned)[went_on], np.array(tight)[went_on], env
+
+
+def test_it_is_the_same_drive_without_the_entries_of_the_lidar():
+    lidar, paid, tight, _ = drive(SEES)
+    blind, earned, never, env = drive(BLIND)
+    kept = [i for i, name in enumerate(SEES.observation_names) if not name.endswith("deg")]
+    assert blind.shape[-1] == env.single_observation_space.shape[0] == len(kept)
+    np.testing.assert_array_equal(blind, lidar[..., kept])
+    assert tight.any()
+    assert not never.any()
+    assert earned - paid == pytest.approx(-SEES.rewards.tight * tight, abs=1e-6)
+    for name in LIDAR_SIGNALS - {"sector_clearance_m"}:
+        assert np.isnan(env.signals[name]).all(), name
+    assert env.signals["sector_clearance_m"].shape == (2, 0)
+
+
+def test_the_truth_of_a_near_collision_is_the_simulators_all_the_same():
+    env = WarehouseVectorEnv(2, task=BLIND, seed=3)
+    env.reset(seed=3)
+    true = env.sensing.true_clearance_m
+    assert np.isfinite(true).all()
+    assert (true > 0).all()
+    env.close()
+
+
+def test_the_planner_follows_its_plan_and_stops_for_nothing():
+    env = WarehouseVectorEnv(2, task=BLIND, seed=3)
+    observation, _ = env.reset(seed=3)
+    planner = PlannerFollower(epsilon=0.0)
+    before = env.signals["route_remaining_m"].copy()
+    for _ in range(15):
+        observation, *_ = env.step(planner.act(env, observation)[0])
+    assert (env.signals["route_remaining_m"] < before).all()
+    assert np.isinf(PathFollower(BLIND).front(env.signals)).all()
+    assert np.isfinite(env.signals["nav_speed_mps"]).all()
+    env.close()
+
+
+def test_the_twin_labels_what_logs_can_be_labelled_by_and_says_the_rest():
+    evaluated, lost = conditions_in_twin(PROFILE.conditions, PROFILE.signals, lidar=False)
+    assert lost == unseen(PROFILE.conditions) != {}
+    assert [one.name for one in evaluated] == ["wheel_slip"]
+    assert conditions_in_twin(PROFILE.conditions, PROFILE.signals) == (PROFILE.conditions, {})
+
+
+@pytest.mark.parametrize("sectors", [2, 5])
+def test_sectors_are_none_or_at_least_four(sectors):
+    with pytest.raises((ConfigError, ValueError), match="even and 4 or more, or 0"):
+        msgspec.structs.replace(SEES, sectors=sectors)
