@@ -68,6 +68,13 @@ class LiveObserver:
                 where=f"profile {profile.name!r}",
                 remedy="name a topic with the pose in the map frame under [inputs.pose]",
             )
+        if profile.inputs.pose is not None and profile.inputs.pose.by_fix:
+            raise ConfigError(
+                "takes its pose from satellite fixes, whose frame and heading are not kept live",
+                where=f"profile {profile.name!r}",
+                remedy="name a topic with the pose in the map frame under [inputs.pose], such as"
+                " that of robot_localization's navsat_transform_node",
+            )
         if profile.goal_source == "hindsight":
             raise ConfigError(
                 "takes its goals by hindsight, and a robot on its way has none",

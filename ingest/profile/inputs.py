@@ -18,7 +18,12 @@ MOST_NAME = 64  # characters of a behaviour policy
 # `orientation` is a quaternion's path and becomes a yaw.
 INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "command": {"speed_mps": True, "yaw_rate_radps": False, "steering_rad": False},
-    "pose": {"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
+    "pose": {
+        **{"x_m": True, "y_m": True, "orientation": False, "yaw_rad": False},
+        **{"latitude_deg": False, "longitude_deg": False, "status": False},
+        **{"covariance_m2": False, "covariance_type": False},
+    },
+    "heading": {"orientation": False, "yaw_rad": False},  # of a pose by fix
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
     "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
     "scan": {"ranges_m": True, "angle_min_rad": True, "angle_increment_rad": True},
@@ -49,6 +54,7 @@ MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other typ
 STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POLICY_FALLBACK = "whose command it equals: {names}; else the profile's behaviour_policy"
+FIX_FALLBACK = "the direction of the last {track_m:g} m driven, as fixes do not say it"
 POSE_FALLBACK = "from transforms, by [frames]"
 WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
@@ -56,6 +62,9 @@ HINDSIGHT = {
     "goal": "by hindsight: where the drive stopped, turned back or came by often",
     "plan": "by hindsight: the way that was driven",
 }
+
+
+FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
 
 
 class Input(Checked, frozen=True):
@@ -68,6 +77,15 @@ class Input(Checked, frozen=True):
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # of a command that steers
     stop_holds: bool = False  # of the command: one to stop holds until the next, however old
+    # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
+    origin_deg: tuple[float, float] | None = None  # of the map; None: each recording's first fix
+    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # beyond it a fix is none; 5 m
+    track_m: Annotated[float, Meta(gt=0)] | None = None  # that its yaw is the direction of; 1 m
+
+    @property
+    def by_fix(self) -> bool:
+        """Whether it is a position by latitude and longitude."""
+        return "latitude_deg" in self.fields
 
 
 class Inputs(Checked, frozen=True):
@@ -76,6 +94,7 @@ class Inputs(Checked, frozen=True):
     command: Input
     wheels: Input | None = None  # None: speeds from poses, by [motion]
     pose: Input | None = None
+    heading: Input | None = None  # of a pose by fix; None: the direction that it drove
     scan: Input | None = None
     imu: Input | None = None
     goal: Input | None = None
@@ -105,8 +124,18 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
     missing = sorted(
         key for key, required in known.items() if required and key not in source.fields
     )
-    if name == "pose" and not source.fields.keys() & {"orientation", "yaw_rad"}:
+    if source.by_fix:
+        missing = sorted({"latitude_deg", "longitude_deg"} - source.fields.keys())
+        unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
+    elif name in ("pose", "heading") and not source.fields.keys() & {"orientation", "yaw_rad"}:
         missing.append("orientation")
+    given = [key for key in FIX_SETTINGS if getattr(source, key) is not None]
+    if given and not source.by_fix:
+        raise ConfigError(
+            f"`inputs.{name}.{given[0]}` is of a pose by latitude and longitude",
+            where=where,
+            remedy="leave it out, or give latitude_deg and longitude_deg",
+        )
     steered = "steering_rad" in source.fields
     if name in ("command", "nav_command"):
         if steered and "yaw_rate_radps" in source.fields:

@@ -30,6 +30,8 @@ from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
     FALLBACKS,
+    FIX_FALLBACK,
+    FIX_SETTINGS,
     HINDSIGHT,
     MOTION,
     POLICY_FALLBACK,
@@ -193,8 +195,13 @@ class Profile(Checked, frozen=True):
             apart |= {"motion"}
         if not self.command_sources:
             apart |= {"command_sources"}
+        for source in values["command_sources"].values():
+            for key in FIX_SETTINGS:
+                del source[key]
+        if self.inputs.heading is None:
+            del values["inputs"]["heading"]
         for source in filter(None, values["inputs"].values()):
-            for key in ("stop_holds", "wheelbase_m"):
+            for key in ("stop_holds", "wheelbase_m", *FIX_SETTINGS):
                 if not source[key]:
                     del source[key]
         rest = {key: value for key, value in values.items() if key not in apart}
@@ -237,6 +244,8 @@ class Profile(Checked, frozen=True):
             fallbacks["behaviour_policy"] = POLICY_FALLBACK.format(names=names)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
+        elif self.inputs.pose.by_fix and self.inputs.heading is None:
+            fallbacks["heading"] = FIX_FALLBACK.format(track_m=self.inputs.pose.track_m or 1.0)
         if self.motion is not None:
             fallbacks["wheels"] = WHEELS_FALLBACK.format(window_s=self.motion.window_s)
         if self.task.goal == "none":
@@ -347,7 +356,14 @@ def _check(profile: Profile, where: str) -> None:
         )
     for name, source in profile.command_sources.items():
         check_command_source(name, source, profile.inputs.command, where)
-    if profile.inputs.pose is None and profile.frames is None:
+    pose = profile.inputs.pose
+    if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
+        raise ConfigError(
+            "`inputs.heading` is of a pose by latitude and longitude, which has none of its own",
+            where=where,
+            remedy="leave it out: other poses say where they face",
+        )
+    if pose is None and profile.frames is None:
         raise ConfigError(
             "`inputs.pose` is missing, and there is no `frames`",
             where=where,

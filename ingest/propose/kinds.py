@@ -212,7 +212,7 @@ def _rises_m(recording: Recording) -> float:
     """How far the poses of a recording go up and down; 0 where there are none."""
     rises = [0.0]
     for topic, kind in topics_for(usable_topics(recording), KINDS["pose"]):
-        path = kind.fields["x_m"].removesuffix("x") + "z"
+        path = kind.fields.get("x_m", "").removesuffix("x") + "z"
         if path in recording.leaves(topic.name):
             heights = np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])
             heights = heights[np.isfinite(heights)]

@@ -14,8 +14,9 @@ import numpy as np
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Clock, Frames
-from restock.ingest.propose.roles import FrameGuess, Roles
+from restock.ingest.propose.roles import FIX, FIX_FIELDS, FrameGuess, Roles
 from restock.ingest.steps.align import align
+from restock.ingest.steps.fixes import Fixes, fixes_of
 from restock.ingest.steps.frames import FIELDS, Edges, Tree
 from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
@@ -92,14 +93,25 @@ def pose_series(
         series = PoseSeries.joined(poses_along(tree))
         return series, f"{frames.fixed} -> {frames.base} of {usual.topic}"
     topic, kind = roles["pose"][0]
+    if topic.type == FIX:
+        fixes = fixes_in(recording, topic.name)
+        at = fixes.poses()
+        order = np.argsort(fixes.time_ns, kind="stable")
+        columns = (column[order] for column in (fixes.time_ns, at.x_m, at.y_m, at.yaw_rad))
+        return PoseSeries.of(*columns), topic.name
     position = [kind.fields["x_m"], kind.fields["y_m"]]
     turned = kind.fields.get("orientation")
     turn = [f"{turned}.{axis}" for axis in "xyzw"] if turned else [kind.fields["yaw_rad"]]
-    columns = recording.read({topic.name: [*position, *turn]})[topic.name]
-    x, y, *parts = (np.asarray(columns.fields[p], np.float64) for p in (*position, *turn))
+    read = recording.read({topic.name: [*position, *turn]})[topic.name]
+    x, y, *parts = (np.asarray(read.fields[p], np.float64) for p in (*position, *turn))
     yaw = yaw_of(*parts) if turned else parts[0]
-    order = np.argsort(columns.log_time_ns, kind="stable")
-    return PoseSeries.of(columns.log_time_ns[order], x[order], y[order], yaw[order]), topic.name
+    order = np.argsort(read.log_time_ns, kind="stable")
+    return PoseSeries.of(read.log_time_ns[order], x[order], y[order], yaw[order]), topic.name
+
+
+def fixes_in(recording: Recording, topic: str) -> Fixes:
+    """The satellite fixes of a topic."""
+    return fixes_of(recording.read({topic: list(FIX_FIELDS.values())})[topic], FIX_FIELDS)
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:

@@ -19,11 +19,12 @@ from restock.ingest.propose.command_choice import CommandChoice
 from restock.ingest.propose.command_hold import CommandHold, TurnReading
 from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
-from restock.ingest.propose.motion_choice import MotionChoice
+from restock.ingest.propose.motion_choice import MotionChoice, fixes_in
 from restock.ingest.propose.robot_lines import RobotProposal
-from restock.ingest.propose.roles import KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
+from restock.ingest.propose.roles import FIX, KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
 from restock.ingest.propose.scanned_outline import OWN_SPREAD_M, ScannedOutline
 from restock.ingest.propose.trial import Trial
+from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 
@@ -115,6 +116,7 @@ def profile_lines(
         *_task_lines(seen, trial),
         *seen.goal.table_lines(),
         *_robot_lines(seen),
+        *_fix_noise_lines(seen),
         *_clock_lines(seen.clock, trial),
     ]
     for role, fitting in seen.roles.items():
@@ -368,6 +370,44 @@ def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
     ]
 
 
+def _fix_lines(seen: Evidence, topic: TopicInfo) -> list[str]:
+    """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
+    fixes = fixes_in(seen.recording, topic.name)
+    origin, std_m = fixes.origin_deg(), fixes.std_m()
+    told = std_m[np.isfinite(std_m)]
+    usual = float(np.median(told)) if len(told) else None
+    how = "they do not say how good they are" if usual is None else f"of {usual:.2g} m, mostly"
+    return [
+        f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
+        "# track_m driven (backing up looks turned round), or by an IMU that knows north:",
+        "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
+        *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
+        f"max_std_m = {MAX_STD_M:g}  # a fix that says it is worse is none",
+        f"track_m = {max(TRACK_M, round(3 * (usual or 0.0), 1)):g}",
+    ]
+
+
+def _fix_noise_lines(seen: Evidence) -> list[str]:
+    """How far two steps may lie apart, and what is slip: fixes come seldom, and scatter."""
+    pose = seen.roles["pose"][:1]
+    if not pose or pose[0][0].type != FIX:
+        return []
+    topic = pose[0][0].name
+    std_m = fixes_in(seen.recording, topic).std_m()
+    told = std_m[np.isfinite(std_m)]
+    usual = float(np.median(told)) if len(told) else 1.0
+    apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)
+    room = 2 * seen.commands.speed_mps * apart_s + 3 * usual
+    return [
+        "[episodes]",
+        f"max_pose_jump_m = {max(1.0, round(room, 1)):g}  # between two fixes: it drives on",
+        "",
+        "[noise]",
+        f"localiser_m = {max(usual, 0.01):.2g}  # as the fixes say; less would be taken for slip",
+        "",
+    ]
+
+
 def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
     """Four periods of a topic, or None (latched) for one with few messages."""
     rate = topic.expected / seconds if seconds > 0 else 0.0
@@ -417,6 +457,8 @@ def _input_lines(
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
+    if topic.type == FIX and role == "pose":
+        lines += _fix_lines(seen, topic)
     if role == "command" and seen.turns is not None:
         lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:

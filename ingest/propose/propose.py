@@ -43,6 +43,7 @@ from restock.ingest.propose.proposal_lines import (
 )
 from restock.ingest.propose.robot_lines import RobotProposal, propose_robot, urdf_footprint
 from restock.ingest.propose.roles import (
+    FIX,
     KINDS,
     LATCHED,
     ODOMETRY_AS_COMMAND,
@@ -223,6 +224,8 @@ def gather(
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
     frames = transform_frames(recording)
+    if frames is not None and all(topic.type == FIX for topic, _ in roles["pose"]):
+        roles["pose"] = []  # transforms say where it faces, too
     # Odometry drifts: where transforms lead to a map, they are the better pose.
     drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts

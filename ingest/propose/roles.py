@@ -30,6 +30,16 @@ class Kind:
     rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
 
 
+# Where nothing else says where the robot is.
+FIX = "sensor_msgs/msg/NavSatFix"
+FIX_FIELDS = {
+    "latitude_deg": "latitude",
+    "longitude_deg": "longitude",
+    "status": "status.status",
+    "covariance_m2": "position_covariance",
+    "covariance_type": "position_covariance_type",
+}
+
 # A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
 NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
 # Of several, what is nearest to the motor is driven: a multiplexer's output before its inputs.
@@ -106,6 +116,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             ("pose",),
             never=_ELSEWHERE,
         ),
+        Kind(FIX, FIX_FIELDS, ("fix", "gps", "gnss"), never=("filtered",)),
     ),
     "wheels": (Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),),
     "imu": (

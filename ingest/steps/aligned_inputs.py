@@ -26,6 +26,7 @@ from restock.ingest.steps.align import (
     align,
     ticks_of,
 )
+from restock.ingest.steps.fixes import FixedPoses, fixes_of
 from restock.ingest.steps.frames import FRAME_ID, Edges, Placement, Tree, plain
 from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import yaw_of
@@ -58,6 +59,8 @@ class InputColumns:
 
     def numbers(self, name: str, key: str) -> F64:
         """A field of an input, one number a message (N,)."""
+        if self.by_name[name].by_fix and key in ("x_m", "y_m", "yaw_rad"):
+            return np.asarray(getattr(self.fixed, key), np.float64)
         if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
             return self._yaw(name)
         if key == "yaw_rate_radps" and self.by_name[name].wheelbase_m is not None:
@@ -75,6 +78,28 @@ class InputColumns:
     def texts(self, name: str) -> list[str]:
         """The text of an input, one a message."""
         return [str(text) for text in np.asarray(self.column(name, "text"), object)]
+
+    @cached_property
+    def fixed(self) -> FixedPoses:
+        """The pose of each message, where it is by latitude and longitude."""
+        source = self.by_name["pose"]
+        columns, yaw = self.topics[source.topic], None
+        if "heading" in self.by_name:
+            yaw = self._heading_at(columns.log_time_ns)
+        fixes = fixes_of(columns, source.fields, yaw)
+        return fixes.poses(source.origin_deg, source.max_std_m, source.track_m)
+
+    def _heading_at(self, time_ns: Ints) -> F64:
+        """The heading (N,) received last at these log times; NaN where none is known."""
+        source = self.by_name["heading"]
+        said_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
+        order = np.argsort(said_ns, kind="stable")
+        said_ns, yaw = said_ns[order], yaw[order]
+        last = np.searchsorted(said_ns, time_ns, "right") - 1
+        known = last >= 0
+        if source.max_age_s is not None and len(said_ns):
+            known &= time_ns - said_ns[last] <= source.max_age_s * NS
+        return np.where(known, yaw[last], np.nan) if len(yaw) else np.full(len(time_ns), np.nan)
 
     @cached_property
     def plans(self) -> list[F64]:

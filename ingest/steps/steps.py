@@ -255,10 +255,15 @@ class Filling:
 
     def _pose(self) -> None:
         if "pose" in self.inputs.by_name:
-            self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
             latest = self.aligned.latest("pose")
+            usable = latest.known & latest.fresh
+            if self.inputs.by_name["pose"].by_fix and latest.known.any():
+                problem = np.where(usable, self.inputs.fixed.problem[latest.row], "")
+                self._mark_reasons("pose", problem)
+                usable &= problem == ""
+            self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
             self.signals["pose_stamp_ns"] = self.tick_ns - latest.age_ns
-            self.located = latest.known & latest.fresh
+            self.located = usable
             return
         tree = self.aligned.tree
         assert tree is not None  # the profile is refused otherwise

@@ -16,8 +16,16 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Frames, Profile
-from restock.ingest.propose.roles import KINDS, topics_for, transform_frames, usable_topics
+from restock.ingest.propose.roles import (
+    FIX,
+    FIX_FIELDS,
+    KINDS,
+    topics_for,
+    transform_frames,
+    usable_topics,
+)
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.fixes import fixes_of
 from restock.ingest.steps.frames import (
     AXES,
     FIELDS,
@@ -136,9 +144,11 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     along = None
     if guess is not None:
         along = along_transforms(recording, Frames(fixed=guess.fixed, base=guess.base))
-    found = _of_topics(
-        recording, {t.name: kind.fields for t, kind in topics_for(usable, KINDS["pose"])}
-    )
+    kinds = topics_for(usable, KINDS["pose"])
+    fixes = [topic.name for topic, _ in kinds if topic.type == FIX]
+    found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
+    if not found and along is None:  # another frame than anything else's, and no heading
+        found = [p for name in fixes for p in [_by_fixes(recording, name, FIX_FIELDS)] if p]
     localised = guess is not None and guess.localised
     return [p for p in ((along, *found) if localised else (*found, along)) if p is not None]
 
@@ -161,6 +171,9 @@ def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) ->
 def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
     source = profile.inputs.pose
     if source is not None and source.topic in recording.topics:
+        if source.by_fix:
+            settings = source.origin_deg, source.max_std_m, source.track_m
+            return _by_fixes(recording, source.topic, source.fields, *settings)
         found = _of_topics(recording, {source.topic: source.fields})
         return found[0] if found else None
     return None if profile.frames is None else along_transforms(recording, profile.frames)
@@ -187,6 +200,25 @@ def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) ->
         ):
             found.append(poses)
     return found
+
+
+def _by_fixes(
+    recording: Recording,
+    topic: str,
+    fields: Mapping[str, str],
+    origin_deg: tuple[float, float] | None = None,
+    max_std_m: float | None = None,
+    track_m: float | None = None,
+) -> Poses | None:
+    """The poses by a satellite receiver's fixes; their yaw is the direction that was driven."""
+    leaves = recording.leaves(topic)
+    wanted = [*fields.values(), *(path for path in (STAMP, FRAME_ID) if path in leaves)]
+    columns = recording.read({topic: wanted})[topic]
+    at = fixes_of(columns, fields).poses(origin_deg, max_std_m, track_m)
+    known = np.flatnonzero(at.problem == "")
+    times, yaw = Times.of(columns), at.yaw_rad[known]
+    kept = Times(times.stamp_ns[known], times.log_ns[known])
+    return _poses(kept, at.x_m[known], at.y_m[known], yaw, "", f"fixes of {topic}")
 
 
 def _paths(fields: Mapping[str, str]) -> list[str]:

@@ -1,0 +1,244 @@
+"""Poses by satellite fixes: metres east and north, no pose without a fix, and a causal heading."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.driven_robot import columns, write_topics
+from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import ConfigError
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.steps.fixes import Fixes, local_plane_m, track_yaw
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+
+AXIS_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
+ORIGIN = (47.3769, 8.5417)
+FIX, TWIST, IMU = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Imu"
+RATE_S = 0.1
+
+
+def geodesic_m(one: tuple[float, float], other: tuple[float, float]) -> float:
+    """The shortest way on the ellipsoid, by Vincenty's inverse formula (1975)."""
+    polar_m = (1 - FLATTENING) * AXIS_M
+    u1, u2 = (np.arctan((1 - FLATTENING) * np.tan(np.radians(p[0]))) for p in (one, other))
+    apart = turn = np.radians(other[1] - one[1])
+    for _ in range(50):
+        sin_s = np.hypot(
+            np.cos(u2) * np.sin(turn),
+            np.cos(u1) * np.sin(u2) - np.sin(u1) * np.cos(u2) * np.cos(turn),
+        )
+        cos_s = np.sin(u1) * np.sin(u2) + np.cos(u1) * np.cos(u2) * np.cos(turn)
+        sin_a = np.cos(u1) * np.cos(u2) * np.sin(turn) / sin_s
+        cos2 = 1 - sin_a**2
+        middle = cos_s - 2 * np.sin(u1) * np.sin(u2) / cos2
+        c = FLATTENING / 16 * cos2 * (4 + FLATTENING * (4 - 3 * cos2))
+        arc = np.arctan2(sin_s, cos_s)
+        turn = apart + (1 - c) * FLATTENING * sin_a * (
+            arc + c * sin_s * (middle + c * cos_s * (2 * middle**2 - 1))
+        )
+    k = cos2 * (AXIS_M**2 - polar_m**2) / polar_m**2
+    a = 1 + k / 16384 * (4096 + k * (-768 + k * (320 - 175 * k)))
+    b = k / 1024 * (256 + k * (-128 + k * (74 - 47 * k)))
+    sixth = b / 6 * middle * (4 * sin_s**2 - 3) * (4 * middle**2 - 3)
+    more = b * sin_s * (middle + b / 4 * (cos_s * (2 * middle**2 - 1) - sixth))
+    return float(polar_m * a * (arc - more))
+
+
+def degrees(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latitude and longitude of places near the origin, by the radii of curvature there."""
+    phi, squared = np.radians(ORIGIN[0]), FLATTENING * (2 - FLATTENING)
+    bend = 1 - squared * np.sin(phi) ** 2
+    north_m, east_m = AXIS_M * (1 - squared) / bend**1.5, AXIS_M / np.sqrt(bend)
+    return (
+        ORIGIN[0] + np.degrees(y_m / north_m),
+        ORIGIN[1] + np.degrees(x_m / east_m / np.cos(phi)),
+    )
+
+
+def drive(time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """2 s standing, 10 s east at 1 m/s, then a circle of 4 m radius to the left: x, y and yaw."""
+    along = np.clip(time_s - 2, 0, None)
+    turned = np.clip(along - 10, 0, None) / 4
+    x = np.minimum(along, 10) + 4 * np.sin(turned)
+    return x, 4 * (1 - np.cos(turned)), turned
+
+
+def recorded(folder: Path, *, heading: bool = False, seconds: float = 20.0) -> Path:
+    """A bag of commands and fixes; of the fixes from 8 s to 9 s none is one, and one is poor."""
+    time_s = np.arange(0, seconds, RATE_S)
+    x, y, yaw = drive(time_s)
+    latitude, longitude = degrees(x, y)
+    count = len(time_s)
+    covariance = np.tile(np.diag([0.01, 0.01, 0.04]).ravel(), (count, 1))
+    covariance[150] *= 1e5
+    lost = (time_s >= 8) & (time_s < 9)
+    ticks = np.arange(0.05, seconds, 0.2)
+    going = ticks > 2
+    turning = np.where(ticks > 12, 0.25, 0.0)
+    topics = {
+        "/cmd_vel": (
+            TWIST,
+            columns(
+                ticks,
+                {"linear.x": np.where(going, 1.0, 0.0), "angular.z": turning},
+                stamped=False,
+            ),
+        ),
+        "/gps/fix": (
+            FIX,
+            columns(
+                time_s,
+                {
+                    "latitude": np.where(lost, np.nan, latitude),
+                    "longitude": np.where(lost, np.nan, longitude),
+                    "status.status": np.where(lost, -1, 0),
+                    "position_covariance": covariance,
+                    "position_covariance_type": np.full(count, 2),
+                },
+            ),
+        ),
+    }
+    if heading:
+        half = yaw / 2
+        fields = {"orientation.z": np.sin(half), "orientation.w": np.cos(half)}
+        topics["/imu"] = (IMU, columns(time_s, fields))
+    return write_topics(topics, folder)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("fixes") / "bag")
+
+
+@pytest.mark.parametrize("km", [0.1, 1.0, 5.0, 10.0])
+def test_the_plane_is_as_accurate_as_it_is_said_to_be(km):
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        here = float(rng.uniform(-70, 70)), float(rng.uniform(-180, 180))
+        way = rng.uniform(0, 2 * np.pi)
+        there = (
+            here[0] + np.degrees(km * 1e3 * np.sin(way) / 6.371e6),
+            here[1] + np.degrees(km * 1e3 * np.cos(way) / 6.371e6 / np.cos(np.radians(here[0]))),
+        )
+        east, north = local_plane_m(np.array(there[:1]), np.array(there[1:]), here)[0]
+        assert np.hypot(east, north) == pytest.approx(geodesic_m(here, there), abs=0.005)
+        assert np.sign([east, north]).tolist() == np.sign([np.cos(way), np.sin(way)]).tolist()
+
+
+def test_a_hundredth_of_a_degree_on_the_equator():
+    """Lengths of a degree there: 110.574 km and 111.320 km."""
+    plane = local_plane_m(np.array([0.01, 0.0]), np.array([0.0, 0.01]), (0.0, 0.0))
+    assert plane == pytest.approx(np.array([[0.0, 1105.743], [1113.195, 0.0]]), abs=1e-3)
+
+
+def test_what_is_no_fix_is_no_pose_and_says_why():
+    count = 6
+    covariance = np.tile(np.diag([1.0, 1.0, 4.0]).ravel(), (count, 1))
+    covariance[4] *= 100
+    fixes = Fixes(
+        np.arange(count),
+        np.array([0.0, 47.0, np.nan, 47.0, 47.0, 147.0]),
+        np.array([0.0, 8.0, 8.0, 8.0, 8.0, 8.0]),
+        status=np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0]),
+        covariance_m2=covariance,
+        covariance_type=np.full(count, 2.0),
+    )
+    said = ["no fix"] * 3 + [""] + ["fix too uncertain", "no fix"]
+    assert fixes.problems(5.0).tolist() == said
+    assert fixes.problems(50.0)[4] == ""
+    assert fixes.origin_deg() == (47.0, 8.0)
+    assert np.isnan(fixes.poses().x_m).tolist() == [True, True, True, False, True, True]
+
+
+def test_the_heading_by_the_track_is_causal_held_and_turned_by_backing_up():
+    time_s = np.arange(0, 20, 0.1)
+    x, y, yaw = drive(time_s)
+    found = track_yaw(x, y, 1.0)
+    assert np.isnan(found[time_s < 2.95]).all()  # it has not driven a metre yet
+    later = time_s > 13.2
+    lag = 0.5 / 4  # of a circle of 4 m: the direction of a chord of a metre
+    assert found[later] == pytest.approx(yaw[later] - lag, abs=0.02)
+    for end in (35, 90, 150):
+        np.testing.assert_array_equal(track_yaw(x[:end], y[:end], 1.0), found[:end])
+    out = np.concatenate([np.arange(0, 5, 0.1), np.full(30, 4.9), np.arange(4.9, 0, -0.1)])
+    backed = track_yaw(out, np.zeros(len(out)), 1.0)
+    assert backed[50:85] == pytest.approx(np.zeros(35))  # while it stands, and a little after
+    assert np.abs(backed[-20:]) == pytest.approx(np.full(20, np.pi))
+
+
+def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, capsys):
+    profile, store = tmp_path / "gps.toml", tmp_path / "store"
+    assert main(["profile", "new", str(bag), "--out", str(profile)]) in (0, 3)
+    text = profile.read_text()
+    origin = degrees(*(column[:1] for column in drive(np.zeros(1))[:2]))
+    assert f"origin_deg = [{origin[0][0]:.7f}, {origin[1][0]:.7f}]" in text
+    assert f'type = "{FIX}"' in text
+    capsys.readouterr()
+    command = ["ingest", str(bag), "--profile", str(profile), "--store", str(store), "--json"]
+    assert main(command) == 0
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    dropped = {one["reason"]: one["count"] for one in row["drops"]}
+    assert dropped["pose: no fix"] == 5  # a second of ticks
+    assert dropped["pose: fix too uncertain"] == 1
+    assert dropped["pose: heading unknown until it has driven"] >= 10
+    with Store(store) as opened:
+        rows = opened.sql("FROM transitions ORDER BY stamp_ns").to_arrow_table()
+    at_s = (rows["pose_stamp_ns"].to_numpy() - 1_700_000_000 * 10**9) * 1e-9
+    x, y, _ = drive(at_s)
+    assert rows["pose_x_m"].to_numpy() == pytest.approx(x, abs=0.01)
+    assert rows["pose_y_m"].to_numpy() == pytest.approx(y, abs=0.01)
+    speeds = rows["wheel_speed_mps"].to_numpy()[(at_s > 6) & (at_s < 7.8)]
+    assert speeds == pytest.approx(np.ones(len(speeds)), abs=0.02)
+
+
+def test_the_heading_of_an_imu_stands_in_for_the_track(tmp_path):
+    bag = recorded(tmp_path / "bag", heading=True)
+    main(["profile", "new", str(bag), "--out", str(tmp_path / "gps.toml")])
+    heading = (
+        f'[inputs.heading]\ntopic = "/imu"\ntype = "{IMU}"\n'
+        'fields = { orientation = "orientation" }\nmax_age_s = 0.5\n'
+    )
+    text = (tmp_path / "gps.toml").read_text() + heading
+    profile = parse_profile(text, where="gps.toml")
+    outcome = ingest(bag, profile, store=StoreWriter(tmp_path / "store"))
+    assert not any("heading" in one["reason"] for one in outcome.manifest["drops"])
+    with Store(tmp_path / "store") as opened:
+        rows = opened.sql("FROM transitions ORDER BY stamp_ns").to_arrow_table()
+    at_s = (rows["pose_stamp_ns"].to_numpy() - 1_700_000_000 * 10**9) * 1e-9
+    turned = rows["pose_yaw_rad"].to_numpy()
+    assert turned == pytest.approx(drive(at_s)[2], abs=0.01)
+    with pytest.raises(ConfigError, match="has none of its own"):
+        parse_profile(WAREHOUSE + "\n" + heading, where="warehouse.toml")
+
+
+def test_it_is_not_done_live(bag, tmp_path):
+    main(["profile", "new", str(bag), "--out", str(tmp_path / "gps.toml")])
+    with pytest.raises(ConfigError, match="satellite fixes"):
+        LiveObserver(load_profile(tmp_path / "gps.toml"))
+
+
+HUSKY = ROOT.parent / "shared" / "bags" / "ros1" / "husky_robot_localization.bag"
+
+
+@pytest.mark.skipif(not HUSKY.exists(), reason="recordings of others are not there")
+def test_a_husky_outdoors_drives_as_far_by_its_fixes_as_by_its_wheels():
+    from restock.ingest.containers.open_recording import open_recording
+    from restock.ingest.propose.motion_choice import fixes_in
+
+    with open_recording(HUSKY) as recording:
+        (name,) = [n for n, t in recording.topics.items() if t.type == FIX]
+        fixes = fixes_in(recording, name)
+    at = fixes.poses(max_std_m=100.0)
+    known = np.isfinite(at.x_m)
+    assert known.mean() > 0.9
+    reach = np.hypot(np.ptp(at.x_m[known]), np.ptp(at.y_m[known]))
+    assert 5 < reach < 2000
