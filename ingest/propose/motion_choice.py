@@ -16,7 +16,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Clock, Frames
 from restock.ingest.propose.roles import FIX, FIX_FIELDS, FrameGuess, Roles
 from restock.ingest.steps.align import align
-from restock.ingest.steps.fixes import Fixes, fixes_of
+from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.steps.frames import FIELDS, Edges, Tree
 from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
@@ -97,8 +97,8 @@ def pose_series(
         fixes = fixes_in(recording, topic.name)
         at = fixes.poses()
         order = np.argsort(fixes.time_ns, kind="stable")
-        columns = (column[order] for column in (fixes.time_ns, at.x_m, at.y_m, at.yaw_rad))
-        return PoseSeries.of(*columns), topic.name
+        columns = (column[order] for column in (at.x_m, at.y_m, at.yaw_rad))
+        return PoseSeries.of(fixes.time_ns[order], *columns), topic.name
     position = [kind.fields["x_m"], kind.fields["y_m"]]
     turned = kind.fields.get("orientation")
     turn = [f"{turned}.{axis}" for axis in "xyzw"] if turned else [kind.fields["yaw_rad"]]
@@ -112,6 +112,41 @@ def pose_series(
 def fixes_in(recording: Recording, topic: str) -> Fixes:
     """The satellite fixes of a topic."""
     return fixes_of(recording.read({topic: list(FIX_FIELDS.values())})[topic], FIX_FIELDS)
+
+
+def fix_lines(recording: Recording, topic: str) -> list[str]:
+    """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
+    fixes = fixes_in(recording, topic)
+    origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
+    how = "they do not say how good they are" if usual is None else f"of {usual:.2g} m, mostly"
+    return [
+        f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
+        "# track_m driven (backing up looks turned round), or by an IMU that knows north:",
+        "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
+        *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
+        f"max_std_m = {MAX_STD_M:g}  # a fix that says it is worse is none",
+        f"track_m = {max(TRACK_M, round(3 * (usual or 0.0), 1)):g}",
+    ]
+
+
+def fix_noise_lines(recording: Recording, topic: str, driven_m: float) -> list[str]:
+    """What is a jump, and what slip, of fixes between which `driven_m` are driven."""
+    usual = _usual_std_m(fixes_in(recording, topic)) or 1.0
+    return [
+        "[episodes]",
+        f"max_pose_jump_m = {max(1.0, round(driven_m + 3 * usual, 1)):g}  # between two fixes",
+        "",
+        "[noise]",
+        f"localiser_m = {max(usual, 0.01):.2g}  # as the fixes say; less would be taken for slip",
+        "",
+    ]
+
+
+def _usual_std_m(fixes: Fixes) -> float | None:
+    """The median that they give; None where they do not say."""
+    std_m = fixes.std_m()
+    told = std_m[np.isfinite(std_m)]
+    return float(np.median(told)) if len(told) else None
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:

@@ -19,16 +19,14 @@ from restock.ingest.propose.command_choice import CommandChoice
 from restock.ingest.propose.command_hold import CommandHold, TurnReading
 from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
-from restock.ingest.propose.motion_choice import MotionChoice, fixes_in
+from restock.ingest.propose.motion_choice import MotionChoice, fix_lines, fix_noise_lines
 from restock.ingest.propose.robot_lines import RobotProposal
 from restock.ingest.propose.roles import FIX, KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
-from restock.ingest.propose.scanned_outline import OWN_SPREAD_M, ScannedOutline
+from restock.ingest.propose.scanned_outline import ScannedOutline, range_lines
 from restock.ingest.propose.trial import Trial
-from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 
-LEAST_RANGE_M = 0.01
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 
 
@@ -116,7 +114,7 @@ def profile_lines(
         *_task_lines(seen, trial),
         *seen.goal.table_lines(),
         *_robot_lines(seen),
-        *_fix_noise_lines(seen),
+        *_noise_lines(seen),
         *_clock_lines(seen.clock, trial),
     ]
     for role, fitting in seen.roles.items():
@@ -327,32 +325,20 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
 def _range_lines(seen: Evidence) -> list[str]:
     if not seen.roles["scan"]:
         return ["sectors = 0  # no lidar: clearance is unknown, and no part of the observation"]
-    low, high, why = _lidar_range(seen)
-    return [
-        f"range_min_m = {low:g}{why}",
-        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
-    ]
+    return range_lines(seen.recording, seen.roles["scan"][0][0].name, seen.outline)
 
 
-def _lidar_range(seen: Evidence) -> tuple[float, float, str]:
-    """The nearest and the farthest range of use, at most 4 m, and why where the lidar says less.
+def _fix_topic(seen: Evidence) -> str:
+    """The topic of the fixes that its pose is from, or ""."""
+    pose = seen.roles["pose"][:1]
+    return pose[0][0].name if pose and pose[0][0].type == FIX else ""
 
-    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
-    """
-    topic = seen.roles["scan"][0][0].name
-    columns = seen.recording.read({topic: ["range_min", "range_max"]})[topic].fields
-    low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))
-    if not 0 <= low < high < np.inf:
-        return 0.05, 4.0, ""
-    own_m = (
-        seen.outline.own_range_m + OWN_SPREAD_M if seen.outline and len(seen.outline.own_m) else 0
-    )
-    why = ""
-    if low < LEAST_RANGE_M:
-        low, why = LEAST_RANGE_M, "  # the lidar says less; 0 is where nothing came back"
-    if own_m > low:
-        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
-    return round(low, 3), min(round(high, 3), 4.0), why
+
+def _noise_lines(seen: Evidence) -> list[str]:
+    if not (topic := _fix_topic(seen)):
+        return []
+    apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)
+    return fix_noise_lines(seen.recording, topic, 2 * seen.commands.speed_mps * apart_s)
 
 
 def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
@@ -366,44 +352,6 @@ def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
         f'steps = "{clock.steps}"  # {why}' + ("" if clock.every_s is None else ", mostly"),
         *_said(trial, "clock.max_gap_s"),
         f"max_gap_s = {clock.max_gap_s:g}  # a longer one ends an episode",
-        "",
-    ]
-
-
-def _fix_lines(seen: Evidence, topic: TopicInfo) -> list[str]:
-    """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
-    fixes = fixes_in(seen.recording, topic.name)
-    origin, std_m = fixes.origin_deg(), fixes.std_m()
-    told = std_m[np.isfinite(std_m)]
-    usual = float(np.median(told)) if len(told) else None
-    how = "they do not say how good they are" if usual is None else f"of {usual:.2g} m, mostly"
-    return [
-        f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
-        "# track_m driven (backing up looks turned round), or by an IMU that knows north:",
-        "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
-        *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
-        f"max_std_m = {MAX_STD_M:g}  # a fix that says it is worse is none",
-        f"track_m = {max(TRACK_M, round(3 * (usual or 0.0), 1)):g}",
-    ]
-
-
-def _fix_noise_lines(seen: Evidence) -> list[str]:
-    """How far two steps may lie apart, and what is slip: fixes come seldom, and scatter."""
-    pose = seen.roles["pose"][:1]
-    if not pose or pose[0][0].type != FIX:
-        return []
-    topic = pose[0][0].name
-    std_m = fixes_in(seen.recording, topic).std_m()
-    told = std_m[np.isfinite(std_m)]
-    usual = float(np.median(told)) if len(told) else 1.0
-    apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)
-    room = 2 * seen.commands.speed_mps * apart_s + 3 * usual
-    return [
-        "[episodes]",
-        f"max_pose_jump_m = {max(1.0, round(room, 1)):g}  # between two fixes: it drives on",
-        "",
-        "[noise]",
-        f"localiser_m = {max(usual, 0.01):.2g}  # as the fixes say; less would be taken for slip",
         "",
     ]
 
@@ -457,8 +405,8 @@ def _input_lines(
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
-    if topic.type == FIX and role == "pose":
-        lines += _fix_lines(seen, topic)
+    if role == "pose" and _fix_topic(seen):
+        lines += fix_lines(seen.recording, topic.name)
     if role == "command" and seen.turns is not None:
         lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:

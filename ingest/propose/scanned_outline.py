@@ -31,6 +31,7 @@ LEAST_SCANS = 20
 OFTEN = 0.005  # of the scans, and at least three: one odd return says nothing
 ROOM_M = 0.05  # that a robot leaves between itself and what it comes nearest to
 LEAST_M = 0.1  # half of a robot's length
+LEAST_RANGE_M = 0.01
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
 FACING_RAD, LEAST_FACINGS, LEAST_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
@@ -125,6 +126,35 @@ def _nearest(fields: Mapping[str, FieldColumn] | Fields) -> dict[str, FieldColum
     place = np.minimum(turn[valid].astype(np.int64), BINS - 1)
     np.minimum.at(found, (row[valid], place), values[valid])
     return {NEAREST: found}
+
+
+def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
+    """The nearest and the farthest range of use, as a task has them."""
+    low, high, why = _range_m(recording, topic, outline)
+    return [
+        f"range_min_m = {low:g}{why}",
+        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
+    ]
+
+
+def _range_m(
+    recording: Recording, topic: str, outline: ScannedOutline | None
+) -> tuple[float, float, str]:
+    """The nearest and the farthest, at most 4 m, and why where the lidar says less.
+
+    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
+    """
+    columns = recording.read({topic: ["range_min", "range_max"]})[topic].fields
+    low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))
+    if not 0 <= low < high < np.inf:
+        return 0.05, 4.0, ""
+    own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
+    why = ""
+    if low < LEAST_RANGE_M:
+        low, why = LEAST_RANGE_M, "  # the lidar says less; 0 is where nothing came back"
+    if own_m > low:
+        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
+    return round(low, 3), min(round(high, 3), 4.0), why
 
 
 def lidar_place(recording: Recording, scan_frame: str) -> tuple[float, float, str] | None:

@@ -199,6 +199,12 @@ def by_poses(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "stand_ins", stand_ins)
 
 
+def without_lidar(table: pa.Table, recordings: pa.Table) -> Tables:
+    lost = {"condition": "recovery", "kind": "outcome", "signals": ["clearance_m"]}
+    unknown = [[lost | {"because": "no lidar"}], []]
+    return table, replaced(recordings, "unknown_conditions", unknown)
+
+
 def by_hindsight(table: pa.Table, recordings: pa.Table) -> Tables:
     first = rows_where(table, "recording_id", f"{1:016x}")
     return replaced(table, "goal_source", np.where(first, "hindsight", None)), recordings
@@ -321,6 +327,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("goals_by_hindsight", by_hindsight, 1, {"recording_id": f"{1:016x}"}),
     ("mixed_goal_sources", both_kinds_of_goals, 1, {"logged_episodes": 120}),
     ("speeds_from_poses", by_poses, 1, {"instead": "speeds from poses"}),
+    ("unknown_conditions", without_lidar, 1, {"condition": "recovery", "recordings": 1}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("one_action", one_circle, 1, {"recording_id": f"{1:016x}", "action": 3, "share": 1.0}),
     ("same_drive", replayed, 1, {"same_as": f"{2:016x}", "later_s": 33e6}),

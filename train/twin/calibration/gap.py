@@ -131,7 +131,7 @@ def _floor_difference(
     store: Store, steps: LoggedSteps, warehouse: Warehouse, rng: np.random.Generator
 ) -> float:
     rows = np.flatnonzero(steps.conditions[NOMINAL])
-    if not len(rows):
+    if not len(rows) or not steps.task.lidar:
         return 1.0
     return agreement(steps, store, np.sort(rng.permutation(rows)[:_FLOOR_ROWS]), warehouse)
 
@@ -286,7 +286,12 @@ def _not_done(
 ) -> Iterator[str]:  # fmt: skip
     if AFTER not in twins:
         yield "No gap after calibration: no fitted perturbation was given."
-    if difference > AGREES:
+    if not steps.task.lidar:
+        yield (
+            "Steps were driven on an empty floor, where nothing is bumped into: the robot has no"
+            " lidar, so nothing says on which floor it was."
+        )
+    elif difference > AGREES:
         yield (
             "What the lidar sees was not compared: the log was driven on another floor than the"
             f" twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is the"
