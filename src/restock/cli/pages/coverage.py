@@ -94,11 +94,11 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
     share, success = row["share"], row["success_share"]
     return {
         "condition": row["condition"],
-        "rows": row["rows"],
+        "rows": "unknown" if row["rows"] is None else row["rows"],
         "share": "" if share is None else f"{share:.1%}",
         "episodes": row["episodes"],
         "success": "" if success is None else f"{success:.0%}",
         "zones": row["zones"],
         "recordings": row["recordings"],
-        "who drove": ", ".join(str(name) for name in row["behaviour_policies"] if name),
+        "who drove": ", ".join(str(name) for name in row["behaviour_policies"] or () if name),
     }

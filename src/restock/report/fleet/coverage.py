@@ -105,9 +105,12 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
             f"Shortest against what is asked for: {words(worst['cell'])}, {worst['there']:,} of"
             f" {worst['needed']:,} {worst['counted']}"
         )
-    never = [words(row["condition"]) for row in shelves if not row["rows"]]
+    never = [words(row["condition"]) for row in shelves if row["rows"] == 0]
     if never:
         text += f"; never seen: {', '.join(never)}"
+    unknown = [words(row["condition"]) for row in shelves if row["rows"] is None]
+    if unknown:
+        text += f"; unknown of every recording: {', '.join(unknown)}"
     plan = gaps["plan"]
     if plan["orders"]:
         text += (
@@ -118,6 +121,8 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
 
 
 def _shelves(rows: Rows) -> Section:
+    unknown = [words(row["condition"]) for row in rows if row["rows"] is None]
+    rows = [row for row in rows if row["rows"] is not None]
     table = [
         {
             "condition": words(row["condition"]),
@@ -137,7 +142,13 @@ def _shelves(rows: Rows) -> Section:
         "shelves",
         "The shelves",
         intro="One shelf a condition. A row lies on the shelf of its rarest condition; it holds for"
-        " others too. Effective episodes: how many equally long ones it would be.",
+        " others too. Effective episodes: how many equally long ones it would be."
+        + (
+            f" No row tells {', '.join(unknown)}: nothing was measured that they need (see the view"
+            " unknown_conditions)."
+            if unknown
+            else ""
+        ),
         figures=[Figure(_bars(rows), "Rows of each condition (logarithmic)")] if rows else [],
         two=True,
         tables=[Table(table, set(table[0]) - {"condition", "who drove"} if table else set())],
