@@ -39,7 +39,7 @@ class _After:
             execute(module)
             self.action()
 
-        spec.loader.exec_module = exec_module
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
         return spec
 
 
