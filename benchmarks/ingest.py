@@ -33,7 +33,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 
-FLOOR = "decompress only"
+FLOOR = "decompress and check only"
 OURS = "restock, all topics"
 OURS_PROFILE = "restock, a profile's fields"
 OURS_WALKED = "restock, no message index"

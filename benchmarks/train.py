@@ -5,8 +5,11 @@
 Equal network (2 x 256 ReLU; no LayerNorm, which the peers' MLPs do not have), equal batch, Adam,
 plain DQN targets, one thread, sampling from a full buffer included: CleanRL's logic,
 Stable-Baselines3, Tianshou, TorchRL and d3rlpy, each where it is installed (d3rlpy in a Python of
-its own, `--neighbours`). Then Restock's own ways: by autograd, with LayerNorm, its default (double
-DQN, LayerNorm, half of the batch from logs by quotas), and that with the record of what was fed.
+its own, `--neighbours`) and with its own defaults; the first two once more with Restock's
+settings (a Polyak pull at every update, fused Adam: `_equal`). Then Restock's own ways: by
+autograd, with LayerNorm, its default (double DQN, LayerNorm, half of the batch from logs by
+quotas), and that with the record of what was fed. The floor is the update's matrix products by
+the faster of PyTorch's two libraries, and nothing else.
 Figures are CPU times. `--check` exits 1 where a target of the design is missed.
 """
 
@@ -43,6 +46,7 @@ from restock.replay.ring.ring import FreshRing
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.manual_backprop import UpdatePath
+from restock.train.dqn.products import product, product_into
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.held_rows import EpisodeLabels
@@ -146,22 +150,28 @@ def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:
     return update
 
 
-def products(batch: int) -> Updates:
-    """The matrix products of an update alone: two passes forward, one backward."""
+def products(batch: int, *, best: bool) -> Updates:
+    """The matrix products of an update alone: two passes forward, one backward.
+
+    By `torch.mm` as it comes, or, `best`, by the faster library for this processor.
+    """
     sizes = [OBSERVATION, 256, 256, ACTIONS]
     weights = [torch.randn(after, before) for before, after in itertools.pairwise(sizes)]
     values = [torch.randn(batch, size) for size in sizes]
-    outs = [torch.empty_like(value) for value in values]
     into = [torch.empty_like(weight) for weight in weights]
+    times = product if best else torch.mm
 
     def update(updates: int) -> None:
         for _ in range(updates):
             for layer in (0, 1, 2) * 2:
-                torch.mm(values[layer], weights[layer].t(), out=outs[layer + 1])
+                times(values[layer], weights[layer].t())
             for layer in (2, 1, 0):
-                torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
+                if best:
+                    product_into(into[layer], values[layer + 1].t(), values[layer])
+                else:
+                    torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
                 if layer:
-                    torch.mm(values[layer + 1], weights[layer], out=outs[layer])
+                    times(values[layer + 1], weights[layer])
 
     return update
 
@@ -183,6 +193,7 @@ def lines(answer: dict[str, Any]) -> Iterator[str]:
         yield f"{name} / restock: {value:.2f}x{target}"
     yield from (f"{name}: not installed, left out" for name in answer["left_out"])
     over, share = answer["over_in_place"], answer["record_share"]
+    yield f"restock / the best products alone: {answer['over_products']:.2f}x"
     yield f"restock / in place: {over:.2f}x (target at most {IN_PLACE_TARGET}x)"
     yield f"record of what was fed: {share:.1%} of an update (target at most {FEED_TARGET:.0%})"
 
@@ -203,7 +214,9 @@ def main() -> int:
     normed, default = config(batch, loss={"double": False}), config(batch)
     peers = {
         "cleanrl": cleanrl(batch, arrays),
+        "cleanrl_equal": cleanrl(batch, arrays, equal=True),
         "stable_baselines3": stable_baselines3(batch, arrays),
+        "stable_baselines3_equal": stable_baselines3(batch, arrays, equal=True),
         "tianshou": tianshou(batch, arrays),
         "torchrl": torchrl(batch, arrays),
         "d3rlpy": d3rlpy(batch, arrays, options.neighbours),
@@ -211,7 +224,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         run = Run.create(Path(folder) / "run", {})
         contenders: dict[str, Updates] = {
-            "products": products(batch),
+            "products": products(batch, best=True),
+            "products_by_torch_mm": products(batch, best=False),
             "restock_in_place": in_place(equal, arrays),
             "restock": Restock(equal, arrays),
             "restock_autograd": Restock(equal, arrays, path="autograd"),
@@ -227,6 +241,7 @@ def main() -> int:
         us = medians(in_turns(timed, rounds))
     ratios = {name: us[name] / us["restock"] for name in peers if name in us}
     over = us["restock"] / us["restock_in_place"]
+    floor = min(us["products"], us["products_by_torch_mm"])
     feed = us["restock_default_recorded"] / us["restock_default"] - 1
     missed = [
         f"{name}: {ratios[name]:.2f}x, target {target}x"
@@ -242,6 +257,7 @@ def main() -> int:
         "us_per_update": us,
         "ratios": ratios,
         "over_in_place": over,
+        "over_products": us["restock"] / floor,
         "left_out": [name for name, peer in peers.items() if peer is None],
         "record_share": feed,
     }

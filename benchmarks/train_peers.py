@@ -1,13 +1,15 @@
 """The same DQN update in other libraries: 2 x 256 ReLU, Adam, their own loss.
 
 Each function returns what makes `n` updates from a full buffer of the same rows, or None where the
-library is not installed. Target networks follow each library's own way: Polyak 0.005 at every
-update where it has that (CleanRL, Stable-Baselines3, TorchRL), a copy at every 500th where it does
-not (Tianshou, d3rlpy), which is less work.
+library is not installed. Target networks and optimisers are each library's defaults: a copy at
+every so many updates, which is less work than Restock's pull at every one (TorchRL alone is given
+that). CleanRL and Stable-Baselines3 can be given Restock's settings instead, `equal`: the pull, and
+PyTorch's fused Adam.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -45,16 +47,17 @@ def mlp() -> nn.Sequential:
     )
 
 
-def cleanrl(batch: int, arrays: Arrays) -> Updates:
+def cleanrl(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates:
     """The update of CleanRL's `cleanrl/dqn.py`, line by line, without its logging.
 
     Its buffer is the one of Stable-Baselines3 1 (`cleanrl_utils/buffers.py`): a gather of each
-    column, then `torch.tensor`. Its target moves by `tau` every `target_network_frequency`: every
-    update here, as Restock's default does.
+    column, then `torch.tensor`. Its target is copied every 500 steps (`tau` 1).
     """
+    tau, every = (TAU, 1) if equal else (1.0, COPY_EVERY)
     network, target = mlp(), mlp()
     target.load_state_dict(network.state_dict())
-    optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
+    optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE, fused=equal or None)
+    steps = itertools.count(1)
     rng = np.random.default_rng(0)
 
     def update(updates: int) -> None:
@@ -69,13 +72,15 @@ def cleanrl(batch: int, arrays: Arrays) -> Updates:
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-            for slow, fast in zip(target.parameters(), network.parameters(), strict=True):
-                slow.data.copy_(TAU * fast.data + (1.0 - TAU) * slow.data)
+            if next(steps) % every == 0:
+                for slow, fast in zip(target.parameters(), network.parameters(), strict=True):
+                    slow.data.copy_(tau * fast.data + (1.0 - tau) * slow.data)
 
     return update
 
 
-def stable_baselines3(batch: int, arrays: Arrays) -> Updates | None:
+def stable_baselines3(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates | None:
+    """Its target is copied every 10,000 steps by default: never, within a benchmark."""
     try:
         import gymnasium
         from stable_baselines3 import DQN
@@ -95,8 +100,11 @@ def stable_baselines3(batch: int, arrays: Arrays) -> Updates | None:
         buffer_size=ROWS,
         batch_size=batch,
         gamma=DISCOUNT,
-        tau=TAU,
-        policy_kwargs={"net_arch": [256, 256]},
+        tau=TAU if equal else 1.0,
+        policy_kwargs={
+            "net_arch": [256, 256],
+            "optimizer_kwargs": {"fused": True} if equal else {},
+        },
         device="cpu",
     )
     model.set_logger(Logger(None, []))
@@ -109,7 +117,9 @@ def stable_baselines3(batch: int, arrays: Arrays) -> Updates | None:
     def update(updates: int) -> None:
         for _ in range(updates):
             model.train(gradient_steps=1, batch_size=batch)
-            polyak_update(model.q_net.parameters(), model.q_net_target.parameters(), TAU)
+            if equal:
+                slow, fast = model.q_net_target, model.q_net
+                polyak_update(fast.parameters(), slow.parameters(), TAU)
 
     return update
 
