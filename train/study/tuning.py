@@ -148,8 +148,8 @@ def draw(trial: Any, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
             step = {} if one.step is None else {"step": int(one.step)}
             values[name] = trial.suggest_int(name, one.low, one.high, log=one.log, **step)
         else:
-            step = {} if one.step is None else {"step": one.step}
-            values[name] = trial.suggest_float(name, one.low, one.high, log=one.log, **step)
+            apart = None if one.step is None else float(one.step)
+            values[name] = trial.suggest_float(name, one.low, one.high, log=one.log, step=apart)
     return values
 
 
