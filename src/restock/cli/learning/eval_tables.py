@@ -10,12 +10,16 @@ from restock.stats import interval_text
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
 
+_WIDE = 140  # columns of a terminal from which on the table of an evaluation has all of these
+_WIDER = ("discounted return", "people, least (mean) m", "lost s")
+
 
 def show_measures(rows: list[dict[str, Any]]) -> None:
     """A table a perturbation: success, return and safety side by side, policies beneath each
     other within a condition."""
-    from restock.cli.output import print_table, say
+    from restock.cli.output import print_table, say, stdout
 
+    wide = stdout().width >= _WIDE
     for perturbation in dict.fromkeys(row["perturbation"] for row in rows):
         own = [row for row in rows if row["perturbation"] == perturbation]
         cells = list(dict.fromkeys(row["condition"] for row in own))
@@ -24,10 +28,14 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         if not any(row["held back"] for row in shown):
             for row in shown:
                 del row["held back"]
+        if not wide:
+            shown = [{k: v for k, v in row.items() if k not in _WIDER} for row in shown]
         print_table(
             shown,
             title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
         )
+    if not wide:
+        say(f"not shown in {stdout().width} columns, but with --json: {', '.join(_WIDER)}")
     if not any(row["policy"] == "planner" for row in rows) and not any(
         row["time_lost_episodes"] for row in rows
     ):

@@ -114,6 +114,7 @@ def tell(to: Settings, console: Console) -> None:
             " what\nother missions of the kind might give (95 %).[/dim]"
         )
         print_table(rows)
+        console.print(story.trained(to))
     show("The shelves, before and after mixing", story.shelves(to.panel))
     show("One rare event, from its message to an update", story.rare_event(to))
     show("What to try next", story.next_steps(to))

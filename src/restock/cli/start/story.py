@@ -83,6 +83,17 @@ def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
     return f"{sum(of)} of {len(of)} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
+def trained(to: Settings) -> str:
+    """How far fine-tuning came, in a sentence."""
+    from restock.train.run.run import Run
+
+    steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
+    return (
+        f"Fine-tuned means {max(steps, default=0):,} steps in the twin here;"
+        " docs/learning.md has what more give."
+    )
+
+
 def shelves(panel: Path) -> list[str]:
     """A line a shelf: its share of the logs, its share of what is drawn, and both as a bar."""
     from restock.replay.panel.panel import Panel
@@ -214,4 +225,4 @@ def next_steps(to: Settings) -> list[str]:
     ]
 
 
-__all__ = ["OPENING", "RARE", "before_and_after", "next_steps", "rare_event", "shelves"]
+__all__ = ["OPENING", "RARE", "before_and_after", "next_steps", "rare_event", "shelves", "trained"]
