@@ -16,7 +16,8 @@ from restock.ingest.decoding.columns import offsets_of
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
-from restock.ingest.store.episode_rows import ENDS, EpisodeRows, episode_rows, groups, packed
+from restock.ingest.store.episode_rows import EpisodeRows, episode_rows, groups, packed
+from restock.ingest.store.summary import ENDS
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import COVERAGE, STEP_BITS, signal_columns, transition_schema

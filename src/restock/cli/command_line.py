@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import types
 import typing
 from typing import Annotated, Any, Literal
 
 import tyro
 
+_PREPARED: list[type[Any]] = []
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
-@functools.cache
 def prepared(command: type[Any]) -> type[Any]:
     """The dataclass with its types written so that its help is plain and its parsing quick.
 
@@ -21,6 +20,9 @@ def prepared(command: type[Any]) -> type[Any]:
     typeguard, and with that asyncio. An option that may be left out shows what it takes, not
     `{None}|STR`, and no default where that says nothing.
     """
+    if command in _PREPARED:
+        return command
+    _PREPARED.append(command)
     hints = typing.get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
         field.type = _prepared(hints[field.name], field.default)
