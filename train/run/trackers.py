@@ -89,13 +89,14 @@ class WandbSink:
 
         known = tracked(run.path).get("wandb", {})
         self._mode = os.environ.get("WANDB_MODE", "offline")
-        self._run: Any = wandb.init(
+        init: Any = wandb.init
+        self._run: Any = init(
             project=os.environ.get("WANDB_PROJECT", PROJECT),
             name=run.path.name,
             id=known.get("id"),
             resume="allow" if known else None,
             dir=str(run.path),
-            mode=self._mode,  # type: ignore[arg-type]
+            mode=self._mode,
             config=dict(run.document["config"]),
             settings=wandb.Settings(console="off", silent=True, disable_git=True),
         )

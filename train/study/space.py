@@ -114,7 +114,7 @@ def load_search(path: Path) -> Search:
     Raises:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
-    remedy = "docs/study.md lists every key with its meaning"
+    remedy = "docs/tune.md lists every key with its meaning"
     search = typed(read_toml(path), Search, where=str(path), remedy=remedy)
     for name, parameter in search.parameters.items():
         values = parameter.choices or (parameter.low, parameter.high)

@@ -75,6 +75,12 @@ class EvalCommand:
 
     def run(self) -> int:
         if self.on_logs is not None:
+            if self.video:
+                from restock.errors import ConfigError
+
+                raise ConfigError(
+                    "on logs nothing drives", where="--video", remedy="leave out --on-logs"
+                )
             return self._evaluate_off_policy(self.on_logs)
         return self._drive()
 
