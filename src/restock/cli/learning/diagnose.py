@@ -71,12 +71,12 @@ class DiagnoseCommand:
             )
         runs = [Run.open(path) for path in self.runs]
         diagnosis = diagnose(runs)
-        found, reason = rows_of(runs) if self.rows else (None, "it was not asked for")
+        found, reason = rows_of(runs) if self.rows else (None, "")
         if found is not None:
             diagnosis = with_rows(diagnosis, found)
         if not self.json:
             _show(diagnosis, self.runs)
-            if found is None:
+            if found is None and self.rows:
                 say(f"the rows of its panel were not held against the twin: {reason}")
         confirmation = (
             confirm(runs[0], diagnosis, self.confirm) if self.confirm is not None else None
