@@ -324,9 +324,12 @@ class Store:
             self.path.read(f"{table.table}/{path}", columns=table.schema.names)
             for path in table.paths
         ]
-        bare = [part.replace_schema_metadata(None) for part in parts]
-        found = pa.concat_tables([table.schema.empty_table(), *bare], promote_options="default")
-        return found.select(table.schema.names).cast(table.schema)
+        wanted = {field.name: field for field in table.schema}
+        # Other tools write text as views or large strings.
+        bare = [
+            part.cast(pa.schema([wanted[name] for name in part.column_names])) for part in parts
+        ]
+        return pa.concat_tables([table.schema.empty_table(), *bare], promote_options="default")
 
     def _set_memory(self, limit: str) -> None:
         try:

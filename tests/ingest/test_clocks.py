@@ -97,10 +97,10 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     store = tmp_path / "store"
     assert main(["ingest", str(bag), "--store", str(store)]) == 3  # the zero stamp is lost
     shown = capsys.readouterr().out
-    line = next(line for line in shown.splitlines() if line.strip().startswith("/odom"))
+    line = " ".join(shown[shown.index(" /odom ") :].split())  # long cells are wrapped
     # 19 -> 20 and 29 -> 30 go back; and the zero stamp is off the clock, so it is left out.
     assert "2 backsteps, 1 repeated stamps, 1 zero stamps, 1 left out" in line
-    assert "0.002" in line
+    assert "0.002" in line[: line.index("backsteps")]
     question = "SELECT unnest(clocks, recursive := true) FROM recordings"
     assert main(["sql", str(store), question, "--json"]) == 0
     rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
@@ -120,7 +120,7 @@ def test_info_compares_clocks_when_asked(bag, capsys):
     clock = json.loads(capsys.readouterr().out)["recordings"][0]["topics"]["/odom"]["clock"]
     assert (clock["zero_stamps"], clock["duplicates"], clock["backsteps"]) == (1, 1, 2)
     assert main(["info", str(bag), "--clocks"]) == 0
-    assert "1 zero stamps" in capsys.readouterr().out
+    assert "1 zero" in capsys.readouterr().out  # long cells are wrapped
 
 
 def test_messages_logged_out_of_order_are_counted(tmp_path, capsys):

@@ -14,6 +14,7 @@ import pytest
 from support.stores import one
 
 from restock.errors import StoreError
+from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.column_docs import view_docs
 from restock.replay.store.query import MACROS, definitions
@@ -27,14 +28,23 @@ VIEWS = sorted(set(view_docs()) - DUCKDBS)
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store of three recordings, one of them replaced, in which a condition was never seen."""
+    """A store of three recordings, one of them replaced, in which a condition was never seen, and
+    another one cannot be told."""
     import pyarrow as pa
+
+    untold = {
+        "condition": "near_miss",
+        "kind": "outcome",
+        "signals": ["clearance_m"],
+        "because": "no lidar",
+    }
 
     path = tmp_path_factory.mktemp("spark") / "store"
     writer = StoreWriter(path)
     for recording, ingest in ((1, "a"), (2, "a"), (1, "b"), (3, "a")):
         manifest, rows = one(recording, ingest)
         keep = pa.array([name != "recovery" for name in rows["condition"].to_pylist()])
+        manifest = replaced(manifest, {"unknown_conditions": [[untold]]})
         writer.write(manifest, rows.filter(keep))
     return path
 

@@ -83,7 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _dispatch(args)
+        code = _dispatch(args)
+        sys.stdout.flush()  # here, where a reader that went away is no error
+        return code
     except KeyboardInterrupt:
         _complain("interrupted; nothing is left half-written")
         return int(ExitCode.INTERRUPTED)

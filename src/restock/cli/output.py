@@ -19,6 +19,7 @@ Row = Mapping[str, Any]
 
 
 PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
+SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, for who searches it
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
     **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),
@@ -94,8 +95,9 @@ def print_table(
 ) -> None:
     """A table on stdout, its title on a line of its own; numbers to the right.
 
-    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. Words that say how something
-    is (fail, pass) are coloured on a terminal.
+    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe names of
+    one word and cells up to SHORT are not: where columns leave too little, the table is wider.
+    Words that say how something is (fail, pass) are coloured on a terminal.
     """
     names = list(columns if columns is not None else rows[0] if rows else ())
     if not sys.stdout.isatty() and _fits(rows, names):
@@ -106,15 +108,25 @@ def print_table(
     from rich import box
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table, console = Table(box=box.SIMPLE_HEAD, pad_edge=False), stdout()
+    piped, least = not sys.stdout.isatty(), 0
     for name in names:
         numeric = any(_is_number(row[name]) for row in rows)
+        texts = [name, *(cell(row[name]) for row in rows)]
+        longest = max(_longest(text.split("\n")) for text in texts)
+        word = _longest([text for text in texts if len(text.split()) == 1])
         table.add_column(
-            name, justify="right" if numeric else "left", overflow="fold", no_wrap=numeric
+            name,
+            justify="right" if numeric else "left",
+            overflow="fold",
+            no_wrap=numeric or (piped and longest <= SHORT),
+            min_width=word if piped else None,
         )
+        least += 3 + (longest if numeric else max(word, min(longest, SHORT)))
+    if piped:
+        console.width = max(PIPE_WIDTH, least)
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
-    console = stdout()
     with console.capture() as captured:
         if title is not None:  # rich's own would be wrapped to the table's width
             console.print(
@@ -128,6 +140,13 @@ def print_table(
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
     sys.stdout.write(text.strip("\n") + "\n")
+
+
+def _longest(parts: Sequence[str]) -> int:
+    """Columns of the longest of some lines or words, as `cell` writes them."""
+    from rich.cells import cell_len
+
+    return max((cell_len(part.replace(r"\[", "[")) for part in parts), default=0)
 
 
 def _styled(text: str) -> str:

@@ -109,6 +109,8 @@ def outcome_sections(
         text = f"{verdict(found)['text'].capitalize()}: {why_refused(found)}."
         return [Section(f"{prefix}outcomes", title, callout=text)]
     rows = found["outcomes"]
+    if not rows:
+        return [Section(f"{prefix}outcomes", title, callout="No condition was driven in both.")]
     reasons = list(dict.fromkeys(row["no_interval"] for row in rows if row["no_interval"]))
     table = [
         {
