@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -21,7 +22,16 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.train.study.study import load_study
 from restock.train.twin.floors.floor_file import read_floor
 
-LANGUAGES = (*RUN, "toml", "json", "csv", "text", "xml", "py")  # py: signatures in docs/api.md
+LANGUAGES = (
+    *RUN,
+    "toml",
+    "yaml",
+    "json",
+    "csv",
+    "text",
+    "xml",
+    "py",
+)  # py: signatures in docs/api.md
 ALL = {page: blocks(page) for page in PAGES}
 NOTEBOOKS = [page for page in PAGES if page.with_suffix(".ipynb").exists()]  # test_tutorial.py's
 PAGES_RUN = [p for p in PAGES if p not in NOTEBOOKS and any(block.is_run for block in ALL[p])]
@@ -142,9 +152,13 @@ max_age_s = 0.2
 
 
 def check_profile(block: Block, folder: Path) -> None:
-    """A part of a profile is checked as an addition to the shipped one."""
-    shipped = files("restock.ingest.profile") / "profiles/warehouse_amr.toml"
-    whole = "\n".join([shipped.read_text("utf-8"), WHEELS, block.text])
+    """A part of a profile is checked as an addition to the shipped one, whose inputs of the same
+    names it replaces."""
+    shipped = (files("restock.ingest.profile") / "profiles/warehouse_amr.toml").read_text("utf-8")
+    tables = re.split(r"^(?=\[)", shipped, flags=re.MULTILINE)
+    own = [rf"\[inputs\.{name}[].]" for name in tomllib.loads(block.text).get("inputs", {})]
+    kept = [table for table in tables if not any(re.match(one, table) for one in own)]
+    whole = "\n".join(["".join(kept), WHEELS, block.text])
     parse_profile(whole, where=block.place, folder=folder)
 
 
