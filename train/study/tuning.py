@@ -198,7 +198,9 @@ def _try(
     for index, seed in enumerate(search.seeds):
         path = plan.run(values, seed)
         log = plan.out / "logs" / f"{path.name}.log"
-        if (path / DONE).exists():
+        if (path / DONE).exists():  # trained before, by a trial that drew the same values
+            if search.prune:
+                _falls_behind(trial, path, set(), index)
             continue
         settings = [*settings_of(search, values), f"seed={seed}"]
         panel = plan.panel(values)
@@ -259,6 +261,8 @@ def _train(
             where=str(log),
             remedy="mend it and run the same command again: what is done is kept",
         )
+    if trial is not None and not stopped:  # what it evaluated since it was last looked at
+        _falls_behind(trial, path, told, index)
     return not stopped
 
 
