@@ -96,13 +96,6 @@ SUMMARY_SCHEMA = pa.schema(
 )
 
 
-_READ = (  # by the statements on episodes and coverage
-    *("episode_id", "episode_index", "step_index", "stamp_ns", "action", "reward", "terminated"),
-    *("truncated", "condition", "conditions", "behaviour_policy", "zone", "bumped", "goal_source"),
-    *("clearance_m", "progress_m"),
-)
-
-
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     """A manifest row with the summary of its recording's rows."""
     values: dict[str, Any] = {
@@ -111,8 +104,6 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
     with _database().cursor() as connection:  # with temporary tables of its own
-        read = rows.select([name for name in _READ if name in rows.schema.names])
-        connection.register("recording_rows", read)
         connection.register("transitions", _complete(rows))
         connection.register("recordings", manifest)
         connection.execute(_definitions())

@@ -1,6 +1,6 @@
--- What the common views need of a recording, from its `transitions` (`recording_rows` are a few of
--- their columns) and its manifest (`recordings`). Kept in its manifest; summaries.sql adds them up over
--- the store. Cells are counted as views.sql, which scans, counts them: a test holds that both give the same.
+-- What the common views need of a recording, from its `transitions` and its manifest (`recordings`). Kept
+-- in its manifest; summaries.sql adds them up over the store. Cells are counted as views.sql, which scans,
+-- counts them: a test holds that both give the same.
 CREATE TEMP TABLE steps AS
 SELECT
     *,
@@ -9,16 +9,10 @@ SELECT
         PARTITION BY episode_id ORDER BY step_index
     ) AS handover
 FROM (
-    FROM recording_rows
-    UNION ALL BY NAME
     SELECT
-        NULL::VARCHAR AS goal_source,
-        NULL::VARCHAR AS zone,
-        NULL::VARCHAR AS behaviour_policy,
-        NULL::FLOAT AS progress_m,
-        NULL::BOOLEAN AS bumped,
-        NULL::FLOAT AS clearance_m
-    WHERE false
+        episode_id, episode_index, step_index, stamp_ns, action, reward, terminated, truncated, condition,
+        conditions, behaviour_policy, zone, bumped, goal_source, clearance_m, progress_m
+    FROM transitions
 )
 CROSS JOIN (
     SELECT

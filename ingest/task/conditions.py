@@ -74,7 +74,8 @@ class Condition(Checked, frozen=True):
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition with those of the constants that its SQL names; its own win."""
-        used = {name: value for name, value in constants.items() if name in self.words}
+        words = self.words
+        used = {name: value for name, value in constants.items() if name in words}
         return msgspec.structs.replace(self, constants=used | self.constants)
 
     @property
