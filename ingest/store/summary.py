@@ -11,6 +11,7 @@ import atexit
 import re
 from functools import cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from typing import Any
 
 import duckdb
@@ -141,17 +142,20 @@ def _database() -> duckdb.DuckDBPyConnection:
 
 @cache
 def _definitions() -> str:
-    return with_included(_sql("summary.sql"))
+    return with_included("-- include: summary.sql")
 
 
-def with_included(text: str) -> str:
-    """SQL with the files of this folder that it names: definitions which summaries share with the
-    views that scan."""
-    return re.sub(r"-- include: (\w+\.sql)", lambda named: with_included(_sql(named[1])), text)
+def with_included(text: str, beside: Traversable | None = None) -> str:
+    """SQL with the files that it names: definitions which several statements share, in this folder
+    or else in the one `beside`."""
 
+    def included(named: re.Match[str]) -> str:
+        folder = files("restock.ingest.store")
+        if beside is not None and not (folder / named[1]).is_file():
+            folder = beside
+        return with_included((folder / named[1]).read_text(encoding="utf-8"), beside)
 
-def _sql(name: str) -> str:
-    return (files("restock.ingest.store") / name).read_text(encoding="utf-8")
+    return re.sub(r"-- include: (\w+\.sql)", included, text)
 
 
 def _listed(rows: pa.Table, kind: pa.DataType) -> pa.Array:

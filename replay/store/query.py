@@ -102,7 +102,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    whole = with_included("\n".join(text))
+    whole = with_included("\n".join(text), folder)
     return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 

@@ -86,42 +86,23 @@ WITH seen AS (
     FROM (SELECT ingest_id, unnest(condition_episodes) AS part FROM stored_summaries)
     SEMI JOIN recordings USING (ingest_id)
     GROUP BY ALL
-), held_rows AS (
-    SELECT cell.condition AS condition, CAST(sum(cell.rows) AS BIGINT) AS rows_held
-    FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
-    SEMI JOIN recordings USING (ingest_id)
-    GROUP BY ALL
 ), held AS (
-    SELECT part.condition AS condition, CAST(sum(part.episodes) AS BIGINT) AS episodes_held
-    FROM (SELECT ingest_id, unnest(held_episodes) AS part FROM stored_summaries)
-    SEMI JOIN recordings USING (ingest_id)
-    GROUP BY ALL
+    SELECT *
+    FROM (
+        SELECT cell.condition AS condition, CAST(sum(cell.rows) AS BIGINT) AS rows_held
+        FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
+        SEMI JOIN recordings USING (ingest_id)
+        GROUP BY ALL
+    )
+    FULL JOIN (
+        SELECT part.condition AS condition, CAST(sum(part.episodes) AS BIGINT) AS episodes_held
+        FROM (SELECT ingest_id, unnest(held_episodes) AS part FROM stored_summaries)
+        SEMI JOIN recordings USING (ingest_id)
+        GROUP BY ALL
+    ) USING (condition)
 )
-SELECT
-    condition,
-    timing,
-    coalesce(rows, least) AS rows,
-    coalesce(rows, least) / nullif(sum(rows) OVER (), 0) AS share,
-    coalesce(episodes, least) AS episodes,
-    coalesce(rows_held, least) AS rows_held,
-    coalesce(episodes_held, least) AS episodes_held,
-    coalesce(effective_episodes, least) AS effective_episodes,
-    success_share,
-    return_mean,
-    reward_mean,
-    terminal_fraction,
-    coalesce(recordings, least) AS recordings,
-    coalesce(actions, least) AS actions,
-    coalesce(zones, least) AS zones,
-    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies
-FROM conditions
-FULL JOIN seen USING (condition)
-FULL JOIN by_episode USING (condition)
-FULL JOIN held_rows USING (condition)
-FULL JOIN held USING (condition)
-LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
-    USING (condition)
-ORDER BY rows DESC, condition;
+-- include: coverage_columns.sql
+;
 
 CREATE OR REPLACE VIEW measured_signals AS
 SELECT

@@ -200,30 +200,8 @@ WITH seen AS (
     FROM held_conditions
     GROUP BY condition
 )
-SELECT
-    condition,
-    timing,
-    coalesce(rows, least) AS rows,
-    coalesce(rows, least) / nullif(sum(rows) OVER (), 0) AS share,
-    coalesce(episodes, least) AS episodes,
-    coalesce(rows_held, least) AS rows_held,
-    coalesce(episodes_held, least) AS episodes_held,
-    coalesce(effective_episodes, least) AS effective_episodes,
-    success_share,
-    return_mean,
-    reward_mean,
-    terminal_fraction,
-    coalesce(recordings, least) AS recordings,
-    coalesce(actions, least) AS actions,
-    coalesce(zones, least) AS zones,
-    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies
-FROM conditions
-FULL JOIN seen USING (condition)
-FULL JOIN by_episode USING (condition)
-FULL JOIN held USING (condition)
-LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
-    USING (condition)
-ORDER BY rows DESC, condition;
+-- include: coverage_columns.sql
+;
 
 -- One line a perturbation of the twin; null is hardware, or a simulator that did not say.
 CREATE OR REPLACE VIEW coverage_by_perturbation AS
