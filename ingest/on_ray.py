@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import ConfigError, RecordingError
+from restock.imports import import_extra
 from restock.ingest.batch import AGAIN, Result, out_of_memory
 
 if TYPE_CHECKING:
@@ -57,13 +58,7 @@ def cluster(workers: int) -> Iterator[Any]:
     """Ray, with a cluster to give tasks to."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError(
-            "--engine ray needs Ray, which is not installed",
-            remedy="pip install 'restock[ray]'",
-        ) from error
+    ray = import_extra("ray", "ray", "--engine ray needs Ray")
     if ray.is_initialized():  # by the caller
         yield ray
         return

@@ -6,7 +6,6 @@ which says what to subscribe to and what observation, actions and limits are. No
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from restock.arrays import F32
 from restock.errors import ConfigError
+from restock.imports import import_extra
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.profile.profile_text import read_profile_toml
 
@@ -76,12 +76,7 @@ def open_session(path: Path) -> Any:
     Raises:
         ConfigError: no such file, no ONNX model, or the runtime is not installed.
     """
-    try:
-        runtime = import_module("onnxruntime")
-    except ImportError as error:
-        raise ConfigError(
-            "needs onnxruntime, which is not installed", remedy="pip install 'restock[onnx]'"
-        ) from error
+    runtime = import_extra("onnxruntime", "onnx", "an exported policy is run by onnxruntime")
     if not path.is_file():
         raise ConfigError("no such file", where=str(path), remedy="restock export RUN --to onnx")
     options = runtime.SessionOptions()

@@ -1,4 +1,5 @@
-"""Libraries that are slow to import: what is to happen once one is, and what none may look for."""
+"""Libraries that are slow to import, or optional: those of an extra, what is to happen once one is
+imported, and what none may look for."""
 
 from __future__ import annotations
 
@@ -6,8 +7,30 @@ import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
+
+from restock.errors import ConfigError
+
+
+def import_extra(
+    name: str, extra: str, use: str, *, where: str | None = None, instead: str | None = None
+) -> Any:
+    """The module `name` of one of Restock's optional extras. `use` ends in what is needed ("an .rrd
+    file is written by Rerun"); `instead` is what does without it.
+
+    Raises:
+        ConfigError: it cannot be imported; says which extra has it.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        remedy = f"pip install 'restock[{extra}]'" + (f", or {instead}" if instead else "")
+        raise ConfigError(
+            f"{use}, which is not installed ({error})", where=where, remedy=remedy
+        ) from error
 
 
 def when_imported(name: str, action: Callable[[], None]) -> None:
@@ -66,4 +89,4 @@ class _Hides:
         return None
 
 
-__all__ = ["hidden", "when_imported"]
+__all__ = ["hidden", "import_extra", "when_imported"]

@@ -20,6 +20,7 @@ from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.files import write_bytes
+from restock.imports import import_extra
 from restock.ingest.live.policy_file import FORMAT, open_session
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.task.task import Task
@@ -41,7 +42,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         RunError: no such run, no policy kept, or there is something at `out` already.
         ConfigError: the extra `onnx` is not installed.
     """
-    onnx = _library("onnx")
+    onnx = _onnx()
     run = Run.open(run_path)
     if out.exists():
         raise RunError("already exists", where=str(out), remedy="choose another --out")
@@ -68,7 +69,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
 
 def to_onnx(network: PolicyNetwork) -> Any:
     """The network as an ONNX model, node for layer; where it is filtered, both in one graph."""
-    onnx = _library("onnx")
+    onnx = _onnx()
     graph = _Graph(onnx)
     inner = network.inner if isinstance(network, ProposedNetwork) else network
     plain = inner.values if isinstance(inner, FilteredNetwork) else inner
@@ -237,15 +238,8 @@ def _array(tensor: torch.Tensor) -> F32:
     return np.ascontiguousarray(tensor.detach().cpu().numpy())
 
 
-def _library(name: str) -> Any:
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"needs {name}, which is not installed", remedy="pip install 'restock[onnx]'"
-        ) from error
+def _onnx() -> Any:
+    return import_extra("onnx", "onnx", "a policy is exported with onnx")
 
 
 __all__ = ["OnnxPolicy", "export_onnx", "to_onnx"]

@@ -26,8 +26,9 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.errors import ConfigError, RestockError, RunError
+from restock.errors import RestockError, RunError
 from restock.files import write_text
+from restock.imports import import_extra
 from restock.stats import wilson
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
@@ -74,15 +75,7 @@ def require_optuna() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import optuna
-    except ImportError as error:
-        raise ConfigError(
-            f"a space is searched with Optuna, which is not installed ({error})",
-            where="[space]",
-            remedy="pip install 'restock[tune]'",
-        ) from error
-    return optuna
+    return import_extra("optuna", "tune", "a space is searched with Optuna", where="[space]")
 
 
 def run_search(plan: SearchPlan, *, say: Say = lambda line: None) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from restock.arrays import F64
-from restock.errors import ConfigError
+from restock.imports import import_extra
 from restock.ingest.steps.seen_at_ticks import SeenScan
 from restock.replay.trace.moment import Moment
 from restock.train.view.critic import Critic
@@ -25,15 +25,13 @@ def require_rerun() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import rerun
-    except ImportError as error:
-        raise ConfigError(
-            f"an .rrd file is written by Rerun, which is not installed ({error})",
-            where="--view",
-            remedy="pip install 'restock[view]', or give a name that ends in .mcap",
-        ) from error
-    return rerun
+    return import_extra(
+        "rerun",
+        "view",
+        "an .rrd file is written by Rerun",
+        where="--view",
+        instead="give a name that ends in .mcap",
+    )
 
 
 def write_rerun(path: Path, moment: Moment, critic: Critic | None) -> dict[str, int]:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools
 from restock.errors import ConfigError
+from restock.imports import import_extra
 
 CONTACTS, CONSTRAINTS = 64, 192  # room a simulation: four wheels, and a chassis against obstacles
 _CTRL, _MOCAP = int(mujoco.mjtState.mjSTATE_CTRL), int(mujoco.mjtState.mjSTATE_MOCAP_POS)
@@ -215,15 +216,9 @@ def _shape(array: Any) -> tuple[int, ...]:
 
 
 def _import() -> tuple[Any, Any]:
-    try:
-        import mujoco_warp  # type: ignore[import-not-found,unused-ignore]
-        import warp  # type: ignore[import-not-found,unused-ignore]
-    except ImportError as error:
-        raise ConfigError(
-            'physics="warp" needs MuJoCo Warp, which is not installed',
-            where="the twin",
-            remedy="pip install 'restock[mjwarp]'",
-        ) from error
+    use = 'physics="warp" needs MuJoCo Warp'
+    mujoco_warp = import_extra("mujoco_warp", "mjwarp", use, where="the twin")
+    warp = import_extra("warp", "mjwarp", use, where="the twin")
     warp.config.quiet = True
     return warp, mujoco_warp
 
