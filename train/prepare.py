@@ -16,7 +16,6 @@ from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
-from restock.replay.sampling.share_controller import PlannedDraws
 from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
@@ -36,6 +35,7 @@ from restock.train.missions import (
     reference_success,
     ways_to_evaluate,
 )
+from restock.train.resolve import planned_draws, resolve_config, resolve_teacher
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
@@ -48,10 +48,10 @@ from restock.train.run.run_profile import (
 from restock.train.run.trackers import require_trackers
 from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit, sealed
-from restock.train.twin.env.interface import AFTER_LOGS, Twin
+from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.physics.episode import KINDS
-from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
+from restock.train.twin.physics.perturbation import find_perturbation
 
 _EVALUATION_ENVS = 16
 
@@ -233,7 +233,7 @@ def prepare_new(
     if not config.env.twin:
         config = without_twin(config, panel)
     check_missions(config, profile, panel)
-    config = _resolve_teacher(config, profile)
+    config = resolve_teacher(config, profile)
     refuse_nothing_to_learn(config.teacher, None if panel is None else sorted(_policies(panel)))
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     written = _document(config, profile, panel)
@@ -338,33 +338,6 @@ def _evaluation_layouts(config: TrainConfig) -> str:
     return config.evaluation.layouts or layouts_of_split(config.env.layouts, "validation")
 
 
-def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """What the config leaves to whether there is a panel: how to begin online."""
-    epsilon = config.epsilon
-    if epsilon.start is None:
-        learns_first = panel is not None and config.schedule.offline_updates > 0
-        epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
-    env = config.env
-    if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
-        perturbation = find_perturbation(env.perturbation, where="env.perturbation")
-        env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
-    if isinstance(env.missions, str):
-        env = msgspec.structs.replace(env, missions=mission_orders(config))
-    return msgspec.structs.replace(config, epsilon=epsilon, env=env)
-
-
-def planned_draws(config: TrainConfig) -> PlannedDraws:
-    """The rows that a run of this config will draw, if nothing ends it before its budget."""
-    schedule, batch_size = config.schedule, config.replay.batch_size
-    online = max(schedule.env_steps - schedule.warmup_env_steps, 0)
-    return PlannedDraws(
-        offline=schedule.offline_updates * batch_size,
-        online=online * schedule.updates_per_env_step * batch_size,
-        begin_env_steps=min(schedule.warmup_env_steps, schedule.env_steps),
-        end_env_steps=schedule.env_steps,
-    )
-
-
 def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
     return Logs.of_panel(
         panel,
@@ -372,19 +345,6 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
         config.loss.huber_delta,
         as_of_ns=int(document["created_ns"]),
     )
-
-
-def _resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
-    """What the config leaves open: the operator drives to goals; where there are none, nobody."""
-    teacher = config.teacher
-    if teacher.source is None:
-        soft = config.loss.munchausen > 0 and teacher.target == "filtered"
-        source = "operator" if profile.task.goal == "route" and not soft else "none"
-        teacher = msgspec.structs.replace(teacher, source=source)
-    if teacher.offline_updates is None:
-        count = config.schedule.offline_updates
-        teacher = msgspec.structs.replace(teacher, offline_updates=count)
-    return msgspec.structs.replace(config, teacher=teacher)
 
 
 def _policies(panel: Panel) -> Counter[str]:

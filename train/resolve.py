@@ -1,0 +1,53 @@
+"""What a config leaves open, settled by the panel and the profile before a run begins."""
+
+from __future__ import annotations
+
+import msgspec
+
+from restock.ingest.profile.profile import Profile
+from restock.replay.panel.panel import Panel
+from restock.replay.sampling.share_controller import PlannedDraws
+from restock.train.dqn.config import TrainConfig
+from restock.train.missions import mission_orders
+from restock.train.twin.env.interface import AFTER_LOGS
+from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
+
+
+def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
+    """What the config leaves to whether there is a panel: how to begin online."""
+    epsilon = config.epsilon
+    if epsilon.start is None:
+        learns_first = panel is not None and config.schedule.offline_updates > 0
+        epsilon = msgspec.structs.replace(epsilon, start=AFTER_LOGS if learns_first else 1.0)
+    env = config.env
+    if env.perturbation not in PERTURBATIONS:  # what is in a file may change: the run keeps it
+        perturbation = find_perturbation(env.perturbation, where="env.perturbation")
+        env = msgspec.structs.replace(env, perturbation=msgspec.to_builtins(perturbation))
+    if isinstance(env.missions, str):
+        env = msgspec.structs.replace(env, missions=mission_orders(config))
+    return msgspec.structs.replace(config, epsilon=epsilon, env=env)
+
+
+def planned_draws(config: TrainConfig) -> PlannedDraws:
+    """The rows that a run of this config will draw, if nothing ends it before its budget."""
+    schedule, batch_size = config.schedule, config.replay.batch_size
+    online = max(schedule.env_steps - schedule.warmup_env_steps, 0)
+    return PlannedDraws(
+        offline=schedule.offline_updates * batch_size,
+        online=online * schedule.updates_per_env_step * batch_size,
+        begin_env_steps=min(schedule.warmup_env_steps, schedule.env_steps),
+        end_env_steps=schedule.env_steps,
+    )
+
+
+def resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
+    """What the config leaves open: the operator drives to goals; where there are none, nobody."""
+    teacher = config.teacher
+    if teacher.source is None:
+        soft = config.loss.munchausen > 0 and teacher.target == "filtered"
+        source = "operator" if profile.task.goal == "route" and not soft else "none"
+        teacher = msgspec.structs.replace(teacher, source=source)
+    if teacher.offline_updates is None:
+        count = config.schedule.offline_updates
+        teacher = msgspec.structs.replace(teacher, offline_updates=count)
+    return msgspec.structs.replace(config, teacher=teacher)
