@@ -35,7 +35,7 @@ test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 test-docs: $(VENV)/.dev
-	$(BIN)/python -m pytest -m 'docs and not slow'
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m 'docs and not slow'
 
 site: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
