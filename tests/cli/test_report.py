@@ -15,7 +15,9 @@ import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import vl_convert
 from PIL import Image
+from support.page_scripts import charts_of
 from support.panels import panel_of
 from support.stores import TASK
 
@@ -251,9 +253,35 @@ def outline(html: str) -> Outline:
 def test_the_page_fetches_nothing(html: str) -> None:
     page = outline(html)
     assert [url for url in page.fetched if not url.startswith(("#", "data:"))] == []
-    assert "script" not in page.tags
+    assert page.tags.count("script") == 3  # rows, Vega, and what draws with it
     assert "@import" not in html
     assert "url(http" not in html
+
+
+def test_its_charts_are_drawn_again_by_vega_with_what_the_pointer_asks(html: str) -> None:
+    page = charts_of(html)
+    specs = [
+        {**chart["spec"], "datasets": {name: page["rows"][name] for name in chart["rows"]}}
+        for chart in page["charts"]
+    ]
+    assert len(specs) >= 14
+    for spec in specs:  # each is one that Vega-Lite takes
+        assert "Undefined" not in json.dumps(vl_convert.vegalite_to_vega(spec))
+    text = json.dumps(specs)
+    learnt = next(
+        spec
+        for spec in specs
+        if '"environment steps"' in json.dumps(spec) and '"kept"' in json.dumps(spec["datasets"])
+    )
+    told = learnt["layer"][-1]["encoding"]["tooltip"]
+    assert [one["title"] for one in told] == ["environment steps", "success"]
+    success = next(spec for spec in specs if "facet" in spec and '"low"' in json.dumps(spec))
+    (bars, _) = success["spec"]["layer"]
+    assert bars["params"][0]["bind"] == "legend"
+    told = bars["encoding"]["tooltip"]
+    assert [one["title"] for one in told][-3:] == ["success", "95 %, low", "95 %, high"]
+    assert told[-1]["format"] == ".1~%"
+    assert "alert(1)" in text  # a hostile name is text there, too
 
 
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
@@ -343,10 +371,10 @@ def test_a_condition_is_spelt_one_way(html: str) -> None:
 
 
 def test_figures_are_drawn_at_the_size_of_a_phone_and_of_a_desktop(html: str) -> None:
-    assert len(re.findall(r'<div class="drawing w300"><svg[^>]* width="300"', html)) >= 7
-    assert html.count('<div class="drawing w300">') == html.count(
-        '<div class="drawing w470">'
-    ) + html.count('<div class="drawing w1000">')
+    assert len(re.findall(r'<div class="drawing w300"[^>]*><svg[^>]* width="300"', html)) >= 7
+    assert html.count('<div class="drawing w300"') == html.count(
+        '<div class="drawing w470"'
+    ) + html.count('<div class="drawing w1000"')
     sizes = set(re.findall(r'font-size="([\d.]+)px"', html))
     assert sizes == {"12"}
     ids = re.findall(r"<svg.*?</svg>", html, re.DOTALL)

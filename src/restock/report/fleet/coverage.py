@@ -170,7 +170,8 @@ def _bars(rows: Rows) -> Drawing:
 
     def chart(width: int) -> Any:
         base = charts.plot(shown).encode(
-            y=alt.Y("condition:N", sort=names, title=None, axis=alt.Axis(grid=False, ticks=False))
+            y=alt.Y("condition:N", sort=names, title=None, axis=alt.Axis(grid=False, ticks=False)),
+            tooltip=["condition:N", alt.Tooltip("rows:Q", format=",")],
         )
         most = max(row["to"] for row in shown)
         scale = alt.Scale(type="log", domain=[PALE_ROWS, most * 8])
@@ -270,12 +271,7 @@ def _weeks(rows: Rows) -> Section | None:
             .encode(
                 x=alt.X("week:O", title=None, axis=alt.Axis(labelAngle=-60, grid=False)),
                 y=alt.Y("rows:Q", title="rows", axis=alt.Axis(format="~s")),
-                color=alt.Color(
-                    "condition:N",
-                    scale=charts.scale(names, charts.WORDS_COLOURS),
-                    sort=names,
-                    legend=charts.legend(names, width),
-                ),
+                color=charts.coloured("condition", names, charts.WORDS_COLOURS, width),
             )
             .properties(height=200)
         )

@@ -126,12 +126,7 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
     def chart(width: int) -> Any:
         base = charts.plot(rows).encode(
             x=alt.X("period:O", title=None, axis=_PERIODS),
-            color=alt.Color(
-                "robot:N",
-                scale=charts.scale(robots, colours),
-                sort=robots,
-                legend=charts.legend(robots, width),
-            ),
+            color=charts.coloured("robot", robots, colours, width),
             xOffset=alt.XOffset("robot:N", sort=robots),
         )
         bars = base.mark_rule(strokeWidth=3, opacity=0.4).encode(
@@ -232,12 +227,7 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
             .encode(
                 x=alt.X("period:O", title=None, axis=_PERIODS),
                 y=alt.Y("events_per_h:Q", title="events an hour", scale=alt.Scale(zero=True)),
-                color=alt.Color(
-                    "robot:N",
-                    scale=charts.scale(robots, {}),
-                    sort=robots,
-                    legend=charts.legend(robots, width),
-                ),
+                color=charts.coloured("robot", robots, {}, width),
             )
             .properties(width=width // columns - 70, height=150)
             .facet(facet=alt.Facet("condition:N"), columns=columns)

@@ -11,12 +11,20 @@ from typing import Any
 from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
-Drawing = dict[int, str]  # width in CSS pixels -> the SVG drawn at that width
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A chart at each width, in CSS pixels, that a page may have for it; it shows the widest
+    that fits."""
+
+    svg: dict[int, str]
+    spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # Vega-Lite; none of a map
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One chart, drawn at each width that the page may have for it; `name` is its file's."""
+    """A drawing and what is said of it; `name` is its file's."""
 
     drawing: Drawing
     title: str = ""
@@ -27,19 +35,21 @@ class Figure:
     @property
     def widest(self) -> str:
         """The SVG at its widest."""
-        return self.drawing[max(self.drawing)]
+        return self.drawing.svg[max(self.drawing.svg)]
 
     @property
     def kind(self) -> str:
         """A class of CSS: half of a line, or all of it."""
-        return "half" if max(self.drawing) < 500 else "full"
+        return "half" if max(self.drawing.svg) < 500 else "full"
 
     @property
-    def shown(self) -> list[tuple[str, str]]:
-        """A class of CSS (`w470`) and the SVG; the page shows the widest that fits."""
-        if len(self.drawing) == 1:
-            return [("any", self.widest)]
-        return [(f"w{width}", svg) for width, svg in sorted(self.drawing.items())]
+    def shown(self) -> list[tuple[str, str, dict[str, Any] | None]]:
+        """A class of CSS (`w470`), the SVG, and its specification where it has one."""
+        drawn = sorted(self.drawing.svg.items())
+        return [
+            ("any" if len(drawn) == 1 else f"w{width}", svg, self.drawing.spec.get(width))
+            for width, svg in drawn
+        ]
 
 
 @dataclass(frozen=True)

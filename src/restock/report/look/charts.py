@@ -1,9 +1,10 @@
-"""The pages' charts: rows in, static SVG out, so that a page opens without a network.
+"""The pages' charts: rows in, SVG out, and the specification that it was drawn from.
 
 A chart is drawn once for each width that a page may have for it, always at its own size: type is
 then equally large in every figure and on every screen. A figure is thus a `Drawing`, its SVG by
-width in CSS pixels; the page shows the widest that fits. One colour per condition, per source and
-per policy, the same in every chart; `theme.DARK` says what each is on a dark ground.
+width in CSS pixels; the page shows the widest that fits, and `live` has it answer the pointer. One
+colour per condition, per source and per policy, the same in every chart; `theme.DARK` says what
+each is on a dark ground.
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ POLICY_COLOURS = {
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # of a line, with which each is drawn
+STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
 LETTER_PX = 5.8  # of a label, about
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
 
-_CONFIG = {
+CONFIG = {
     "background": "transparent",
     "font": FONT,
     "view": {"stroke": None},
@@ -81,15 +83,20 @@ def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawin
 
     A chart that has no width of its own (a facet has) is fitted, with its axes and legend.
     """
-    return {width: _svg(chart_of(width), width) for width in widths}
+    spec = {width: _fitted(chart_of(width), width) for width in widths}
+    return Drawing({width: _svg(one) for width, one in spec.items()}, spec)
 
 
-def _svg(chart: Any, width: int) -> str:
+def _fitted(chart: Any, width: int) -> dict[str, Any]:
     if not isinstance(chart, alt.FacetChart):
         fit = alt.AutoSizeParams(type="fit-x", contains="padding")
         chart = chart.properties(width=width, autosize=fit)
-    chart = chart.configure(**_CONFIG)
-    text: str = vl_convert.vegalite_to_svg(chart.to_json())
+    spec: dict[str, Any] = chart.configure(**CONFIG).to_dict()
+    return spec
+
+
+def _svg(spec: dict[str, Any]) -> str:
+    text: str = vl_convert.vegalite_to_svg(spec)
     # What a mark stands for, shown where the pointer rests on it.
     text = re.sub(
         r'<(path|rect|line)\b([^<>]*?\baria-label="([^"]*)"[^<>]*?)/>',
@@ -118,6 +125,22 @@ def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     return alt.Legend(columns=columns, symbolOpacity=1)
 
 
+def coloured(
+    field: str,
+    names: Sequence[str],
+    colours: Mapping[str, str],
+    width: int,
+    labels_px: int = 60,
+) -> alt.Color:
+    """A colour for each name of a column, in the order of `names`, and the legend above."""
+    return alt.Color(
+        f"{field}:N",
+        scale=scale(names, colours),
+        sort=list(names),
+        legend=legend(names, width, labels_px),
+    )
+
+
 def label_px(names: Sequence[str]) -> int:
     """About how wide the labels of an axis are."""
     return round(max((len(name) for name in names), default=0) * LETTER_PX) + 14
@@ -143,6 +166,11 @@ def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, label
     return each.facet(column=alt.Column(f"{key}:N", sort=list(names)))
 
 
+def in_words(rows: Sequence[Row], key: str = "condition") -> list[dict[str, Any]]:
+    """The rows with a column's names as people read them."""
+    return [{**row, key: words(row[key])} for row in rows]
+
+
 def success(rows: Sequence[Row]) -> Drawing:
     """Success with intervals: rows of cell, perturbation, policy, success, low, high."""
     policies = ordered(rows, "policy", POLICY_COLOURS)
@@ -153,12 +181,7 @@ def success(rows: Sequence[Row]) -> Drawing:
         base = plot(rows).encode(
             y=alt.Y("cell:N", sort=cells, title=None, axis=alt.Axis(grid=False, ticks=False)),
             yOffset=alt.YOffset("policy:N", sort=policies),
-            color=alt.Color(
-                "policy:N",
-                scale=scale(policies, POLICY_COLOURS),
-                sort=policies,
-                legend=legend(policies, width, label_px(cells)),
-            ),
+            color=coloured("policy", policies, POLICY_COLOURS, width, label_px(cells)),
         )
         percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
         x_scale = alt.Scale(domain=[0, 1])
@@ -178,39 +201,33 @@ def lines(
     x: str,
     y: str,
     series: str,
-    x_title: str,
     y_title: str,
     colours: Mapping[str, str] = WORDS_COLOURS,
     percent: bool = False,
-    log: bool = False,
+    domain: tuple[float, float] | None = None,
     points: bool = False,
+    steps: bool = False,
     marker: float | None = None,
-    band: tuple[str, str] | None = None,
 ) -> Drawing:
-    """Lines over training; `marker` is a vertical line (the step of the kept checkpoint), `band`
-    the columns between which each line is shaded."""
+    """Lines over training, by `env_steps` or `gradient_steps`; values hold until the next with
+    `steps`. `marker` is a vertical line (the step of the kept checkpoint)."""
     names = ordered(rows, series, colours)
     # A line of a single point would not be seen.
     points = points or len({row[x] for row in rows}) < FEW_POINTS
     axis = alt.Axis(format="%") if percent else alt.Axis(format="~g")
-    y_scale = alt.Scale(domain=[0, 1]) if percent else alt.Scale(type="log" if log else "linear")
+    y_scale = alt.Scale(domain=domain or alt.Undefined)
 
     def chart(width: int) -> Any:
         base = plot(rows).encode(
-            x=alt.X(f"{x}:Q", title=x_title, axis=x_axis(width)),
-            color=alt.Color(
-                f"{series}:N", scale=scale(names, colours), sort=names, legend=legend(names, width)
-            ),
+            x=alt.X(f"{x}:Q", title=STEPS[x], axis=x_axis(width)),
+            color=coloured(series, names, colours, width),
         )
         line = base.mark_line(
-            strokeWidth=2, point={"size": 28, "filled": True} if points else False
+            strokeWidth=2,
+            point={"size": 28, "filled": True} if points else False,
+            interpolate="step-before" if steps else alt.Undefined,
         ).encode(y=alt.Y(f"{y}:Q", title=y_title, axis=axis, scale=y_scale))
         layers = [line]
-        if band is not None:
-            shaded = base.mark_area(opacity=0.18, line=False).encode(
-                y=alt.Y(f"{band[0]}:Q", title=y_title, axis=axis, scale=y_scale), y2=band[1]
-            )
-            layers.insert(0, shaded)
         if marker is not None:
             at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
             layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
@@ -242,12 +259,7 @@ def ages(rows: Sequence[Row]) -> Drawing:
             .encode(
                 x=alt.X("bucket:N", sort=list(dict.fromkeys(buckets)), title=None, axis=axis),
                 y=alt.Y("share:Q", title="share of sampled rows", axis=alt.Axis(format="%")),
-                color=alt.Color(
-                    "source:N",
-                    scale=scale(sources, SOURCE_COLOURS),
-                    sort=sources,
-                    legend=legend(sources, width),
-                ),
+                color=coloured("source", sources, SOURCE_COLOURS, width),
             )
             .properties(height=200)
         )
@@ -268,12 +280,7 @@ def stacked(rows: Sequence[Row], *, group: str, part: str, value: str) -> Drawin
             .encode(
                 y=alt.Y(f"{group}:N", sort=groups, title=None, axis=quiet),
                 x=alt.X(f"{value}:Q", stack="normalize", title=None, axis=alt.Axis(format="%")),
-                color=alt.Color(
-                    f"{part}:N",
-                    scale=scale(parts, CONDITION_COLOURS),
-                    sort=parts,
-                    legend=legend(parts, width),
-                ),
+                color=coloured(part, parts, CONDITION_COLOURS, width),
             )
             .properties(height=30 * max(len(groups), 1))
         )

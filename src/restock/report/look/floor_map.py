@@ -54,11 +54,12 @@ class FloorMap:
         )
         body = "".join([ground, *marks, *racks, frame, *above, bar])
         box = width + 4, height + 26
-        return {
-            MAP_PX: f'<svg xmlns="http://www.w3.org/2000/svg" width="{MAP_PX}"'
+        svg = (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{MAP_PX}"'
             f' height="{MAP_PX * box[1] / box[0]:.0f}" viewBox="-2 -2 {box[0]:.0f} {box[1]:.0f}"'
             f' role="img" aria-label="{escape(label)}">{body}</svg>'
-        }
+        )
+        return Drawing({MAP_PX: svg})
 
 
 def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> Drawing:

@@ -13,7 +13,9 @@ import vl_convert
 from markupsafe import Markup, escape
 
 from restock.files import write_bytes, write_text
+from restock.report.look import live
 from restock.report.look.blocks import Figure, Section
+from restock.report.look.charts import CONFIG
 from restock.report.look.theme import dark_rules
 
 PNG_SCALE = 2.0  # pixels a CSS pixel
@@ -35,7 +37,13 @@ def write_page(content: dict[str, Any], out: Path, figures: Path | None = None) 
     style = (folder / "style.css").read_text(encoding="utf-8")
     style = style.replace("/* dark figures */", dark_rules())
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, template.render({"verdict": None, **content, "style": Markup(style)}))
+    has_charts = any(figure.drawing.spec for part in content["sections"] for figure in part.figures)
+    own = {
+        "style": Markup(style),
+        "charts": live.Charts(CONFIG),
+        "policy": live.policy(has_charts),
+    }
+    write_text(out, template.render({"verdict": None, **content, **own}))
     if figures is not None:
         write_figures(content["sections"], figures)
     return out

@@ -73,7 +73,7 @@ def _strip(plan: FloorMap, film: dict[str, Any]) -> Drawing:
     """The frames beside each other, two or three in a line."""
     width, height = plan.width_m * SCALE + GAP, plan.depth_m * SCALE + GAP
     frames = [_frame(plan, frame, film["track"][: frame["step"] + 1]) for frame in film["strip"]]
-    drawing: Drawing = {}
+    drawn: dict[int, str] = {}
     for pixels, columns in ((300, 2), (470, 3)):
         lines = math.ceil(len(frames) / columns)
         placed = "".join(
@@ -82,12 +82,12 @@ def _strip(plan: FloorMap, film: dict[str, Any]) -> Drawing:
             for i, frame in enumerate(frames)
         )
         box = columns * width - GAP + 4, lines * height - GAP + 4
-        drawing[pixels] = (
+        drawn[pixels] = (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{pixels}"'
             f' height="{pixels * box[1] / box[0]:.0f}" viewBox="-2 -2 {box[0]:.0f} {box[1]:.0f}"'
             f' role="img" aria-label="frames of the episode" font-family="{FONT}">{placed}</svg>'
         )
-    return drawing
+    return Drawing(drawn)
 
 
 def _frame(plan: FloorMap, frame: dict[str, Any], track: list[list[float]]) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import altair as alt
-
 from restock.report.look import charts
 from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, count, percent, words
 from restock.report.run.facts import Facts
@@ -67,30 +65,15 @@ def by_arm(facts: Facts) -> Rows:
 
 
 def _shares(rows: Rows) -> Drawing:
-    lines = [
-        {"env_steps": row["env_steps"], "arm": words(row["arm"]), "share": row["wanted_share"]}
-        for row in rows
-    ]
-    arms = charts.ordered(lines, "arm", charts.WORDS_COLOURS)
-
-    def chart(width: int) -> Any:
-        return (
-            charts.plot(lines)
-            .mark_line(interpolate="step-before")
-            .encode(
-                x=alt.X("env_steps:Q", title="environment steps", axis=charts.x_axis(width)),
-                y=alt.Y("share:Q", title="share of missions", axis=alt.Axis(format="%")),
-                color=alt.Color(
-                    "arm:N",
-                    scale=charts.scale(arms, charts.WORDS_COLOURS),
-                    sort=arms,
-                    legend=charts.legend(arms, width),
-                ),
-            )
-            .properties(height=220)
-        )
-
-    return charts.draw(chart)
+    return charts.lines(
+        charts.in_words(rows, "arm"),
+        x="env_steps",
+        y="wanted_share",
+        series="arm",
+        y_title="share of missions",
+        percent=True,
+        steps=True,
+    )
 
 
 __all__ = ["by_arm", "practice_section"]

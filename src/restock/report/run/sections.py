@@ -213,13 +213,13 @@ def learning(facts: Facts) -> Section:
         figures.append(
             Figure(
                 charts.lines(
-                    [{**row, "condition": words(row["condition"])} for row in facts.learning],
+                    charts.in_words(facts.learning),
                     x="env_steps",
                     y="success",
                     series="condition",
-                    x_title="environment steps",
                     y_title="success",
                     percent=True,
+                    domain=(0, 1),
                     points=True,
                     marker=float(facts.kept["env_steps"]) if facts.kept else None,
                 ),
@@ -235,7 +235,6 @@ def learning(facts: Facts) -> Section:
                 x="gradient_steps",
                 y="loss",
                 series="phase",
-                x_title="updates",
                 y_title="Huber loss",
                 colours={"offline": "#334155", "warmup": "#94a3b8", "online": "#14b8a6"},
             ),
@@ -253,11 +252,10 @@ def critic(facts: Facts) -> Section | None:
         figures.append(
             Figure(
                 charts.lines(
-                    [{**row, "condition": words(row["condition"])} for row in facts.td],
+                    charts.in_words(facts.td),
                     x="gradient_steps",
                     y="td_abs_mean",
                     series="condition",
-                    x_title="updates",
                     y_title="mean |TD error| on a fixed probe",
                 ),
                 "TD error by condition",
@@ -278,7 +276,6 @@ def critic(facts: Facts) -> Section | None:
                     x="gradient_steps",
                     y="target_q_lag",
                     series="what",
-                    x_title="updates",
                     y_title="mean |Q − Q target| / mean |Q|",
                     colours={"relative value lag": "#0f766e"},
                 ),

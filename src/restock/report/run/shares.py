@@ -142,12 +142,7 @@ def _drawn(rows: Rows) -> Drawing:
                     scale=alt.Scale(type="sqrt"),
                     axis=alt.Axis(format="%", values=marks),
                 ),
-                color=alt.Color(
-                    "kind:N",
-                    scale=charts.scale(kinds, COLOURS),
-                    sort=kinds,
-                    legend=charts.legend(kinds, width, charts.label_px(strata)),
-                ),
+                color=charts.coloured("kind", kinds, COLOURS, width, charts.label_px(strata)),
             )
             .properties(height=52 * max(len(strata), 1))
         )

@@ -173,12 +173,7 @@ def _positions(rows: Rows) -> Drawing:
         base = charts.plot(rows).encode(
             y=alt.Y("condition:N", sort=conditions, title=None, axis=quiet),
             yOffset=alt.YOffset("source:N", sort=sources),
-            color=alt.Color(
-                "source:N",
-                scale=charts.scale(sources, COLOURS),
-                sort=sources,
-                legend=charts.legend(sources, width, charts.label_px(conditions)),
-            ),
+            color=charts.coloured("source", sources, COLOURS, width, charts.label_px(conditions)),
         )
         bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
             x=alt.X("median_low:Q", title="metres"), x2="median_high:Q"

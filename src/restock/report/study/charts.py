@@ -26,7 +26,7 @@ def colours(arms: list[str]) -> dict[str, str]:
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
     """Success by condition: rows of arm, condition, value, low, high (None: no interval)."""
     conditions = _conditions(rows)
-    shown = [{**row, "condition": words(row["condition"])} for row in rows]
+    shown = charts.in_words(rows)
     known = [row for row in shown if row["low"] is not None]
 
     def chart(width: int) -> Any:
@@ -34,11 +34,8 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
             return charts.plot(of).encode(
                 y=alt.Y("condition:N", sort=conditions, title=None, axis=_QUIET),
                 yOffset=alt.YOffset("arm:N", sort=arms),
-                color=alt.Color(
-                    "arm:N",
-                    scale=charts.scale(arms, colours(arms)),
-                    sort=arms,
-                    legend=charts.legend(arms, width, charts.label_px(conditions)),
+                color=charts.coloured(
+                    "arm", arms, colours(arms), width, charts.label_px(conditions)
                 ),
             )
 
@@ -107,18 +104,13 @@ def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Sc
 def curves(rows: Rows, arms: list[str]) -> Drawing:
     """Success over environment steps, a panel a condition, bands where there are intervals."""
     conditions = _conditions(rows)
-    shown = [{**row, "condition": words(row["condition"])} for row in rows]
+    shown = charts.in_words(rows)
 
     def chart(width: int) -> Any:
         across = 1 if width < 600 else 2 if width < 900 else min(len(conditions), 4)
         base = charts.plot(shown).encode(
             x=alt.X("env_steps:Q", title="environment steps", axis=charts.x_axis(width // across)),
-            color=alt.Color(
-                "arm:N",
-                scale=charts.scale(arms, colours(arms)),
-                sort=arms,
-                legend=charts.legend(arms, width),
-            ),
+            color=charts.coloured("arm", arms, colours(arms), width),
         )
         axis, domain = alt.Axis(format="%"), alt.Scale(domain=[0, 1])
         band = (

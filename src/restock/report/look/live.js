@@ -1,0 +1,48 @@
+"use strict";
+// Shows each chart drawn by Vega in the place of its SVG, once it comes into view. Whatever fails,
+// the SVG stays. Names of the page's rows only ever become text.
+(() => {
+  if (!("DecompressionStream" in window && "IntersectionObserver" in window)) return;
+  const { config, rows, charts } = JSON.parse(document.getElementById("charts").textContent);
+
+  let unpacked = null;
+  async function unpack() {
+    const packed = atob(document.getElementById("runtime").textContent);
+    const bytes = Uint8Array.from(packed, (letter) => letter.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const script = document.createElement("script");
+    script.textContent = await new Response(stream).text();
+    document.head.append(script);
+    return window.vegaEmbed;
+  }
+
+  async function show(drawing) {
+    const vegaEmbed = await (unpacked ??= unpack());
+    const { rows: names, spec } = charts[drawing.dataset.chart];
+    // Vega marks the rows that it reads: each chart has its own.
+    const datasets = structuredClone(Object.fromEntries(names.map((name) => [name, rows[name]])));
+    const place = document.createElement("div");
+    place.className = "live";
+    drawing.append(place);
+    try {
+      await vegaEmbed(place, { ...spec, datasets }, {
+        mode: "vega-lite", renderer: "svg", config, ast: true, actions: false,
+        defaultStyle: false, tooltip: { disableDefaultStyle: true },
+      });
+      drawing.classList.add("shown");
+      document.getElementById("pointer").hidden = false;
+    } catch (error) {
+      place.remove();
+      console.error(error);
+    }
+  }
+
+  const seen = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      if (!entry.isIntersecting) continue;
+      seen.unobserve(entry.target);
+      show(entry.target);
+    }
+  }, { rootMargin: "300px" });
+  document.querySelectorAll(".drawing[data-chart]").forEach((drawing) => seen.observe(drawing));
+})();

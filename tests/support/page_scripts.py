@@ -1,0 +1,61 @@
+"""The scripts of a page: that it has its own and no others, and what its charts were given."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+from typing import Any
+
+
+class _Scripts(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[dict[str, str | None], str]] = []
+        self.policy = ""
+        self.inside = False
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = dict(attributes)
+        assert not [name for name in given if name.startswith("on")]
+        self.inside = tag == "script"
+        if self.inside:
+            self.found.append((given, ""))
+        if given.get("http-equiv") == "Content-Security-Policy":
+            self.policy = given["content"] or ""
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = False
+
+    def handle_data(self, data: str) -> None:
+        if self.inside:
+            attributes, text = self.found[-1]
+            self.found[-1] = attributes, text + data
+
+
+def charts_of(html: str) -> dict[str, Any]:
+    """What a page's charts are drawn from: config, rows and charts, as its script reads them.
+
+    Asserts that its scripts are those that draw charts, and that its policy lets only them run.
+    """
+    page = _Scripts()
+    page.feed(html)
+    data, runtime, drawing = page.found
+    assert data[0] == {"type": "application/json", "id": "charts"}
+    assert runtime[0] == {"type": "text/plain", "id": "runtime"}
+    assert drawing[0] == {}
+    unpacked = gzip.decompress(base64.b64decode(runtime[1])).decode()
+    digests = [hashlib.sha256(text.encode()).digest() for text in (drawing[1], unpacked)]
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    assert page.policy.endswith(f"script-src {hashes}")
+    assert page.policy.startswith("default-src 'none'")
+    found: dict[str, Any] = json.loads(data[1])
+    numbers = [int(number) for number in re.findall(r'data-chart="(\d+)"', html)]
+    assert numbers == list(range(len(found["charts"])))
+    return found
+
+
+__all__ = ["charts_of"]
