@@ -175,6 +175,50 @@ def test_the_heading_by_the_track_is_causal_held_and_turned_by_backing_up():
     assert np.abs(backed[-20:]) == pytest.approx(np.full(20, np.pi))
 
 
+def plain_track_yaw(x: np.ndarray, y: np.ndarray, track_m: float) -> np.ndarray:
+    """The definition, with a look at every earlier position since the last turn."""
+    yaw, held, back = np.full(len(x), np.nan), np.nan, 0
+    for here in range(len(x)):
+        far = np.flatnonzero(np.hypot(x[here] - x[: here + 1], y[here] - y[: here + 1]) >= track_m)
+        far = far[far >= back]
+        if len(far):
+            back = int(far[-1])
+            held = np.arctan2(y[here] - y[back], x[here] - x[back])
+        yaw[here] = held
+    return yaw
+
+
+@pytest.mark.parametrize("scatter_m", [0.0, 0.02, 0.2, 0.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_track_is_found_as_by_a_look_at_every_earlier_position(seed, scatter_m):
+    rng = np.random.default_rng(seed)
+    speeds = np.repeat(rng.choice([0.0, 0.0, 0.05, 0.1, -0.1], 12), rng.integers(1, 120, 12))
+    heading = np.cumsum(rng.normal(0, 0.15, len(speeds)))
+    x, y = (np.cumsum(speeds * turn(heading)) for turn in (np.cos, np.sin))
+    x, y = (column + rng.normal(0, scatter_m, len(column)) for column in (x, y))
+    np.testing.assert_array_equal(track_yaw(x, y, 1.0), plain_track_yaw(x, y, 1.0))
+
+
+@pytest.mark.parametrize("left_m", [0.0, 1.5], ids=["from the start", "after a drive"])
+def test_a_robot_that_stands_is_not_compared_with_all_that_it_stood(monkeypatch, left_m):
+    compared = 0
+    plain = np.hypot
+
+    def counted(*args):
+        nonlocal compared
+        compared += np.size(args[0])
+        return plain(*args)
+
+    monkeypatch.setattr(np, "hypot", counted)
+    count = 6_000
+    scatter = np.random.default_rng(0).normal(0, 0.03, (2, count))
+    x = np.concatenate([np.arange(0, left_m, 0.1), np.full(count, left_m)])
+    x[-count:] += scatter[0]
+    y = np.concatenate([np.zeros(len(x) - count), scatter[1]])
+    track_yaw(x, y, 1.0)
+    assert compared < 500 * count  # each with each is 3,000 times `count`
+
+
 def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, capsys):
     profile, store = tmp_path / "gps.toml", tmp_path / "store"
     assert main(["profile", "new", str(bag), "--out", str(profile)]) in (0, 3)
