@@ -4,7 +4,8 @@
 
 Recordings are grouped into kinds of robots by what they say themselves (command, odometry's frames,
 lidar, description), never by their names. Each kind goes through `restock start` as a stranger's
-would, with the twin even where it is not to be trusted (`--twin yes`), and without a hand. Then its
+would, without a hand, and with the twin even where it is not to be trusted (`--twin yes`; by
+`--twin auto` such a kind is trained on its logs alone, and judged on those held out). Then its
 drives are tagged, counted by robot and year, compared for drift, and, where a bumper is in the
 recordings (and `--definitions` has the definition of its messages), its contacts score the labels.
 
@@ -54,6 +55,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--only", default="", metavar="TEXT", help="paths that hold this text")
     parser.add_argument("--minutes", type=float, default=3.0, help="of `restock start`, each kind")
+    parser.add_argument("--twin", choices=("yes", "auto"), default="yes", help="as of start")
     parser.add_argument("--definitions", type=Path, metavar="DIR", help="of the robots' own types")
     parser.add_argument("--kept", action="store_true", help="only what earlier calls left in DIR")
     options = parser.parse_args()
@@ -65,7 +67,7 @@ def main() -> int:
         folder = options.out / kind.key
         print(f"{folder}: {kind.told}", file=sys.stderr)
         if not options.kept:
-            start(kind, folder, options.minutes)
+            start(kind, folder, options.minutes, options.twin)
         if (folder / "start").is_dir():
             robots.append(measured(kind, folder, tags, options.definitions))
     return finish(options, {"robots": robots}, [], lines_of(robots))
@@ -112,9 +114,9 @@ def user_tags(bags: Path) -> dict[str, dict[str, str]]:
     }
 
 
-def start(kind: Kind, folder: Path, minutes: float) -> None:
+def start(kind: Kind, folder: Path, minutes: float, twin: str) -> None:
     """The whole way; what it says is kept in the folder."""
-    flags = ["--out", str(folder), "--twin", "yes", "--accept", "--minutes", f"{minutes:g}"]
+    flags = ["--out", str(folder), "--twin", twin, "--accept", "--minutes", f"{minutes:g}"]
     write_text(folder / "start.txt", said(["start", *kind.paths, *flags]))
 
 

@@ -14,6 +14,7 @@ from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.signals import LIDAR_SIGNALS
+from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
@@ -120,7 +121,9 @@ class Prepared:
         fed = "no panel: online only"
         if self.panel is not None:
             share = self.document["panel"].get("logs_share", 0.0)
-            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.0%} of each batch"
+            few = share < 0.1
+            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.{int(few)}%} of each"
+            fed += f" batch{_short(self.panel, config, share)}"
         steps = f"up to {schedule.env_steps:,} environment steps"
         if not config.env.twin:
             steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
@@ -350,6 +353,25 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
 def _policies(panel: Panel) -> Counter[str]:
     """Rows by behaviour policy."""
     return Counter(name for name in panel.meta_column("behaviour_policy").tolist() if name)
+
+
+def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
+    """Why logs get less of an online batch than they are to; "" where they do not."""
+    wanted = config.replay.logs_share
+    if wanted is None:
+        schedule = config.schedule
+        parts = panel.header.mixture.sources.parts.values()
+        span = (min(schedule.warmup_env_steps, schedule.env_steps), schedule.env_steps)
+        wanted = sum(mean_over(part, *span) for part in parts)
+    most = panel.header.mixture.max_replays_per_row
+    if most is None or not config.schedule.env_steps or logs_share > 0.99 * wanted:
+        return ""
+    return (
+        f" (of {wanted:.0%} that the mixture wants: a row may be drawn {most:g} times,"
+        f" {config.schedule.offline_updates:,} offline updates draw first, and the rest is spread"
+        f" over {config.schedule.env_steps:,} steps; log more, lower the schedule, or raise"
+        " max_replays_per_row)"
+    )
 
 
 def _describe_teacher(config: TrainConfig, panel: Panel | None) -> str:

@@ -17,7 +17,8 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.command_hold import CommandHold, limit_of
+from restock.ingest.propose.driven.command_hold import CommandHold, limit_of
+from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.footprint import Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.kinds import RobotTraits, robot_kinds, robot_traits
@@ -128,9 +129,12 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     outlined = min(
         (base, *drives), key=lambda one: (not one.footprint.measured, one.footprint.length_m)
     )
+    turned = DriveEvidence.joined([one.turned for one in drives])
+    described = base if len(base.robot.values) >= len(described.robot.values) else described
     return replace(
         base,
         commands=_commands(base.commands, driven),
+        turned=turned,
         hold=_hold([one.hold for one in driven]),
         clock=replace(
             base.clock,
@@ -145,8 +149,8 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         footprint_notes=outlined.footprint_notes,
         outline=outlined.outline,
         robot=described.robot
-        if len(base.robot.values) < len(described.robot.values)
-        else base.robot,
+        if base.commands.steered
+        else described.robot.driven(turned, outlined.footprint.length_m),
     )
 
 

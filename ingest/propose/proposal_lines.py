@@ -16,7 +16,8 @@ from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.command_choice import CommandChoice
-from restock.ingest.propose.command_hold import CommandHold, TurnReading
+from restock.ingest.propose.driven.command_hold import CommandHold
+from restock.ingest.propose.driven.steering import DriveEvidence, TurnReading
 from restock.ingest.propose.footprint import GUESS, Footprint
 from restock.ingest.propose.goal_choice import GoalChoice
 from restock.ingest.propose.motion_choice import MotionChoice, fix_lines, fix_noise_lines
@@ -79,6 +80,7 @@ class Evidence:
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
+    turned: DriveEvidence  # whether it steers as a car, where nothing describes it
     turns: TurnReading | None  # of Twists, where the robot steers as a car
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
@@ -246,9 +248,8 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
     """Of a robot that steers: no turn on the spot, nor one tighter than its steering allows."""
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
     known = {key: robot.values[key] for key in ("max_steering_rad",) if key in robot.values}
-    least_m = Robot(
-        drive="ackermann", wheelbase_m=commands.wheelbase_m, **known
-    ).min_turning_radius_m
+    wheelbase_m = robot.values.get("wheelbase_m", commands.wheelbase_m)
+    least_m = Robot(drive="ackermann", wheelbase_m=wheelbase_m, **known).min_turning_radius_m
     slow = 0.4 * speed
     wide, tight = min(0.6 * turn, 0.8 * speed / least_m), min(turn, slow / least_m)
     curves = [(0.8 * speed, wide), (slow, tight), *([(-slow, tight)] if commands.backs else [])]

@@ -23,12 +23,16 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_choice import CommandChoice, choose_command
-from restock.ingest.propose.command_hold import (
+from restock.ingest.propose.driven.command_hold import (
     CommandHold,
-    TurnReading,
     command_hold,
     limit_of,
     settled_speeds,
+)
+from restock.ingest.propose.driven.steering import (
+    DriveEvidence,
+    TurnReading,
+    drive_evidence,
     turn_reading,
 )
 from restock.ingest.propose.footprint import GUESS, Footprint, footprint_of
@@ -61,6 +65,7 @@ from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.steps.needs import as_recorded, read_topics
+from restock.ingest.task.robot import USUAL_STEERING_RAD
 
 LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
 
@@ -165,6 +170,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     advice = [*trial.advice]
     if seen.turns is not None and not seen.turns.problem:
         advice.append(Advice("inputs.command", steered_by(seen)))
+    if seen.robot.guessed_steering and not seen.commands.steered:
+        advice.append(Advice("robot.drive", f"it seems to steer as a car: {seen.turned.why}"))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
@@ -234,18 +241,6 @@ def gather(
         poses, _ = pose_series(recording, roles, frames if framed else None)
     frame = _scan_frame(recording, roles)
     scan = roles["scan"][0][0].name if roles["scan"] else None
-    robot = propose_robot(recording, scan, frame, urdf)
-    wheelbase_m = robot.values.get("wheelbase_m")
-    turns = _turns(recording, roles, poses, robot)
-    if turns is not None and turns.is_angle:
-        roles["command"], chosen = choose_command(recording, topics, _as_angles(roles["command"]))
-    commands, gaps, hold = _commands(recording, roles, poses, wheelbase_m)
-    paces = _paces(recording, roles)
-    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
-    motion = None
-    if not roles["wheels"] and (framed or roles["pose"]):
-        motion = choose_motion(recording, roles, frames, framed=framed)
-    best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     notes: list[str] = []
     if footprint is None and urdf is not None:
         footprint = urdf_footprint(urdf, frame)
@@ -256,6 +251,23 @@ def gather(
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, frame))
+    robot = propose_robot(recording, scan, frame, urdf)
+    turned, told_rad = _turned(recording, roles, poses)
+    robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
+    turns = _turns(recording, roles, poses, robot, turned)
+    if turns is not None and turns.is_angle:
+        roles["command"], chosen = choose_command(recording, topics, _as_angles(roles["command"]))
+        if turns.wheelbase_m is not None:
+            robot = replace(robot, values=robot.values | {"wheelbase_m": turns.wheelbase_m})
+    wheelbase_m = robot.values.get("wheelbase_m")
+    commands, gaps, hold = _commands(recording, roles, poses, wheelbase_m)
+    commands = replace(commands, wheelbase_known=robot.described and wheelbase_m is not None)
+    paces = _paces(recording, roles)
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
+    motion = None
+    if not roles["wheels"] and (framed or roles["pose"]):
+        motion = choose_motion(recording, roles, frames, framed=framed)
+    best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     return Evidence(
         recording,
         roles,
@@ -265,6 +277,7 @@ def gather(
         commands,
         chosen,
         hold,
+        turned,
         turns,
         paces,
         choose_clock(
@@ -289,8 +302,40 @@ def gather(
     )
 
 
+def _turned(
+    recording: Recording, roles: Roles, poses: PoseSeries | None
+) -> tuple[DriveEvidence, float | None]:
+    """How the robot turned under its Twists; and the sharpest of commands that are angles."""
+    if not roles["command"]:
+        return DriveEvidence(), None
+    topic, kind = roles["command"][0]
+    if (path := kind.fields.get("steering_rad")) is not None:
+        fields = recording.read({topic.name: [path]})[topic.name].fields
+        angles = np.abs(np.asarray(fields[path], np.float64))
+        angles = angles[np.isfinite(angles)]
+        return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
+    if topic.type == MOTION or poses is None or len(poses) < 2:
+        return DriveEvidence(), None
+    return drive_evidence(*_since(recording, roles, poses)), None
+
+
+def _since(
+    recording: Recording, roles: Roles, poses: PoseSeries
+) -> tuple[F64, F64, F64, PoseSeries]:
+    """The commands in order, in seconds (N,), m/s and rad/s, and the poses: both since the first
+    pose."""
+    _, times, speed, turn = commanded(recording, roles["command"][0], None)
+    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    return (times[order] - zero) * 1e-9, speed[order], turn[order], since
+
+
 def _turns(
-    recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
+    recording: Recording,
+    roles: Roles,
+    poses: PoseSeries | None,
+    robot: RobotProposal,
+    turned: DriveEvidence,
 ) -> TurnReading | None:
     """What the turns of Twists are to a robot that steers; None where it does not, or is driven
     by steering angles."""
@@ -302,16 +347,14 @@ def _turns(
         return None
     if poses is None or len(poses) < 2:
         return TurnReading()
-    _, times, speed, turn = commanded(recording, (topic, kind), None)
-    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
-    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
-    seconds = (times[order] - zero) * 1e-9
-    values = robot.values
-    return turn_reading(
-        *(seconds, speed[order], turn[order], since),
-        values["wheelbase_m"],
-        values.get("max_steering_rad"),
-    )
+    told, most = _since(recording, roles, poses), robot.values.get("max_steering_rad")
+    wheelbase_m = robot.values["wheelbase_m"]
+    if not robot.guessed_steering:
+        return turn_reading(*told, wheelbase_m, most)
+    least_m = turned.turning_m or wheelbase_m / float(np.tan(most or USUAL_STEERING_RAD))
+    reading = turn_reading(*told, None, least_m=least_m)
+    # That it steers is only a guess: that it is told in no known way is no reason to refuse it.
+    return reading if not reading.problem else TurnReading(least_m=least_m)
 
 
 def _as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Kind]]:

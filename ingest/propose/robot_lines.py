@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,12 +13,15 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.footprint import Footprint, descriptions, of_urdf, outline
-from restock.ingest.task.robot import Lidar, Robot
+from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
 
+WHEELBASE_PART = 0.6  # of the outline's length, where nothing says
+_OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
 MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
 
 
@@ -29,6 +33,50 @@ class RobotProposal:
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rolls: bool = True  # False: a description says that it has no wheels
+    drive_why: str = "A GUESS: nothing says"
+
+    @property
+    def described(self) -> bool:
+        """Whether a description says how it drives."""
+        return "drive" in self.values and self.origin.get("drive") != "logs"
+
+    @property
+    def guessed_steering(self) -> bool:
+        """Whether it is taken for one that steers by how it drove alone."""
+        return self.values.get("drive") == "ackermann" and not self.described
+
+    def driven(
+        self, shown: DriveEvidence, length_m: float, *, told_rad: float | None = None
+    ) -> RobotProposal:
+        """With the drive that its logs show, where no description says one.
+
+        Args:
+            shown: how it turned.
+            length_m: of its outline, by which the wheelbase is guessed.
+            told_rad: the sharpest of its commands, where they are steering angles.
+        """
+        if self.described:
+            return self
+        values = {k: v for k, v in self.values.items() if k not in _OF_STEERING}
+        origin = {key: said for key, said in self.origin.items() if key in values}
+        if told_rad is None and not shown.steers:
+            said = shown.why if shown.pivots else f"A GUESS, as its logs do not tell: {shown.why}"
+            return replace(self, values=values, origin=origin, drive_why=said)
+        wheelbase_m = round(WHEELBASE_PART * length_m, 3)
+        values |= {"drive": "ackermann", "wheelbase_m": wheelbase_m}
+        origin |= {"drive": "logs", "wheelbase_m": "default"}
+        sharpest = USUAL_STEERING_RAD
+        if told_rad is not None:
+            why = "its commands are steering angles"
+            sharpest = max(sharpest, told_rad)
+        else:
+            why = f"CONFIRM THAT IT STEERS AS A CAR: {shown.why}"
+            if shown.turning_m is not None:
+                sharpest = math.atan(wheelbase_m / shown.turning_m)
+        if sharpest != USUAL_STEERING_RAD:
+            values["max_steering_rad"] = round(min(max(sharpest, 0.05), 1.3), 3)
+            origin["max_steering_rad"] = "logs"
+        return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
         """With the limits that its logs show, in place of what a description says."""
@@ -51,12 +99,14 @@ class RobotProposal:
                 notes.append(f"{key} = {limit:g} is not its limit: {commanded:g} was commanded")
         own = {key: value for key, value in values.items() if "." not in key}
         lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
-        drive = own.pop("drive", None)
+        drive, told = own.pop("drive", None), self.described
+        guess = {} if told else {"wheelbase_m": "  # A GUESS by the outline: MEASURE IT"}
         lines = [
             "[robot]  # what the twin builds; what is left out follows from the outline's size",
             *(f"# {note}" for note in notes),
-            f'drive = "{drive}"' if drive else 'drive = "differential"  # A GUESS: nothing says',
-            *(f"{key} = {toml_value(value)}" for key, value in own.items()),
+            *([] if told else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
+            f'drive = "{drive or "differential"}"',
+            *(f"{key} = {toml_value(value)}{guess.get(key, '')}" for key, value in own.items()),
         ]
         if lidar:
             lines += ["", "[robot.lidar]", *(f"{k} = {toml_value(v)}" for k, v in lidar.items())]

@@ -14,6 +14,7 @@ from support.paths import SHARED
 
 from restock import cli
 from restock.cli.start import stages
+from restock.cli.start.decisions import updates_settings
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
 from restock.ingest.profile.profile import load_profile
@@ -192,3 +193,16 @@ class OtherLidar(Drive):
     def topics(self) -> dict[str, Any]:
         tenth = np.arange(0, self.duration_s, 0.1)
         return super().topics() | {"/scan": columns(tenth, scans(np.full((len(tenth), 36), 3.0)))}
+
+
+def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
+    few = {"rows": 267, "max_replays_per_row": 400.0}
+    allowed = 267 * 400 / 128  # updates
+    settings = dict(one.split("=") for one in updates_settings(few, 1.0, twin=True, seconds=30.0))
+    assert int(settings["schedule.offline_updates"]) == int(allowed / 2)
+    assert int(settings["schedule.env_steps"]) == 15_000  # what 30 s drive, not the usual 200,000
+    many = {"rows": 12_000, "max_replays_per_row": 400.0}
+    assert updates_settings(many, 1.0, twin=True, seconds=30.0) == []
+    # On the logs alone nothing is driven, and all draws are for them.
+    (alone, _) = updates_settings(few, 9.0, twin=False)
+    assert alone == f"schedule.offline_updates={int(allowed)}"

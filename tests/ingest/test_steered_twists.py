@@ -12,7 +12,7 @@ from support.driven_robot import columns, write_topics
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.propose.command_hold import TurnReading, turn_reading
+from restock.ingest.propose.driven.steering import TurnReading, turn_reading
 from restock.ingest.steps.motion import PoseSeries
 
 WHEELBASE_M, MOST_RAD, SPEED_MPS = 0.4, 0.5, 0.8

@@ -25,6 +25,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
+from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
 
 TINY = [
@@ -80,6 +81,22 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert shares == {"offline": 1.0, "online": 0.5}
     audit = pq.read_table(trained / "audit.parquet").to_pylist()
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
+
+
+def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_path: Path) -> None:
+    task = load_profile("warehouse_amr").task
+    text = "max_replays_per_row = 4\n[each_condition]\nshare = 'natural'\n"
+    rows = recording_transitions(1, episodes=40, task=task)
+    few = build_panel(rows, parse_mixture(text), tmp_path / "panel", task=task)
+    settings = [word for word in TINY if word != "--set"]
+    said = prepare_new(
+        tmp_path / "a", few.path, None, [*settings, "schedule.env_steps=9000"]
+    ).describe()
+    share = (len(few) * 4 - 30 * 32) / (8900 * 0.25 * 32)
+    assert f"{share:.1%} of each batch (of 50% that the mixture wants" in said
+    assert "a row may be drawn 4 times" in said
+    said = prepare_new(tmp_path / "a", panel, None, settings).describe()
+    assert "50% of each batch;" in said
 
 
 def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
 from restock.files import read_json
 
+STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is made for
+WARM_UP_PART = 0.5  # of the draws that few rows allow
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
 INTERVALS = 20  # at least so many points of every curve
 DRIVERS = "behaviour_policies"  # of a row of the coverage
@@ -126,17 +129,30 @@ def logs_alone_settings(coverage: Document) -> list[str]:
     return ["env.twin=false", "teacher.source=logs", f"teacher.policies={toml_value(drivers)}"]
 
 
-def updates_settings(mix: Document, minutes: float, *, twin: bool) -> list[str]:
-    """As many offline updates as the panel's rows and the budget allow; each curve has points."""
+def updates_settings(
+    mix: Document, minutes: float, *, twin: bool, seconds: float = math.inf
+) -> list[str]:
+    """As many offline updates as the panel's rows and the budget allow; each curve has points.
+
+    Of few rows, each of which may be drawn so often and no more, half of the draws are left for the
+    `seconds` in the twin, and planned for the steps that fit in them.
+    """
     from restock.train.dqn.config import TrainConfig
 
     usual = TrainConfig()
     updates = usual.schedule.offline_updates
+    settings = []
     if not twin:
         updates = max(round(UPDATES_A_MINUTE * minutes), INTERVALS)
     if (most := mix.get("max_replays_per_row")) is not None:
-        updates = min(updates, int(mix["rows"] * most / usual.replay.batch_size))
-    settings = []
+        allowed = mix["rows"] * most / usual.replay.batch_size
+        plan = usual.schedule
+        if twin and allowed < updates + plan.env_steps * plan.updates_per_env_step / 2:
+            updates = min(updates, max(int(allowed * WARM_UP_PART), 1))
+            steps = max(round(STEPS_A_SECOND * seconds), plan.warmup_env_steps)
+            if steps < plan.env_steps:
+                settings.append(f"schedule.env_steps={steps}")
+        updates = min(updates, int(allowed))
     if updates != usual.schedule.offline_updates:
         settings.append(f"schedule.offline_updates={updates}")
     if not twin and updates < INTERVALS * usual.record.every_updates:

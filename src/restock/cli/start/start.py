@@ -281,7 +281,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             twin = False
     if not twin:
         settings = logs_alone_settings(covered.document)
-    settings += updates_settings(mixed.document, asked.minutes, twin=twin)
+    settings += updates_settings(mixed.document, asked.minutes, twin=twin, seconds=to.seconds)
     to = replace(to, train=tuple(settings))
     trained = work.do(stages.train(to, twin=twin))
     if not trained.good:

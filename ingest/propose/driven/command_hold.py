@@ -8,20 +8,16 @@ it stood. A command to stop holds until the next one whatever the driver does.
 And how fast the robot really went where it was commanded to go fastest: a driver scales down or
 cuts off what its wheels cannot do. Commands beyond that are no actions of the robot: a twin that
 obeyed them would not move as the robot did.
-
-And what the turn of a Twist was to a robot that steers as a car: a yaw rate, as the message says,
-or the angle of its front wheels, as some drivers take it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from restock.arrays import F64
-from restock.ingest.steps.motion import PoseSeries, motion_at
-from restock.ingest.task.robot import USUAL_STEERING_RAD
+from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.signals import wrap_angle
 
 LEAST_GAP_S = 0.4  # shorter ones say little
@@ -33,9 +29,6 @@ SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
 NEARLY = 0.8  # of the fastest command counts as it
 LEAST_SAMPLES = 10
 HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached its limit
-DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # from a command to the motion
-LEAST_TURNS = 20  # moments of driving in a turn
-WELL, CLEARLY = 0.5, 0.5  # of the turning, left unexplained; of what the other reading leaves
 
 
 @dataclass(frozen=True)
@@ -158,67 +151,3 @@ def limit_of(settled: F64, fastest: float) -> float | None:
         return None
     reached = float(np.percentile(settled, 90))
     return float(f"{reached:.3g}") if 0.01 < reached < HELD_BACK * fastest else None
-
-
-@dataclass(frozen=True)
-class TurnReading:
-    """What the turn of a Twist is taken for, of a robot that steers as a car."""
-
-    is_angle: bool = False  # of its front wheels; else a yaw rate
-    why: str = "as its message defines it: these logs do not show which it is"
-    problem: str = ""  # neither
-    too_tight: int = 0  # commands that turn on a smaller circle than it can, as yaw rates
-    least_m: float = 0.0  # that circle
-
-
-def turn_reading(
-    told_s: F64,
-    told_mps: F64,
-    turn: F64,
-    poses: PoseSeries,
-    wheelbase_m: float,
-    steering_rad: float | None = None,
-) -> TurnReading:
-    """What the commanded turns (N,) were to a robot that steers, by how it turned.
-
-    Each reading says how fast it should have turned at the speed that it had, within its steering;
-    what is left of the squared yaw rates is how badly it explains them.
-
-    Args:
-        told_s, told_mps, turn: of the commands, in order, on the clock of `poses`.
-        wheelbase_m, steering_rad: of the robot; the angle is the largest, None: the usual one.
-    """
-    first_ns, last_ns = int(poses.stamp_ns[0]), int(poses.stamp_ns[-1])
-    ticks = np.arange(first_ns, last_ns, 100_000_000, dtype=np.int64)
-    window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
-    motion = motion_at(poses, ticks, window_s, 1.0)
-    middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps
-    most = steering_rad or USUAL_STEERING_RAD
-    best, seen = [np.inf, np.inf], 0
-    least_m = wheelbase_m / float(np.tan(most))
-    tight = int((np.abs(turn) * least_m > np.abs(told_mps) * 1.01).sum())
-    for delay_s in DELAYS_S:
-        index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
-        told = turn[np.maximum(index, 0)]
-        used = (index >= 0) & (motion.problem == "") & (np.abs(speed) > 0.05)
-        used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(told) > 0.03)
-        if (turning := float((turned[used] ** 2).sum())) == 0 or used.sum() < LEAST_TURNS:
-            continue
-        seen = max(seen, int(used.sum()))
-        sharpest = np.abs(speed[used]) / least_m
-        as_rate = np.clip(told[used], -sharpest, sharpest)
-        as_angle = speed[used] * np.tan(np.clip(told[used], -most, most)) / wheelbase_m
-        left = [float(((turned[used] - by) ** 2).sum()) / turning for by in (as_rate, as_angle)]
-        best = [min(pair) for pair in zip(best, left, strict=True)]
-    untold = TurnReading(too_tight=tight, least_m=least_m)
-    if not seen:
-        return untold
-    by_rate, by_angle = best
-    if min(best) >= 1:
-        return TurnReading(problem="neither a yaw rate nor a steering angle explains how it turned")
-    told_by = "which leaves {:.0%} of its turning unexplained, and {} {:.0%}"
-    if by_angle < WELL and by_angle < CLEARLY * by_rate:
-        return TurnReading(True, told_by.format(by_angle, "a yaw rate", by_rate))
-    if by_rate < WELL and by_rate < CLEARLY * by_angle:
-        return replace(untold, why=told_by.format(by_rate, "a steering angle", by_angle))
-    return untold
