@@ -47,7 +47,8 @@ RENAMED = {
 }
 BEGIN = "<!-- audits: written by `python -m restock.replay.store.audit docs/audit.md` -->"
 END = "<!-- end of audits -->"
-_OFFENDED: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
+OFFENDED: Mapping[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
+WORST_FIRST: tuple[Status, ...] = ("fail", "warn", "info", "pass", "skipped")
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Audit:
     @property
     def parameters(self) -> set[str]:
         """The thresholds that the query uses."""
-        return set(re.findall(r"\$([a-z_]+)", self.sql))
+        return set(re.findall(r"\$([A-Za-z_]\w*)", self.sql))
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,7 @@ def run_audits(
             finding = _run(connection, audit, thresholds.get(audit.name, {}))
         findings.append(finding)
         done(audit.name)
-    order = ["fail", "warn", "info", "pass", "skipped"]
-    return sorted(findings, key=lambda finding: (order.index(finding.status), finding.audit.name))
+    return sorted(findings, key=lambda one: (WORST_FIRST.index(one.status), one.audit.name))
 
 
 def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
@@ -235,7 +235,7 @@ def _run(
             ) from error
         raise ConfigError(f"its SQL does not run: {error}", where=where) from error
     sample = [dict(zip(columns, row, strict=True)) for row in rows[:SAMPLE_ROWS]]
-    status: Status = _OFFENDED[audit.severity] if rows else "pass"
+    status: Status = OFFENDED[audit.severity] if rows else "pass"
     return Finding(audit, status, len(rows), columns, sample, thresholds)
 
 
@@ -271,7 +271,7 @@ def _parse(name: str, text: str, where: str) -> Audit:
     for key in ("severity", "advice", "doc"):
         if key not in header:
             raise ConfigError(f"its header has no `-- {key}: …`", where=f"{where}/{name}.sql")
-    if header["severity"] not in _OFFENDED:
+    if header["severity"] not in OFFENDED:
         raise ConfigError(
             f"severity {header['severity']!r} is not one of error, warning, info",
             where=f"{where}/{name}.sql",

@@ -6,12 +6,15 @@ import json
 from pathlib import Path
 
 import pytest
+from rich.text import Text
 
 from restock import cli
 from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
 from restock.cli.start.stage import Stage
 from restock.cli.start.stages import Settings
 from restock.errors import RestockError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml
 
 SILENT = lambda message: None  # noqa: E731
 
@@ -52,6 +55,34 @@ def test_an_earlier_demo_is_replaced_and_nothing_else(tmp_path: Path) -> None:
     with pytest.raises(RestockError, match="not from a demo"):
         prepare(mine)
     assert (mine / "thesis.tex").read_text() == "precious"
+
+
+def test_what_the_user_gave_is_neither_removed_nor_mistyped_at_the_earlier_demos_cost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    prepare(out)
+    (out / "mine.mcap").write_text("precious")
+    (tmp_path / "link").symlink_to(out)
+    profile = out / "mine.toml"
+    profile.write_text(profile_toml(load_profile("turtlebot3")))
+    for given in (
+        ["--logs", str(out / "mine.mcap")],
+        ["--logs", str(tmp_path)],  # which has `out` within it
+        ["--logs", str(tmp_path / "link" / "*.mcap")],
+        ["--profile", str(profile)],
+    ):
+        assert cli.main(["demo", "--out", str(out), *given]) == 2
+        assert "lies inside --out" in capsys.readouterr().err
+    for given in (["--logs", str(tmp_path / "lgos")], ["--profile", "turtelbot3"]):
+        assert cli.main(["demo", "--out", str(out), *given]) == 2
+    assert (out / "mine.mcap").read_text() == "precious"
+
+
+def test_a_name_in_brackets_is_said_as_it_is() -> None:
+    said: list[str] = []
+    run_demo([Stage("info", "", "", ["info", "a[old].mcap"])], lambda command: 0, say=said.append)
+    assert "info 'a[old].mcap'" in "\n".join(Text.from_markup(line).plain for line in said)
 
 
 def test_a_dry_run_prints_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -549,6 +549,9 @@ def test_ones_own_audits_and_thresholds(tmp_path: Path, clean: Tables) -> None:
                 run_audits(connection, [audits["slow"]], {old: new})
         with pytest.raises(ConfigError, match="no audit named 'sloow'"):
             run_audits(connection, [audits["slow"]], {"sloow": {"least": 1}})
+        named = Audit("named", "error", "", "", None, "SELECT 1 WHERE $Min2_m + $v2 > 0")
+        values: dict[str, float | str] = {"Min2_m": 1.0, "v2": 0.5}
+        assert run_audits(connection, [named], {"named": values})[0].status == "fail"
         broken = Audit("broken", "error", "", "", None, "SELECT nothing FROM transitions")
         with pytest.raises(ConfigError, match=r"broken.*does not run"):
             run_audits(connection, [broken], {})

@@ -18,7 +18,7 @@ from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.store.version import parse_version, split_version
 from restock.ingest.store.writer import StoreWriter
-from restock.replay.fleet.store_difference import diff_stores
+from restock.replay.fleet.store_difference import diff_stores, shifted
 from restock.replay.fleet.two_sample import (
     false_discovery_adjusted,
     share_differences,
@@ -133,6 +133,10 @@ def test_a_signal_that_moved_is_named(tmp_path: Path) -> None:
     assert found["shifts"][0]["signal"] == "wheel_speed_mps"
     assert found["shifts"][0]["p_adjusted"] < 1e-6
     assert sum(row["p_adjusted"] < 0.01 for row in found["shifts"]) == 1
+    assert [row["signal"] for row in shifted(found["shifts"])] == ["wheel_speed_mps"]
+    # The surest of all has p = 0; what is constant has none.
+    bounds = [{"p_adjusted": p} for p in (0.0, 0.049, 0.05, None)]
+    assert shifted(bounds) == bounds[:2]
 
 
 def test_a_version_is_split_from_a_place_unless_a_folder_is_called_so(tmp_path: Path) -> None:

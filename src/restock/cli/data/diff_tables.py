@@ -15,6 +15,7 @@ def show(document: dict[str, Any]) -> None:
 
 def _print_stores(document: dict[str, Any]) -> None:
     from restock.cli import output
+    from restock.replay.fleet.store_difference import shifted
 
     a, b = document["a"], document["b"]
     names = [f"a: {a['path']} version {a['version']}", f"b: {b['path']} version {b['version']}"]
@@ -44,13 +45,13 @@ def _print_stores(document: dict[str, Any]) -> None:
     )
     signals = document["signals"]
     if signals["compared"]:
-        shifted = [row for row in signals["shifts"] if (row["p_adjusted"] or 1) < 0.05]
+        moved = shifted(signals["shifts"])
         title = (
             f"signals that shifted: {signals['compared']} ({signals['episodes_b']:,} and"
             f" {signals['episodes_a']:,}), means of episodes"
         )
-        if shifted:
-            _section(title, [_signal(row) for row in shifted])
+        if moved:
+            _section(title, [_signal(row) for row in moved])
         else:
             output.stdout().print(f"\nno signal shifted: {signals['compared']}")
 

@@ -115,14 +115,14 @@ class CheckCommand:
 
     def _show(self, parts: list[Part]) -> None:
         from restock.cli import output
+        from restock.replay.store.audit import WORST_FIRST
 
-        order = ("fail", "warn", "info", "pass", "skipped")
-        rows = sorted(_rows(parts), key=lambda row: order.index(row["status"]))
+        rows = sorted(_rows(parts), key=lambda row: WORST_FIRST.index(row["status"]))
         shown = [row for row in rows if row["status"] not in ("pass", "skipped")]
         columns = ["part", "check", "status", "rows", "what", "advice"]
         if shown:
             output.print_table(shown, columns)
-        counts = {name: sum(row["status"] == name for row in rows) for name in order}
+        counts = {name: sum(row["status"] == name for row in rows) for name in WORST_FIRST}
         told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         output.stdout().print(f"{len(rows)} checks: {told}")
 

@@ -8,11 +8,18 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from restock.errors import RestockError
-from restock.replay.store.audit import SAMPLE_ROWS, Audit, Finding, Severity, Status
+from restock.replay.fleet.store_difference import shifted
+from restock.replay.store.audit import (
+    OFFENDED,
+    SAMPLE_ROWS,
+    WORST_FIRST,
+    Audit,
+    Finding,
+    Severity,
+    Status,
+)
 
-_STATUS: dict[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
 _MARKS = {"fail": "❌", "warn": "⚠️", "info": "ℹ️", "pass": "✅", "skipped": "–"}
-_ORDER = ("fail", "warn", "info", "pass", "skipped")
 SHOWN = 5  # rows of a finding in a summary
 
 
@@ -39,7 +46,6 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
         if row["change"] == "out" and row.get("recording_id") not in with_recordings
     ]
     labels = document["labels"]["changes"]
-    shifted = [row for row in document["signals"]["shifts"] if (row["p_adjusted"] or 1) < 0.05]
     return [
         _finding(
             "recordings_lost",
@@ -74,7 +80,7 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
             "warning",
             "Signals whose mean over episodes shifted (false discovery rate 5 %)",
             "`restock drift` says which robot, week and part",
-            shifted,
+            shifted(document["signals"]["shifts"]),
         ),
         _finding(
             "recordings_new",
@@ -116,7 +122,7 @@ def _finding(
     name: str, severity: Severity, doc: str, advice: str, rows: Iterable[dict[str, Any]]
 ) -> Finding:
     every = list(rows)
-    status: Status = _STATUS[severity] if every else "pass"
+    status: Status = OFFENDED[severity] if every else "pass"
     audit = Audit(name, severity, advice, doc, None, "")
     columns = list(every[0]) if every else []
     return Finding(audit, status, len(every), columns, every[:SAMPLE_ROWS], {})
@@ -125,7 +131,7 @@ def _finding(
 def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
     """A summary for people, of Markdown as pipelines show it: failures first."""
     every = [(part.name, one) for part in parts for one in part.findings]
-    every.sort(key=lambda pair: _ORDER.index(pair[1].status))
+    every.sort(key=lambda pair: WORST_FIRST.index(pair[1].status))
     failed = sum(one.status in failing for _, one in every)
     passed = sum(one.status == "pass" for _, one in every)
     verdict = f"**{failed} failed**" if failed else "**passed**"

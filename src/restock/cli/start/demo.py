@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal
 from restock.cli.start import stages, story
 from restock.cli.start.stage import Stage
 from restock.cli.start.stages import Settings
+from restock.cli.start.work import escape
 from restock.errors import ExitCode, RestockError
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ class DemoCommand:
         if self.dry_run:
             sys.stdout.writelines(f"{stage.line()}\n" for stage in plan)
             return None
-        prepare(self.out)
+        prepare(self.out, self._given())
         console = stdout()
         if not self.json:
             console.print(f"[bold]What you are about to see[/bold]\n\n{story.OPENING}")
@@ -92,8 +93,23 @@ class DemoCommand:
             print_json({"report": str(report), **parts})
         else:
             tell(to, console)
-            console.print(f"\nThe report: [bold]{report}[/bold] (open it in a browser)")
+            console.print(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
         return None
+
+    def _given(self) -> list[Path]:
+        """The user's own files: the recordings and the profile, which are to be there.
+
+        Raises:
+            RestockError: they cannot be found or read.
+        """
+        from restock.ingest.containers.discover import recordings_in
+        from restock.ingest.profile.profile import load_profile
+
+        given = [] if self.logs is None else [self.logs, *recordings_in(self.logs)]
+        if self.profile is not None:
+            load_profile(self.profile)
+            given += [Path(self.profile)] if Path(self.profile).is_file() else []
+        return given
 
 
 def tell(to: Settings, console: Console) -> None:
@@ -144,7 +160,7 @@ def run_demo(
     for number, stage in enumerate(plan, start=1):
         say(f"\n[bold]{number}/{len(plan)}  {stage.title}[/bold]")
         say(f"[dim]{stage.why}[/dim]")
-        say(f"[cyan]$ {stage.line()}[/cyan]\n")
+        say(f"[cyan]$ {escape(stage.line())}[/cyan]\n")
         sys.stdout.flush()
         started = time.monotonic()
         code = dispatch(stage.command)
@@ -167,12 +183,22 @@ def find_logs() -> Path | None:
     return logs.relative_to(Path.cwd()) if logs.is_relative_to(Path.cwd()) else logs
 
 
-def prepare(out: Path) -> None:
+def prepare(out: Path, given: Sequence[Path] = ()) -> None:
     """An empty directory for the demo; one that an earlier demo left is replaced.
 
     Raises:
-        RestockError: there is something at `out` that no demo made.
+        RestockError: there is something at `out` that no demo made, or that is one of the user's
+            files that were given.
     """
+    for path in given:  # by its name too: a link in `out` to a file elsewhere would be lost
+        if path.absolute().is_relative_to(out.absolute()) or path.resolve().is_relative_to(
+            out.resolve()
+        ):
+            raise RestockError(
+                f"lies inside --out {out}, which the demo replaces",
+                where=str(path),
+                remedy="give another --out",
+            )
     if out.exists() and not (out / MARKER).exists() and (not out.is_dir() or any(out.iterdir())):
         raise RestockError(
             "already exists, and not from a demo",

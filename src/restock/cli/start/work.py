@@ -179,7 +179,8 @@ class Work:
                 aside.mkdir(exist_ok=True)
                 number = 1 + sum(1 for _ in aside.iterdir())
                 path.rename(aside / f"{path.name}-{number}")
-                self.say(f"   [dim]the earlier one is now {aside / f'{path.name}-{number}'}[/dim]")
+                put = escape(str(aside / f"{path.name}-{number}"))
+                self.say(f"   [dim]the earlier one is now {put}[/dim]")
             elif path.is_dir():
                 shutil.rmtree(path)
             else:
