@@ -54,6 +54,7 @@ class PolicyNode:
         self._reports: Any = None
         self._subscriptions: list[Any] = []
         self._timers: list[Any] = []
+        self._defaults: dict[str, Any] = {}  # of the parameters that a policy's profile declared
         self._parameter("policy", str(policy))
         self._parameter("profile", "")
         self._parameter("shadow", not drive)
@@ -71,9 +72,9 @@ class PolicyNode:
         policy = PolicyFile(Path(self._value("policy")), self._value("profile") or None)
         profile, task = policy.profile, policy.profile.task
         form = CommandForm.of(profile)
-        self._parameter("cmd_vel_topic", form.topic)
-        self._parameter("cmd_vel_type", form.type)
-        self._parameter("watchdog_s", 2.5 * task.control_period_s)
+        self._profiles("cmd_vel_topic", form.topic)
+        self._profiles("cmd_vel_type", form.type)
+        self._profiles("watchdog_s", 2.5 * task.control_period_s)
         self.watchdog_s = float(self._value("watchdog_s"))
         if not 0 < self.watchdog_s <= 60:
             raise ConfigError(
@@ -153,6 +154,11 @@ class PolicyNode:
             self.node.destroy_publisher(self._reports)
         self._timers, self._subscriptions, self._published = [], [], {}
         self._reports = None
+        # The next policy has its own; what a person has set stays.
+        for name, default in self._defaults.items():
+            if self._value(name) == default:
+                self.node.undeclare_parameter(name)
+        self._defaults.clear()
 
     # -- messages and ticks ---------------------------------------------------------------------
 
@@ -276,6 +282,11 @@ class PolicyNode:
         if not self.node.has_parameter(name):
             self.node.declare_parameter(name, default)
 
+    def _profiles(self, name: str, default: Any) -> None:
+        """A parameter whose default is the profile's, until `cleanup`."""
+        self._parameter(name, default)
+        self._defaults[name] = default
+
     def _value(self, name: str) -> Any:
         return self.node.get_parameter(name).value
 
@@ -285,9 +296,9 @@ class PolicyNode:
         given = {}
         for name in Limiter.__struct_fields__:
             value = None if profile.limiter is None else getattr(profile.limiter, name)
-            self._parameter(f"limiter_{name}", -1.0 if value is None else float(value))
+            self._profiles(f"limiter_{name}", -1.0 if value is None else float(value))
             asked = float(self._value(f"limiter_{name}"))
-            if asked > 0 or (asked == 0 and name == "stop_m"):
+            if not asked < 0:  # 0 and NaN are refused where they are no limit
                 given[name] = asked
         if not self._value("limiter"):
             return None

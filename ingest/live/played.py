@@ -35,7 +35,9 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
     Raises:
         RecordingError: it cannot be read, or has no commands.
     """
+    from rosbags import rosbag1, rosbag2
     from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, get_typestore
 
     profile = pilot.profile
@@ -62,7 +64,10 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
                     took_s = time.perf_counter() - began_s
                     yield Played(now_ns, decision, took_s, _action(pilot, message))
                 pilot.receive(connection.topic, message, now_ns)
-    except (AnyReaderError, OSError) as error:
+    except (
+        *(AnyReaderError, SerdeError, rosbag1.ReaderError, rosbag2.ReaderError),
+        OSError,
+    ) as error:
         raise RecordingError(
             f"cannot be played: {error}",
             where=str(recording),

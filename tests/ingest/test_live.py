@@ -11,11 +11,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Writer
 from support.kept_run import kept_network, kept_run
 from support.paths import ROOT
 
 from restock.cli import main
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RecordingError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.live.pilot import Pilot
 from restock.ingest.live.played import play
@@ -25,6 +26,7 @@ from restock.ingest.profile.profile import Frames, load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.evaluation.policies import GreedyPolicy
+from restock.train.twin.recording.messages import typestore
 
 BAG = ROOT / "sample_logs" / "amr_tuesday"
 PROFILE = load_profile("warehouse_amr")
@@ -73,6 +75,17 @@ def test_what_it_sees_is_what_ingest_stores_and_it_acts_as_torch_does(
     # Without a limiter the command is the action table's.
     at = decisions[times[0]].decision
     assert at.command == at.proposal == TASK.actions[at.action]
+
+
+def test_a_recording_with_a_message_cut_short_cannot_be_played(
+    policy: Path, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    with Writer(bag, version=9) as writer:
+        to = writer.add_connection("/cmd_vel", "geometry_msgs/msg/Twist", typestore=typestore())
+        writer.write(to, 1, bytes(20))
+    with pytest.raises(RecordingError, match="cannot be played"):
+        list(play(Pilot(PolicyFile(policy), None), bag))
 
 
 def test_a_recording_is_played_at_the_shell(

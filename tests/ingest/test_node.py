@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from support.ros_graph import Graph, Returned, message_class
@@ -21,6 +22,7 @@ from restock.ingest.live.node import lifecycle_node
 from restock.ingest.live.node_topics import ACTION, LIMITER, SHADOW, TAKEOVER, with_node_topics
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.task.limiter import Limiter
 from restock.replay.store.store import Store
 from restock.train.twin.physics.episode import EpisodeSpec
 
@@ -118,6 +120,25 @@ def test_it_can_be_configured_again_after_a_cleanup(policy: Path) -> None:
     assert len(graph.timers) == 3
 
 
+def test_configured_again_it_has_the_limits_of_its_new_policy_and_of_who_set_them(
+    tmp_path: Path,
+) -> None:
+    def limited(name: str, speed_mps: float) -> Path:
+        limiter = Limiter(max_speed_mps=speed_mps, reaction_s=0.0)
+        profile = msgspec.structs.replace(PROFILE, limiter=limiter)
+        return follower_onnx(tmp_path / f"{name}.onnx", profile)
+
+    graph, node = started(limited("first", 0.9))
+    limits = node.policy.pilot.limits
+    assert (limits.fastest[0], limits.reaction_s) == (0.9, 0.0)  # 0 s is a time, and given
+    node._values["policy"] = str(limited("second", 0.3))  # as `ros2 param set` does
+    node._values["limiter_stop_m"] = 0.5
+    node.trigger_cleanup()
+    assert node.trigger_configure() is Returned.SUCCESS, graph.logged
+    limits = node.policy.pilot.limits
+    assert (limits.fastest[0], limits.stop_m) == (0.3, 0.5)
+
+
 def test_silence_stale_inputs_and_a_stalled_timer_are_stops(
     policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +201,7 @@ def test_a_policy_that_does_not_fit_leaves_it_unconfigured_and_says_why(
         ({"watchdog_s": 0.0}, "must be within 0 and 60 s"),
         ({"takeover_topic": "/scan"}, "is an input of profile"),
         ({"limiter_stop_m": 99.0}, "stop_m"),
+        ({"limiter_max_speed_mps": 0.0}, "max_speed_mps"),
         ({"limiter_stop_m": 1}, "not <class 'float'>"),
     ):
         graph = Graph(parameters=parameters)

@@ -93,7 +93,9 @@ class DemoCommand:
             print_json({"report": str(report), **parts})
         else:
             tell(to, console)
-            console.print(f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)")
+            console.print(
+                f"\nThe report: [bold]{escape(str(report))}[/bold] (open it in a browser)"
+            )
         return None
 
     def _given(self) -> list[Path]:
