@@ -14,7 +14,8 @@ Records what a question needs of the stand-in fleet (a day of hours, and for the
 archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
 same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--primary` runs the two arms
 of the primary contrast only, with all seeds; without it the same command adds the others. `--quick`
-has those two arms, ten minutes of logs, two seeds and 2,000 steps: it shows that all of it runs.
+has those two arms, ten minutes of logs, two seeds and 2,000 steps, in OUT/quick: it shows that all
+of it runs.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from harness import markdown, run_restock
+from harness import markdown, once, run_restock
 
 from restock.cli.output import plain
 from restock.errors import RestockError
@@ -89,12 +90,13 @@ def _answer(options: argparse.Namespace) -> int:
     hours = 1 if options.quick else options.hours
     if options.primary or options.quick:
         study = primary_arms(study)
+    out = options.out
     if options.quick:
-        study = quick(study)
-    store = options.out / str(study.store)
+        study, out = quick(study), out / "quick"  # its recordings are others
+    store = out / str(study.store)
     _make_store(store, LOGS[str(study.store)], hours, options.workers, options.quick)
     study = msgspec.structs.replace(study, store=str(store.resolve()))
-    plan = StudyPlan(study, HERE, options.out / options.question)
+    plan = StudyPlan(study, HERE, out / options.question)
     power = power_of(plan)
     if power is not None and power.too_small:
         _say(warning(power))
@@ -133,9 +135,11 @@ def quick(study: Study) -> Study:
 
 
 def _make_store(store: Path, logs: Logs, hours: int, workers: int, small: bool) -> None:
-    """Record and ingest what is not there yet."""
-    if store.exists():
-        return
+    """Record and ingest what is not there yet: a store that was cut short goes on.
+
+    Raises:
+        SystemExit: the store is of other recordings than are asked for.
+    """
     folder = store.parent / store.name.replace("store", "logs")
     folder.mkdir(parents=True, exist_ok=True)
     asked = [
@@ -161,9 +165,14 @@ def _make_store(store: Path, logs: Logs, hours: int, workers: int, small: bool) 
             )
             for number, kind in enumerate(RARE)
         ]
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda one: _record(*one), asked))
-    run_restock(["ingest", str(folder), "--store", str(store)])
+
+    def make() -> None:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(lambda one: _record(*one), asked))
+        run_restock(["ingest", *(str(path) for path, *_ in asked), "--store", str(store)])
+
+    told = [f"{path.name} {' '.join(flags)} {conditions}" for path, flags, conditions in asked]
+    once(store.with_name(f"{store.name}.json"), told, make)
 
 
 def _record(recording: Path, flags: list[str], conditions: str) -> None:

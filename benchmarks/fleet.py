@@ -160,20 +160,21 @@ def _found(samples: pa.Table, signals: pa.Table) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = option_parser(__doc__, quick="1 minute a drive, not 3")
+    parser = option_parser(__doc__, quick="1 minute a drive, not 3; into FOLDER/quick")
     parser.add_argument("--out", type=Path, default=Path("fleet"), help="default: ./fleet")
     options = parser.parse_args()
-    logs = options.out / "logs"
+    out = options.out / "quick" if options.quick else options.out  # its drives are others
+    logs = out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
     for drive in drives():
         if not (logs / drive.name).exists():
             record(logs / drive.name, drive.plan(1.0 if options.quick else 3.0))
             print(drive.name, file=sys.stderr)
-    run_restock(["ingest", str(logs), "--store", str(options.out / "store")])
-    with Store(options.out / "store") as store:
+    run_restock(["ingest", str(logs), "--store", str(out / "store")])
+    with Store(out / "store") as store:
         drift = measure_drift(store)
         table = power(store, np.random.default_rng(0))
-    write_drift_page(drift, options.out / "drift.html")
+    write_drift_page(drift, out / "drift.html")
     hardware = [row for row in drift.findings if row["part"] not in ("driving", "conditions")]
     named = {(row["robot"], row["part"], row["scope"], row["periods"]) for row in hardware}
     missed = []

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.cli import main as restock
+from restock.files import write_text
 from restock.stats import percentiles
 from restock.train.run.run import Run
+from restock.train.study.study_run import train_words
 
 T = TypeVar("T")
 
@@ -82,13 +84,29 @@ def run_restock(arguments: Sequence[str]) -> None:
 
 def trained(path: Path, settings: Sequence[str], panel: Path | None = None) -> Run:
     """The run at a path, trained or resumed where it has not ended."""
-    if not (path / "done").exists():
-        flags = [word for setting in settings for word in ("--set", setting)]
-        panel_flags = ["--panel", str(panel)] if panel else []
-        new = ["--out", str(path), *panel_flags, *flags]
-        run_restock(["train", *(["--resume", str(path)] if path.exists() else new)])
-        (path / "done").touch()
+
+    def train() -> None:
+        run_restock(train_words(path, settings, panel))
+
+    once(path / "done", [*settings, str(panel)], train)
     return Run.open(path)
+
+
+def once(mark: Path, asked: Sequence[str], do: Callable[[], object]) -> None:
+    """Do what is asked, and keep in `mark` what that was: it is not done again.
+
+    Raises:
+        SystemExit: it was done as something else was asked.
+    """
+    text = json.dumps(asked, indent=1) + "\n"
+    if not mark.exists():
+        do()
+        write_text(mark, text)
+    elif mark.read_text(encoding="utf-8") != text:
+        raise SystemExit(
+            f"{mark}: is not of what is asked for now ({', '.join(asked)}): remove it and what it"
+            " is of, or name another --out"
+        )
 
 
 def markdown(header: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -32,6 +31,7 @@ from restock.errors import RestockError
 from restock.files import write_text
 from restock.train.study.contrasts import RunCurve, contrast
 from restock.train.study.study import Study, StudyJob, StudyPlan, load_study
+from restock.train.study.study_run import train_words
 
 HERE = Path(__file__).parent
 ARMS = HERE / "learner" / "arms.toml"
@@ -100,8 +100,7 @@ def _asked(options: argparse.Namespace) -> Study:
 def _run(plan: StudyPlan) -> None:
     """Train and judge what is not there yet, seeds first."""
     store = plan.out / "store"
-    if not store.exists():
-        run_restock(["ingest", str(LOGS), "--store", str(store)])
+    run_restock(["ingest", str(LOGS), "--store", str(store)])  # skips what it has
     for job in plan.jobs:
         panel = Path(str(job.arm.panel))
         if not panel.exists():
@@ -122,14 +121,8 @@ def _run(plan: StudyPlan) -> None:
 def _train(plan: StudyPlan, job: StudyJob, panel: Path) -> None:
     """Train a run or go on with it, and add up what it costs."""
     seconds = job.path / "cpu_seconds"
-    if (job.path / "checkpoints" / "latest.safetensors").exists():
-        arguments = ["train", "--resume", str(job.path)]
-    else:
-        if job.path.exists():
-            shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
-        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
-        arguments = ["train", "--out", str(job.path), "--panel", str(panel), *sets]
-    spent = _restock(arguments, plan, job)
+    words = train_words(job.path, plan.settings(job.arm, job.seed), panel)
+    spent = _restock(words, plan, job)
     write_text(seconds, f"{spent + (float(seconds.read_text()) if seconds.exists() else 0):.2f}\n")
 
 

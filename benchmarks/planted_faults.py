@@ -13,6 +13,7 @@ again.
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections import Counter
 from pathlib import Path
@@ -102,15 +103,15 @@ def plant(clean: Path, faulty: Path, fault: str) -> None:
 def panel_for(fault: str, out: Path) -> Path:
     """The panel that a fault trains on, made once."""
     clean, panel = out / "clean", out / "panels" / fault.replace(" ", "_")
-    if not (clean / "transitions").exists():
-        logs = Path(__file__).parents[1] / "sample_logs"
-        run_restock(["ingest", str(logs), "--store", str(clean)])
+    logs = Path(__file__).parents[1] / "sample_logs"
+    run_restock(["ingest", str(logs), "--store", str(clean)])  # skips what it has
     if not panel.exists():
         store = clean
         if fault.startswith(LOGGED):
             store = out / "stores" / fault.replace(" ", "_")
-            if not store.exists():
-                plant(clean, store, fault)
+            if store.exists():  # cut, or there would be the panel
+                shutil.rmtree(store)
+            plant(clean, store, fault)
         panel.parent.mkdir(exist_ok=True)
         run_restock(["mix", str(store), "--mixture", "coverage", "--out", str(panel)])
     return panel

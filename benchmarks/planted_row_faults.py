@@ -14,6 +14,7 @@ once, when the limits stood.
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pyarrow as pa
-from harness import finish, markdown, option_parser
+from harness import finish, markdown, once, option_parser
 
 from restock.ingest.containers.discover import recordings_in
 from restock.ingest.pipeline import ingest
@@ -275,16 +276,23 @@ def planting(fault: Fault, rng: np.random.Generator) -> type[Filling]:
 def plant(logs: Path, fault: Fault, out: Path) -> Path:
     """A store of the recordings with the fault, made once."""
     store = out / re.sub(r"\W+", "_", f"{logs.stem}-{fault.type}-{fault.dose}")
+    mark = store.with_name(f"{store.name}.json")
+    once(mark, [str(logs.resolve())], lambda: _plant(logs, fault, store))
+    return store
+
+
+def _plant(logs: Path, fault: Fault, store: Path) -> None:
+    """From the first recording on: draws go on from one to the next."""
     if store.exists():
-        return store
+        shutil.rmtree(store)
     rng = np.random.default_rng(0)
     if fault.rows or fault.again:
-        rewrite(StoreWriter(plant(logs, NOTHING, out)), StoreWriter(store), fault, rng)
-        return store
+        healthy = plant(logs, NOTHING, store.parent)
+        rewrite(StoreWriter(healthy), StoreWriter(store), fault, rng)
+        return
     with patch.object(steps_module, "Filling", planting(fault, rng)):
         for path in recordings_in(logs):
             ingest(path, PROFILE, store=StoreWriter(store))
-    return store
 
 
 def rewrite(

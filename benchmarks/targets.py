@@ -17,12 +17,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import duckdb
 import numpy as np
-from harness import finish, markdown, mean_interval, option_parser, run_restock, trained
+from harness import finish, markdown, mean_interval, once, option_parser, run_restock, trained
 from numpy.typing import NDArray
 
 from restock.stats import interval_text, wilson
@@ -64,9 +65,9 @@ def main() -> int:
     runs = []
     for seed in range(options.seeds):
         path = options.out / f"{'quick' if options.quick else options.budget}-{seed}"
-        if not (path / "done").exists():
-            began = time.process_time(), time.monotonic()
-            trained(path, [*settings, f"seed={seed}"], panel)
+        there, began = (path / "done").exists(), (time.process_time(), time.monotonic())
+        trained(path, [*settings, f"seed={seed}"], panel)
+        if not there:
             spent = time.process_time() - began[0], time.monotonic() - began[1]
             print(f"{path.name}: {spent[0]:.0f} s of CPU in {spent[1]:.0f} s", file=sys.stderr)
         _judge(path, few, ["agent", *(REFERENCES if seed == 0 else ())])
@@ -77,8 +78,7 @@ def main() -> int:
 
 def _panel(out: Path) -> Path:
     store, panel = out / "store", out / "panel"
-    if not store.exists():
-        run_restock(["ingest", str(LOGS), "--store", str(store)])
+    run_restock(["ingest", str(LOGS), "--store", str(store)])  # skips what it has
     if not panel.exists():
         run_restock(["mix", str(store), "--mixture", "coverage", "--out", str(panel)])
     return panel
@@ -94,10 +94,8 @@ def _judge(run: Path, episodes: tuple[int, int, int], policies: Sequence[str]) -
             *("--layouts", "generated:test"),
         ],
     }.items():
-        judged = run / f"judged-{mark}"
-        if not judged.exists():
-            run_restock(["eval", str(run), "--policies", ",".join(policies), *what])
-            judged.touch()
+        words = ["eval", str(run), "--policies", ",".join(policies), *what]
+        once(run / f"judged-{mark}", words[2:], partial(run_restock, words))
 
 
 def _table(runs: Sequence[Path]) -> list[dict[str, Any]]:

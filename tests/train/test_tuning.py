@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from restock.stats import wilson
 from restock.train.dqn.config import parse_config
 from restock.train.study import tuning
 from restock.train.study.space import Search, load_search, settings_of, trial_name
+from restock.train.study.study_run import train_words
 from restock.train.study.tuning import SearchPlan, run_search, worst_condition
 
 TEXT = """
@@ -125,6 +127,51 @@ def test_an_interrupted_search_draws_what_it_would_have(
     assert len(run_search(more)["trials"]) == 7
     with pytest.raises(RunError, match="another search"):
         run_search(plan_of(tmp_path / "cut", TEXT.replace("high = 5", "high = 4")))
+
+
+def test_a_run_goes_on_from_its_checkpoint_or_begins_again(tmp_path: Path) -> None:
+    run, panel = tmp_path / "run", tmp_path / "panel"
+    begin = ["train", "--out", str(run), "--set", "seed=1", "--panel", str(panel)]
+    assert train_words(run, ["seed=1"], panel) == begin
+    run.mkdir()
+    (run / "config.json").touch()  # cut before its first checkpoint
+    assert train_words(run, ["seed=1"], panel) == begin
+    assert not run.exists()
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "checkpoints" / "latest.safetensors").touch()
+    assert train_words(run, ["seed=1"], panel) == ["train", "--resume", str(run)]
+
+
+def test_mixtures_of_one_name_in_two_folders_have_panels_of_their_own(tmp_path: Path) -> None:
+    space = "mixture = { choices = ['coverage', 'a/coverage.toml', 'b/coverage.toml'] }"
+    plan = plan_of(tmp_path, f"store = 'store'\n[space]\n{space}\n")
+    names = plan.search.parameters["mixture"].choices
+    panels = [plan.panel({"mixture": name}) for name in names]
+    assert panels[0] == plan.out / "panels" / "coverage"
+    assert len(set(panels)) == 3
+    assert {panel.parent for panel in panels if panel is not None} == {plan.out / "panels"}
+
+
+def test_ctrl_c_reaches_the_training_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    signals: list[int] = []
+
+    class Process:
+        def __init__(self, words: list[str], *, start_new_session: bool, **_: Any) -> None:
+            assert start_new_session  # else the terminal sends it another: "end at once"
+
+        def poll(self) -> None:
+            raise KeyboardInterrupt
+
+        def send_signal(self, number: int) -> None:
+            signals.append(number)
+
+        def wait(self) -> int:
+            return 130
+
+    monkeypatch.setattr(tuning.subprocess, "Popen", Process)
+    with pytest.raises(KeyboardInterrupt):
+        tuning._train(tmp_path / "run", [], None, tmp_path / "log", None, 0)
+    assert signals == [signal.SIGINT]
 
 
 def test_a_trial_is_told_of_the_evaluations_of_its_training(tmp_path: Path) -> None:

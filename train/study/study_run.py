@@ -20,6 +20,7 @@ import msgspec
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
+from restock.replay.places import RUN_CONFIG
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.study.study import ArmConfig, StudyEvaluation, StudyJob, StudyPlan
@@ -211,18 +212,21 @@ def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, 
 
 
 def _train(plan: StudyPlan, job: StudyJob, log: Path, say: Say) -> None:
-    panel = plan.panel(job.arm)
-    checkpoint = job.path / "checkpoints" / "latest.safetensors"
-    if (job.path / "config.json").exists() and not checkpoint.exists():
-        shutil.rmtree(job.path)  # cut before its first checkpoint: nothing to go on from
-    if checkpoint.exists():
-        arguments = ["train", "--resume", str(job.path)]
-    else:
-        sets = [word for setting in plan.settings(job.arm, job.seed) for word in ("--set", setting)]
-        arguments = ["train", "--out", str(job.path), *sets]
-        arguments += ["--panel", str(panel)] if panel is not None else []
+    settings = plan.settings(job.arm, job.seed)
     say(f"{job.path.name}: training")
-    restock_verb(arguments, log)
+    restock_verb(train_words(job.path, settings, plan.panel(job.arm)), log)
+
+
+def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) -> list[str]:
+    """What trains the run at a path, on from its checkpoint where it has one. One that was cut
+    before its first checkpoint has nothing to go on from: it is removed, and begins again."""
+    if (path / "checkpoints" / "latest.safetensors").exists():
+        return ["train", "--resume", str(path)]
+    if (path / RUN_CONFIG).exists():
+        shutil.rmtree(path)
+    words = [word for setting in settings for word in ("--set", setting)]
+    words += ["--panel", str(panel)] if panel is not None else []
+    return ["train", "--out", str(path), *words]
 
 
 def restock_verb(arguments: Sequence[str], log: Path) -> None:
@@ -255,4 +259,4 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
         )
 
 
-__all__ = ["Engine", "Say", "run_job", "run_study"]
+__all__ = ["Engine", "Say", "run_job", "run_study", "train_words"]

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import msgspec
 import pyarrow as pa
@@ -34,7 +34,7 @@ from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
 from restock.train.study.space import MIXTURE, Parameter, Search, settings_of, trial_name
 from restock.train.study.study import DONE
-from restock.train.study.study_run import Say, episodes_flags, pack, restock_verb
+from restock.train.study.study_run import Say, episodes_flags, pack, restock_verb, train_words
 
 SEARCH, TRIALS = "search.json", "trials.log"  # what was asked; Optuna's journal
 _POLL_S = 0.5
@@ -58,7 +58,10 @@ class SearchPlan:
         if self.search.panel is not None:
             return self.folder / self.search.panel
         mixture = values.get(MIXTURE, self.search.mixture)
-        return None if mixture is None else self.out / "panels" / Path(str(mixture)).stem
+        if mixture is None:
+            return None
+        # One name for each: two folders may both hold a coverage.toml.
+        return self.out / "panels" / quote(str(mixture), safe="")
 
     @property
     def fingerprint(self) -> str:
@@ -214,14 +217,7 @@ def _train(
     path: Path, settings: list[str], panel: Path | None, log: Path, trial: Any, index: int
 ) -> bool:
     """Train a run, telling the trial of its evaluations; False where it was stopped by them."""
-    if (path / "checkpoints" / "latest.safetensors").exists():
-        words = ["train", "--resume", str(path)]
-    else:
-        words = ["train", "--out", str(path)]
-        words += [word for setting in settings for word in ("--set", setting)]
-        words += ["--panel", str(panel)] if panel is not None else []
-        if path.exists():  # cut before its first checkpoint
-            shutil.rmtree(path)
+    words = train_words(path, settings, panel)
     log.parent.mkdir(parents=True, exist_ok=True)
     told: set[int] = set()
     stopped = False
@@ -234,6 +230,7 @@ def _train(
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env={**os.environ, "NO_COLOR": "1"},
+            start_new_session=True,  # Ctrl-C reaches it through here alone: twice is "at once"
         )
         try:
             while process.poll() is None:
@@ -241,7 +238,7 @@ def _train(
                 if trial is not None and not stopped and _falls_behind(trial, path, told, index):
                     process.send_signal(signal.SIGINT)  # it checkpoints and ends
                     stopped = True
-        except KeyboardInterrupt:
+        except BaseException:  # it does not outlive what watches it
             process.send_signal(signal.SIGINT)
             process.wait()
             raise
