@@ -58,7 +58,9 @@ UNION ALL
 SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
 FROM untold_conditions
 WHERE kind = 'outcome' AND condition NOT IN (
-    SELECT cell.condition FROM (SELECT unnest(cells) AS cell FROM stored_summaries)
+    SELECT cell.condition
+    FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
 )
 ORDER BY condition, action, zone, behaviour_policy;
 

@@ -57,8 +57,11 @@ class Moment:
         """What the policy saw of the lidar at each step: a range a sector, T of them.
 
         The observation holds clearances: with the body's reach that way they are ranges again.
+        Empty where the robot has no lidar.
         """
         task = self.task
+        if not task.lidar:
+            return []
         names = task.observation_names
         first = next(i for i, name in enumerate(names) if name.startswith("clearance_"))
         near = self.observations[:, first : first + task.sectors].astype(np.float64)

@@ -243,9 +243,9 @@ def _reward_parts(
 
     def columns(signals: Mapping[str, Any]) -> dict[str, Any]:
         return {
-            name: np.array([value])
+            name: np.array([np.nan if value is None else value])  # null: what is not known
             for name, value in signals.items()
-            if isinstance(value, bool | int | float)
+            if value is None or isinstance(value, bool | int | float)
         }
 
     parts = reward_parts(

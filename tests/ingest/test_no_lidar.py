@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from rosbags.highlevel import AnyReader
 from support.driven_robot import Drive, write_bag
 from support.paths import ROOT
 from support.profile_texts import WAREHOUSE
@@ -30,6 +32,8 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.plan import plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
+from restock.replay.trace.trace import TracePlaces, trace_row
+from restock.train.view.view import write_view
 
 NEEDS_ONE = ["blocked_aisle", "closing_traffic", "near_collision", "plan_blocked", "recovery"]
 SCAN = re.search(r"\[inputs\.scan\].*?\n\n", WAREHOUSE, re.DOTALL)
@@ -105,6 +109,23 @@ def test_rows_hold_null_and_what_else_the_robot_knows(drives, blind):
 
     seeing = ingest(drives / "seeing", load_profile("warehouse_amr"), store=None)
     assert seeing.manifest["unknown_conditions"] == []
+
+
+def test_its_moments_are_viewed_without_what_a_lidar_sees(blind, tmp_path):
+    path, _ = blind
+    with Store(path) as store:
+        row, steps = store.sql("SELECT min(transition_id), count(*) FROM transitions").fetchall()[0]
+    files = [tmp_path / f"moment{ending}" for ending in (".mcap", ".rrd")]
+    trace = trace_row(path, str(row), TracePlaces())
+    assert trace.origin.reward_parts["tight"] == 0.0
+    for file in files if find_spec("rerun") else files[:1]:
+        write_view(trace, file)
+        assert file.exists()
+    with AnyReader(files[:1]) as reader:
+        topics = reader.topics
+    assert topics["/restock/reward"].msgcount == topics["/restock/speed/wheels_mps"].msgcount
+    assert 20 < topics["/restock/reward"].msgcount <= steps
+    assert not [name for name in topics if "seen" in name or "clearance" in name]
 
 
 def test_a_wall_beside_the_robot_costs_what_does_not_see_it_nothing(drives, tmp_path):

@@ -151,6 +151,19 @@ def old_labels(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "labels_version", versions)
 
 
+def old_labels_and_a_newer_robot(table: pa.Table, recordings: pa.Table) -> Tables:
+    table, recordings = old_labels(table, recordings)
+    other = recordings.slice(0, 1)
+    for name, value in {
+        "recording_id": f"{3:016x}",
+        "ingest_id": "c",
+        "profile": "other",
+        "ingested_at": datetime(2026, 2, 1, tzinfo=UTC),
+    }.items():
+        other = replaced(other, name, [value])
+    return table, pa.concat_tables([recordings.cast(other.schema), other])
+
+
 def poor_labels(table: pa.Table, recordings: pa.Table) -> Tables:
     score = {"condition": "wheel_slip", "precision": 0.5, "recall": 0.9, "labelled": 50}
     scores = [[score | {"support": 30}], []]
@@ -318,6 +331,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("duplicate_transitions", twice, 2, {"copies": 2}),
     ("several_tasks", two_tasks, 2, {"task_hash": TASK.hash}),
     ("stale_labels", old_labels, 1, {"recording_id": f"{2:016x}"}),
+    ("stale_labels", old_labels_and_a_newer_robot, 1, {"recording_id": f"{2:016x}"}),
     ("label_quality", poor_labels, 1, {"condition": "wheel_slip", "precision": 0.5}),
     ("uncertain_labels", uncertain_slip, 1, {"condition": "wheel_slip"}),
     ("stratum_of_failures", failures, 1, {"condition": "wheel_slip", "success_share": 0.0}),

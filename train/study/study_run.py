@@ -20,7 +20,6 @@ import msgspec
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
-from restock.replay.places import RUN_CONFIG
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.study.study import ArmConfig, StudyEvaluation, StudyJob, StudyPlan
@@ -222,7 +221,7 @@ def train_words(path: Path, settings: Sequence[str], panel: Path | None = None) 
     before its first checkpoint has nothing to go on from: it is removed, and begins again."""
     if (path / "checkpoints" / "latest.safetensors").exists():
         return ["train", "--resume", str(path)]
-    if (path / RUN_CONFIG).exists():
+    if (path / "config.json").exists():
         shutil.rmtree(path)
     words = [word for setting in settings for word in ("--set", setting)]
     words += ["--panel", str(panel)] if panel is not None else []

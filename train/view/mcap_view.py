@@ -105,10 +105,9 @@ def _shown(moment: Moment, critic: Critic | None) -> Iterator[_Shown]:
             ),
         )
         yield log_ns, "/restock/body", "visualization_msgs/msg/Marker", _body(moment, log_ns)
-        yield (
-            *(log_ns, "/restock/seen", "sensor_msgs/msg/LaserScan"),
-            _scan(SECTORS, sectors[index], log_ns),
-        )
+        if sectors:
+            scan = _scan(SECTORS, sectors[index], log_ns)
+            yield log_ns, "/restock/seen", "sensor_msgs/msg/LaserScan", scan
         yield (
             *(log_ns, "/restock/waypoints", "nav_msgs/msg/Path"),
             _path(

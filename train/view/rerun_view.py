@@ -51,7 +51,9 @@ def write_rerun(path: Path, moment: Moment, critic: Critic | None) -> dict[str, 
     for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
         log.at(log_ns)
         log.put("map/robot", _placed(rr, step))
-        log.put("map/robot/seen", _points(rr, "seen", _ends(sectors[index], body.lidar_x_m, 0.0)))
+        if sectors:
+            ends = _ends(sectors[index], body.lidar_x_m, 0.0)
+            log.put("map/robot/seen", _points(rr, "seen", ends))
         ahead = [
             (float(step[f"waypoint_{name}_x_m"]), float(step[f"waypoint_{name}_y_m"]), 0.0)
             for name in ("near", "far")

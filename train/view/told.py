@@ -24,7 +24,7 @@ def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str
 
 
 def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, float]:
-    """What is plotted of a step."""
+    """What is plotted of a step, as far as the store has it."""
     step = moment.steps[index]
     names = {
         "reward": "reward",
@@ -36,7 +36,9 @@ def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, f
         "clearance/least_m": "clearance_m",
         "clearance/ahead_m": "clearance_ahead_m",
     }
-    numbers = {name: float(step[column]) for name, column in names.items()}
+    numbers = {
+        name: float(step[column]) for name, column in names.items() if step[column] is not None
+    }
     if critic is not None:
         numbers["critic/value"] = float(critic.value[index])
         numbers["critic/best_value"] = float(critic.best[index])
