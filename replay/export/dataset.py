@@ -11,12 +11,12 @@ import importlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
+from restock.imports import installed
 from restock.ingest.store.version import Version
 from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
@@ -64,7 +64,7 @@ def export_dataset(
     module, needs, ending = FORMATS.get(to, ("", "", ""))
     if not module:
         raise StoreError(f"no format {to!r}", remedy=f"one of {', '.join(FORMATS)}")
-    if needs and find_spec(needs) is None:
+    if needs and not installed(needs):
         raise StoreError(
             f"the format {to} needs {needs}, which is not installed",
             remedy=f"pip install {needs}, or `pip install restock[libraries]`",

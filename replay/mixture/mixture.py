@@ -27,7 +27,6 @@ SCHEMA_FILE = "mixture.schema.json"
 
 AtLeastOne = Annotated[int, Meta(ge=1)]
 Count = Annotated[int, Meta(ge=0)]
-FromZero = Annotated[float, Meta(ge=0)]
 FromOne = Annotated[float, Meta(ge=1)]
 Positive = Annotated[float, Meta(gt=0)]
 Timing = Literal["pre", "post"]

@@ -162,9 +162,9 @@ def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
     return rows
 
 
-def junit_xml(findings: Sequence[Finding], suite: str) -> str:
-    """The findings as JUnit XML: failed audits fail, skipped ones are skipped."""
-    return _xml(_suite(findings, suite, {"fail"}))
+def junit_xml(findings: Sequence[Finding], suite: str, failing: Collection[str] = ("fail",)) -> str:
+    """The findings as JUnit XML: those whose status is in `failing` fail, skipped are skipped."""
+    return _xml(_suite(findings, suite, failing))
 
 
 def junit_suites(suites: Mapping[str, Sequence[Finding]], failing: Collection[str]) -> str:

@@ -33,6 +33,14 @@ def import_extra(
         ) from error
 
 
+def installed(name: str) -> bool:
+    """Whether the module `name` can be imported, without importing it."""
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ValueError:  # what stands in its place says nothing of itself: it was blocked
+        return False
+
+
 def when_imported(name: str, action: Callable[[], None]) -> None:
     """Do it once the module `name` is imported: now where it is, else right after it will be."""
     if name in sys.modules:
@@ -89,4 +97,4 @@ class _Hides:
         return None
 
 
-__all__ = ["hidden", "import_extra", "when_imported"]
+__all__ = ["hidden", "import_extra", "installed", "when_imported"]

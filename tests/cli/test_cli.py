@@ -142,3 +142,25 @@ def sample_rows(tmp_path):
     assert cli.main(["ingest", str(bag), "--store", str(store)]) == 0
     columns = "i AS number, range(30) AS numbers, '[a]' || chr(10) || 'b' AS text"
     return store, f"SELECT {columns} FROM range(100) AS t(i)"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval", "run", "--on-logs", "own", "--check", "--baseline", "main"],
+        ["eval", "run", "--on-logs", "own", "--no-drive"],
+        ["eval", "run", "--horizon", "5"],
+        ["label", "store", "--all"],
+        ["export", "run", "--to", "onnx", "--out", "p.onnx", "--license", "apache-2.0"],
+        ["audit", "store", "--capacity", "--strict"],
+        ["audit", "store", "--capacity", "--run", "runs/a"],
+        ["audit", "runs/a", "--reward", "--panel", "panel"],
+    ],
+    ids=" ".join,
+)
+def test_an_option_that_would_do_nothing_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(words) == 2
+    *_, last = (word for word in words if word.startswith("--"))
+    assert last in capsys.readouterr().err

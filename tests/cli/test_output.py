@@ -30,6 +30,12 @@ def test_prose_is_one_line_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None
     assert len(capsys.readouterr().out.splitlines()) == 1
 
 
+def test_a_message_is_said_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    line = f"wrote runs/a[old]/{'x' * 90}[/y]/:key:.html"
+    output.say(line)
+    assert capsys.readouterr().err == f"{line}\n"
+
+
 def test_a_terminal_tells_fail_from_pass_and_is_never_overrun(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

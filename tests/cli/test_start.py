@@ -87,6 +87,21 @@ def test_a_failed_stage_is_tried_again(tmp_path: Path, bag: Path) -> None:
     assert way(out, verbs, bag) == ["kept", "done", "done"]
 
 
+def test_a_stage_that_shows_its_progress_keeps_its_complaint_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def verb(command: list[str]) -> int:
+        sys.stderr.write("10 steps\nrestock: runs/a: no room\n")
+        return 2
+
+    said: list[str] = []
+    stage = Stage("train", "", "", ["train"], shows_progress=True)
+    ended = Work(tmp_path / "out", verb, said.append).do(stage)
+    assert ended.errors == ["runs/a: no room"]
+    assert "10 steps" in capsys.readouterr().err
+    assert not any("no room" in line for line in said)  # it was said
+
+
 def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: Path) -> None:
     verbs, out = Verbs(), tmp_path / "out"
     verbs.codes["train"] = 130

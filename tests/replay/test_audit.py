@@ -624,7 +624,9 @@ def test_the_verb_fails_on_an_error_and_passes_without(
     out = capsys.readouterr().out
     assert "stale_data" in out
     assert "skipped" in out
-    assert cli.main(["audit", str(store_path), "--thresholds", str(easy), "--strict"]) == 1
+    strict = ["--thresholds", str(easy), "--strict", "--junit", str(junit)]
+    assert cli.main(["audit", str(store_path), *strict]) == 1
+    assert int(ElementTree.fromstring(junit.read_text()).get("failures", "")) > 0
 
 
 def test_the_verb_refuses_what_is_no_store(
@@ -640,7 +642,8 @@ def test_the_verb_refuses_a_run_that_is_none_and_a_file_it_cannot_write(
     store = str(store_path)
     assert cli.main(["audit", store, "--run", str(panels["time"])]) == 2
     assert "is not a run directory" in capsys.readouterr().err
-    assert cli.main(["audit", store, "--junit", str(tmp_path / "nowhere" / "x.xml")]) == 2
+    (tmp_path / "file").touch()
+    assert cli.main(["audit", store, "--junit", str(tmp_path / "file" / "x.xml")]) == 2
     assert "cannot be written" in capsys.readouterr().err
 
 

@@ -9,7 +9,6 @@ from typing import Literal
 from restock.stats import ConfidenceInterval, wilson
 
 Status = Literal["ok", "off", "undecided", "not run"]
-DEFINITION = "definition"  # in the twin's place, where there is none to ask
 
 
 @dataclass(frozen=True)
@@ -103,4 +102,4 @@ def shares_compared(
     )  # fmt: skip
 
 
-__all__ = ["DEFINITION", "Comparison", "judged", "not_run", "share_judged", "shares_compared"]
+__all__ = ["Comparison", "judged", "not_run", "share_judged", "shares_compared"]

@@ -11,7 +11,6 @@ is kept is the policy in Restock's own network, weight for weight, so `restock e
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import sys
 import time
@@ -22,6 +21,7 @@ import msgspec
 
 from restock.errors import ConfigError, RestockError
 from restock.files import write_text
+from restock.imports import installed
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
@@ -57,11 +57,7 @@ class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def check_installed() -> None:
     """Raises ConfigError where Stable-Baselines3 is not installed."""
-    try:
-        installed = importlib.util.find_spec("stable_baselines3") is not None
-    except ValueError:  # a module that was blocked
-        installed = False
-    if not installed:
+    if not installed("stable_baselines3"):
         raise ConfigError(
             "an arm trains with Stable-Baselines3, which is not installed",
             remedy="pip install stable-baselines3",

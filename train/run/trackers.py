@@ -7,7 +7,6 @@ Both stay on this machine unless their own environment variables say otherwise: 
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import time
@@ -18,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import ConfigError
+from restock.imports import installed
 from restock.train.run.events import Sink, tracked
 from restock.train.run.run import Run
 
 PROJECT = "restock"  # where WANDB_PROJECT or MLFLOW_EXPERIMENT_NAME name no other
-MODULES = {"wandb": "wandb", "mlflow": "mlflow"}
 _PARAMS = 100  # that MLflow takes at a time
 _LONGEST = 500  # characters of a value that every MLflow store takes
 
@@ -34,7 +33,7 @@ def require_trackers(names: Sequence[str]) -> None:
         ConfigError: names the first, and how it is installed.
     """
     for name in names:
-        if importlib.util.find_spec(MODULES[name]) is None:
+        if not installed(name):
             raise ConfigError(
                 f"{name} is not installed",
                 where="record.trackers",

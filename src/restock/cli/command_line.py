@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
+from collections.abc import Collection
 from typing import Annotated, Any, Literal
 
 import tyro
+
+from restock.errors import ConfigError
 
 _PREPARED: list[type[Any]] = []
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
@@ -28,6 +31,20 @@ def prepared(command: type[Any]) -> type[Any]:
         field.type = _prepared(hints[field.name], field.default)
         command.__annotations__[field.name] = field.type
     return command
+
+
+def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
+    """Refuse options that would do nothing: those of these fields whose value is not the default.
+
+    Raises:
+        ConfigError: one was given.
+    """
+    for field in dataclasses.fields(command):
+        if field.name in names and getattr(command, field.name) != field.default:
+            name = field.name.removesuffix("_dir").replace("_", "-")
+            raise ConfigError(
+                why, where=f"--no-{name}" if field.default is True else f"--{name}", remedy=remedy
+            )
 
 
 def _prepared(hint: Any, default: Any) -> Any:

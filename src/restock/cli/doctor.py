@@ -126,7 +126,7 @@ def _torch() -> Finding:
 
 
 def _drawing() -> Finding:
-    """Whether MuJoCo can draw off screen; only pictures and films need it."""
+    """Whether MuJoCo can draw off screen; only what its cameras see needs it."""
     command = [sys.executable, "-c", DRAWS]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)
@@ -136,7 +136,9 @@ def _drawing() -> Finding:
         backend = os.environ.get("MUJOCO_GL", "egl")
         return Finding("works", "pictures", "ok", f"MuJoCo draws off screen ({backend})")
     why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
-    remedy = "install libegl1 (or MUJOCO_GL=osmesa with libosmesa6); only films need it"
+    remedy = (
+        "install libegl1 (or MUJOCO_GL=osmesa with libosmesa6); only the twin's cameras need it"
+    )
     return Finding("works", "pictures", "missing", why, remedy)
 
 

@@ -56,8 +56,8 @@ def stderr() -> Console:
 
 
 def say(message: str) -> None:
-    """One line of progress, to stderr."""
-    stderr().print(message)
+    """One line of progress, to stderr: as it is, for it may hold a path or a command."""
+    stderr().print(message, markup=False, emoji=False, soft_wrap=True)
 
 
 def plain(value: Any) -> Any:

@@ -66,6 +66,8 @@ class AuditCommand:
         beside = {"panel": self.panel, "run": self.run_dir}
         given = {name: path for name, path in beside.items() if path is not None}
         if self.capacity:
+            _refuse_with(self, "--capacity", "panel", "run_dir", "audits", "thresholds", "reward")
+            _refuse_with(self, "--capacity", "discount", "strict", "rows", "junit")
             return self._capacity()
         if self.apply is not None:
             raise ConfigError(
@@ -81,6 +83,8 @@ class AuditCommand:
                 where="--discount",
                 remedy="give --reward, and the discount of one step: 0.99 say",
             )
+        if self.reward:
+            _refuse_with(self, "--reward", "panel", "run_dir", "rows")
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
@@ -100,7 +104,7 @@ class AuditCommand:
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = [finding for finding in findings if finding.status in failing]
         if self.junit is not None:
-            self._write_junit(self.junit, junit_xml(findings, f"audit {self.store}"))
+            self._write_junit(self.junit, junit_xml(findings, f"audit {self.store}", failing))
         if self.json:
             document: dict[str, Any] = {
                 "store": str(self.store),
@@ -121,8 +125,10 @@ class AuditCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _write_junit(self, path: Path, text: str) -> None:
+        from restock.files import write_text
+
         try:
-            path.write_text(text, encoding="utf-8")
+            write_text(path, text)
         except OSError as error:
             raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
@@ -158,6 +164,12 @@ class AuditCommand:
                 + ("" if applied["before"] is None else f" (was {applied['before']})")
             )
         return int(ExitCode.OK)
+
+
+def _refuse_with(command: AuditCommand, other: str, *names: str) -> None:
+    from restock.cli.command_line import refuse
+
+    refuse(command, names, f"does not go with {other}", remedy="leave one of them out")
 
 
 def _apply(path: Path, rows: int) -> dict[str, Any]:

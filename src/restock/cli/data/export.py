@@ -42,12 +42,12 @@ class ExportCommand:
     def run(self) -> None:
         """Write the data set and say what is in it."""
         from restock.cli import output
-        from restock.errors import StoreError
+        from restock.cli.command_line import refuse
         from restock.ingest.store.version import given_version
 
         if self.to == "onnx":
-            if self.version is not None:
-                raise StoreError("only a store has versions", remedy="leave --version out")
+            of_rows = ("query", "panel", "version", "action", "license")
+            refuse(self, of_rows, "is of a data set", remedy="leave it out: a policy has no rows")
             from restock.train.evaluation.onnx_policy import export_onnx
 
             made = export_onnx(self.source, self.out)

@@ -130,6 +130,8 @@ class LabelCommand:
             clash = [name for name, there in (others | of_rules).items() if there]
             if given and clash:
                 raise ConfigError(f"{verb} does not go with {clash[0]}")
+        if self.all and self.profile is None:
+            raise ConfigError("--all goes with --profile FILE")
         if self.by is not None and not self.score:
             raise ConfigError("--by goes with --score")
         if self.out is not None and self.review is None:

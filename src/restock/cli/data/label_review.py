@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,10 +45,8 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
         output.stdout().print("no event of a label is in doubt, or none is left to review")
         return ExitCode.OK
     output.print_table([_line(row) for row in rows], title="the most doubtful events first")
-    # A command is one line, however narrow the terminal.
-    say = partial(output.stderr().print, soft_wrap=True, highlight=False, markup=False)
-    say(f"to look at the first: {rows[0]['open']}")
-    say(
+    output.say(f"to look at the first: {rows[0]['open']}")
+    output.say(
         f"write yes, no or FIRST..LAST (its true steps) into the last column of {out}, then:"
         f" restock label {path} --corrections {out}"
         if out is not None
@@ -70,7 +68,7 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
         "log time": row["start_time"],
         "episode": row["episode_id"].rpartition("/")[2],
         "steps": f"{row['first_step']}..{row['last_step']}",
-        "restock trace STORE": row["event"] and row["open"].split()[3],
+        "restock trace STORE": row["event"] and shlex.split(row["open"])[3],
     }
 
 

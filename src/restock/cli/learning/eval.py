@@ -8,6 +8,12 @@ from typing import Annotated, Any
 
 import tyro
 
+# Options that say what is driven, and what becomes of it.
+_DRIVES = (
+    *("episodes", "perturbations", "policies", "seed", "layouts", "limiter", "missions"),
+    *("baseline", "margin", "check", "save_as_baseline", "drive", "video"),
+)
+
 
 @dataclass
 class EvalCommand:
@@ -74,14 +80,13 @@ class EvalCommand:
     """Print the table and the settings as JSON."""
 
     def run(self) -> int:
-        if self.on_logs is not None:
-            if self.video:
-                from restock.errors import ConfigError
+        from restock.cli.command_line import refuse
 
-                raise ConfigError(
-                    "on logs nothing drives", where="--video", remedy="leave out --on-logs"
-                )
+        if self.on_logs is not None:
+            why = "does not go with --on-logs: nothing drives"
+            refuse(self, _DRIVES, why, remedy="leave one of them out")
             return self._evaluate_off_policy(self.on_logs)
+        refuse(self, ("epsilon", "horizon"), "is of --on-logs", remedy="give that too")
         return self._drive()
 
     def _drive(self) -> int:

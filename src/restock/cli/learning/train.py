@@ -6,7 +6,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -97,15 +96,13 @@ class TrainCommand:
 
 def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
     """Train to the end; then flush the twin's episodes, where a store is given."""
-    from restock.cli.output import progress, stderr
+    from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
     from restock.train.flush_fresh import flush
     from restock.train.loop import train
 
     config = prepared.config
     session = prepared.open()
-    # Soft: a line a reader greps for must not be wrapped.
-    say = partial(stderr().print, soft_wrap=True, highlight=False)
     say(prepared.describe())
     if store is not None or (session.run.path / "fresh").is_dir():
         session.collector.keep(session.run.path / "fresh")

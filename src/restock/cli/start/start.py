@@ -82,7 +82,7 @@ class StartCommand:
     "files", "seconds", …}], "stopped", "report"}."""
 
     def run(self) -> int:
-        """The whole way; 3 where a person must decide, 2 where a stage failed."""
+        """The whole way; 3 where a person must decide, or a stage failed that it needs."""
         from restock.cli import main
         from restock.cli.output import print_json, stderr, stdout
         from restock.cli.start.work import Work, escape
@@ -101,13 +101,14 @@ class StartCommand:
         work = Work(self.out, main, say, plan=self.dry_run)
         stopped = _way(self, work)
         page = self.out / "run" / "report.html"
+        reported = stopped is None or any(e.name == "report" and e.good for e in work.ended)
         if self.json:
             stages = [{k: v for k, v in asdict(e).items() if k != "document"} for e in work.ended]
             print_json(
                 {
                     "stages": stages,
                     "stopped": None if stopped is None else asdict(stopped),
-                    "report": str(page) if page.exists() and stopped is None else None,
+                    "report": str(page) if page.exists() and reported else None,
                 }
             )
         if stopped is None:
@@ -286,20 +287,27 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     trained = work.do(stages.train(to, twin=twin))
     if not trained.good:
         return Stop("training did not come to its end", (*trained.errors[:2], again))
+    judged = []
     if twin:
         goal = has_goal(to.profile)
         if goal and floor.good:
-            work.do(stages.evaluate_on_ways(to))
-        work.do(stages.evaluate(to, goal=goal))
+            judged.append(work.do(stages.evaluate_on_ways(to)))
+        judged.append(work.do(stages.evaluate(to, goal=goal)))
     if work.plan or any(HELD_OUT in why for why in mixed.document["left_out"]):
-        work.do(stages.judge(to))
+        judged.append(work.do(stages.judge(to)))
     else:
         work.say(
             "\n[yellow]These logs are too short to hold any of them out: nothing says what the"
             " policy is worth. Ingest more.[/]"
         )
     reported = work.do(stages.report(to))
-    return None if reported.good else Stop("there is no report", (again,))
+    if not reported.good:
+        return Stop("there is no report", (again,))
+    if failed := [ended for ended in judged if not ended.good]:
+        why = [one for ended in failed for one in ended.errors[:1]]
+        names = " and ".join(f"`{ended.command}`" for ended in failed)
+        return Stop(f"the report is without what failed: {names}", (*why, again))
+    return None
 
 
 __all__ = ["StartCommand"]

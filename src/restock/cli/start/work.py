@@ -102,20 +102,18 @@ class Work:
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
         self._keep()
         self._stamps.append(stamp)
-        return self._note(self._run(stage, stamp))
+        return self._note(self._run(stage, stamp), told=stage.shows_progress)
 
     def _run(self, stage: Stage, stamp: str) -> Ended:
         printed, complaints = io.StringIO(), io.StringIO()
+        said: Any = _Both(sys.stderr, complaints) if stage.shows_progress else complaints
         started = time.monotonic()
         sys.stdout.flush()
-        with redirect_stdout(printed):
-            if stage.shows_progress:
-                code = self.dispatch([*stage.command, "--json"])
-            else:
-                with redirect_stderr(complaints):
-                    code = self.dispatch([*stage.command, "--json"])
+        with redirect_stdout(printed), redirect_stderr(said):
+            code = self.dispatch([*stage.command, "--json"])
         if code == ExitCode.INTERRUPTED:
-            sys.stderr.write(complaints.getvalue())
+            if not stage.shows_progress:
+                sys.stderr.write(complaints.getvalue())
             raise KeyboardInterrupt
         text = printed.getvalue()
         document = _parsed(text)
@@ -138,12 +136,12 @@ class Work:
         self._keep()
         return ended
 
-    def _note(self, ended: Ended) -> Ended:
-        """Say what came of a stage."""
+    def _note(self, ended: Ended, *, told: bool = False) -> Ended:
+        """Say what came of a stage, and its complaints where they were not `told` already."""
         self.ended.append(ended)
         for line in ended.outcome:
             self.say(f"   {escape(line)}")
-        if not ended.good:
+        if not ended.good and not told:
             for line in ended.errors:
                 self.say(f"   [yellow]{escape(line)}[/yellow]")
         if ended.files:
@@ -191,6 +189,20 @@ class Work:
 
     def _keep(self) -> None:
         write_text(self.out / FOLDER / RECORD, json.dumps(self._known, indent=1) + "\n")
+
+
+class _Both:
+    """A stream, with a copy of what is written to it."""
+
+    def __init__(self, stream: Any, copy: io.StringIO) -> None:
+        self._stream, self._copy = stream, copy
+
+    def write(self, text: str) -> int:
+        self._copy.write(text)
+        return int(self._stream.write(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def escape(text: str) -> str:
