@@ -11,6 +11,7 @@ from restock.errors import ConfigError
 from restock.toml import Checked
 
 COMMAND_SOURCES = "command_sources"
+COMMAND_THROUGH = "command_through"
 MOST_NAME = 64  # characters of a behaviour policy
 
 
@@ -169,14 +170,14 @@ def _check_wheelbase(key: str, source: Input, where: str) -> None:
         )
 
 
-def check_command_source(name: str, source: Input, command: Input, where: str) -> None:
+def check_command_source(key: str, source: Input, command: Input, where: str) -> None:
     """That it says what it commands as the command does, or what is pressed while it drives.
 
     Raises:
         ConfigError: it does not; names the key.
     """
-    key = f"{COMMAND_SOURCES}.{name}"
     commanding = source.fields.keys() - {"pressed"}
+    name = key.removeprefix(f"{COMMAND_SOURCES}.")
     if not name or len(name) > MOST_NAME or not name.isprintable():
         raise ConfigError(
             f"`{key}`: the name of a behaviour policy has 1 to {MOST_NAME} printable characters",
@@ -189,8 +190,9 @@ def check_command_source(name: str, source: Input, command: Input, where: str) -
             where=where,
             remedy=f"a source of commands takes {', '.join(COMMAND_SOURCE_FIELDS)}",
         )
-    complete = "speed_mps" in commanding and len(commanding) == 2
-    if not (commanding == set() if "pressed" in source.fields else complete):
+    complete = "speed_mps" in commanding and len(commanding) == len(source.fields) == 2
+    by_button = key != COMMAND_THROUGH and source.fields.keys() == {"pressed"}
+    if not (complete or by_button):
         raise ConfigError(
             f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not say when it drives",
             where=where,

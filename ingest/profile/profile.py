@@ -29,6 +29,7 @@ from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
+    COMMAND_THROUGH,
     FALLBACKS,
     FIX_FALLBACK,
     FIX_SETTINGS,
@@ -141,6 +142,9 @@ class Profile(Checked, frozen=True):
     behaviour_policy: str = "unknown"  # who drove, where no topic says
     # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
+    # What was chosen among them, where the command is that smoothed or limited: it is by whose
+    # command it follows.
+    command_through: Input | None = None
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
@@ -198,6 +202,8 @@ class Profile(Checked, frozen=True):
         for source in values["command_sources"].values():
             for key in FIX_SETTINGS:
                 del source[key]
+        if self.command_through is None:
+            apart |= {"command_through"}
         if self.inputs.heading is None:
             del values["inputs"]["heading"]
         for source in filter(None, values["inputs"].values()):
@@ -219,6 +225,8 @@ class Profile(Checked, frozen=True):
             f"{COMMAND_SOURCES}.{name}": msgspec.structs.replace(source, optional=True)
             for name, source in self.command_sources.items()
         }
+        if self.command_through is not None:
+            optional[COMMAND_THROUGH] = msgspec.structs.replace(self.command_through, optional=True)
         return dict(self.inputs.items()) | optional
 
     @property
@@ -241,6 +249,8 @@ class Profile(Checked, frozen=True):
                 fallbacks[f"{name}.yaw_rate_radps"] = how
         if self.command_sources and "behaviour_policy" in fallbacks:
             names = ", ".join(self.command_sources)
+            if (through := self.command_through) is not None:
+                names += f" (the one that {through.topic} repeats, which the command follows)"
             fallbacks["behaviour_policy"] = POLICY_FALLBACK.format(names=names)
         if self.inputs.pose is None:
             fallbacks["pose"] = POSE_FALLBACK
@@ -355,7 +365,17 @@ def _check(profile: Profile, where: str) -> None:
             remedy="give the number of sectors (36 by default), or leave [inputs.scan] out",
         )
     for name, source in profile.command_sources.items():
-        check_command_source(name, source, profile.inputs.command, where)
+        check_command_source(f"{COMMAND_SOURCES}.{name}", source, profile.inputs.command, where)
+    if profile.command_through is not None:
+        if not profile.command_sources:
+            raise ConfigError(
+                "`command_through` is given and no `command_sources`: it says by whom nothing is",
+                where=where,
+                remedy="name the topics that it chooses among, or leave it out",
+            )
+        check_command_source(
+            COMMAND_THROUGH, profile.command_through, profile.inputs.command, where
+        )
     pose = profile.inputs.pose
     if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
         raise ConfigError(

@@ -3,6 +3,10 @@
 A multiplexer's output repeats its inputs: where a topic changes to what another one has just said,
 and not the other way about, it comes after it. A joystick drives while a button is held, where the
 commands of that time are an axis of its, times a scale.
+
+A smoother or a collision monitor behind the multiplexer says nothing that anybody said: its command
+goes from where it was towards what was chosen, or is a part of that. By this it is followed back to
+the multiplexer, and from there to whose command that repeats.
 """
 
 from __future__ import annotations
@@ -23,6 +27,8 @@ JOY = "sensor_msgs/msg/Joy"
 WITHIN_S = 0.5
 LEAST_PASSED, LEAST_SHARE, MOSTLY = 5, 0.02, 0.5  # changes that one topic took over from another
 LEAST_HELD, FITS = 10, 0.9  # commands while a button is held; of them, how many are an axis's
+LEAST_TOLD, FOLLOWS, EXACTLY = 20, 0.95, 0.98  # commands that tell; of them, how many follow
+TARGET_S, SAME = 1.0, 1e-4  # how old what it goes towards may be; m/s and rad/s
 _STEERED = "wheelbase_m"
 Fit = tuple[TopicInfo, Kind]
 
@@ -55,6 +61,25 @@ class _Told:
         same = (self.values[np.maximum(at, 0)] == output.values[changed]).all(axis=1)
         return int((same & (at >= 0) & (age_s <= WITHIN_S)).sum())
 
+    def followed_by(self, output: _Told) -> float:
+        """The share of the commands of `output` that lie towards what this topic said, or are a
+        part of that; 0 where too few tell."""
+        at = np.searchsorted(self.log_time_ns, output.log_time_ns[1:], "right") - 1
+        fresh = at >= 1
+        fresh &= output.log_time_ns[1:] - self.log_time_ns[np.maximum(at, 0)] <= TARGET_S * 1e9
+        before, now = output.values[:-1], output.values[1:]
+        good, telling = np.zeros(len(now), np.bool_), np.zeros(len(now), np.bool_)
+        for late in (0, 1):  # the newest may have come too late to count
+            target = self.values[np.maximum(at - late, 0)]
+            low, high = np.minimum(before, target) - SAME, np.maximum(before, target) + SAME
+            good |= ((now >= low) & (now <= high)).all(axis=1)
+            part = (now * target).sum(axis=1) / np.maximum((target**2).sum(axis=1), 1e-12)
+            near = np.abs(now - part[:, None] * target).max(axis=1) <= SAME
+            good |= near & (part >= 0) & (part <= 1)
+            telling |= (np.abs(target - before).max(axis=1) > SAME) | (now != before).any(axis=1)
+        counted = fresh & telling
+        return float(good[counted].mean()) if counted.sum() >= LEAST_TOLD else 0.0
+
     @property
     def changes(self) -> int:
         return int((np.diff(self.values, axis=0) != 0).any(axis=1).sum())
@@ -75,14 +100,18 @@ def choose_command(
         if not later:
             break
         first = max(later, key=first.passed_on)
+    through, first = _through(told, first)
+    by_whom = first if through is None else through
     chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
     sources: dict[str, _Told] = {}
-    inputs = [one for one in told if one is not first and _feeds(one, first, LEAST_SHARE)]
-    for one in sorted(inputs, key=lambda one: -one.passed_on(first)):
+    inputs = [one for one in _inputs(told, by_whom) if one is not first]
+    for one in sorted(inputs, key=lambda one: -one.passed_on(by_whom)):
         sources.setdefault(_policy(one.fit[0].name), one)
-    lines = [line for name, one in sources.items() for line in _lines(name, one, first)]
+    lines = [line for name, one in sources.items() for line in _lines(name, one, by_whom)]
     if "teleop" not in sources:
-        lines += _joystick_lines(recording, topics, first)
+        lines += _joystick_lines(recording, topics, by_whom)
+    if through is not None:
+        lines += _through_lines(through, first)
     named = _policy(first.fit[0].name)
     if not sources and named in ("teleop", "navigation"):
         return chosen, CommandChoice(lines, named, f"by the name of {first.fit[0].name}")
@@ -96,6 +125,58 @@ def _read(recording: Recording, fit: Fit) -> _Told:
     values = np.stack([np.asarray(columns.fields[path], np.float64) for path in paths], axis=1)
     order = np.argsort(columns.log_time_ns, kind="stable")
     return _Told(fit, columns.log_time_ns[order], values[order])
+
+
+def _inputs(told: Sequence[_Told], output: _Told) -> list[_Told]:
+    """Those whose commands it passes on."""
+    return [one for one in told if one is not output and _feeds(one, output, LEAST_SHARE)]
+
+
+def _through(told: Sequence[_Told], first: _Told) -> tuple[_Told | None, _Told]:
+    """The multiplexer's output that the driving command follows, smoothed; and that command.
+
+    None where the command is the multiplexer's own, or nothing shows what it follows.
+    """
+    muxed: _Told | None = None
+    if _inputs(told, first):  # it may be one in the middle of a chain
+        after = [one for one in told if one is not first and _follows(first, one)]
+        if after:
+            muxed, first = first, max(after, key=lambda one: len(one.values))
+    if muxed is None:
+        before = [one for one in told if one is not first and _follows(one, first)]
+        before = [one for one in before if _inputs([o for o in told if o is not first], one)]
+        muxed = max(before, key=lambda one: one.followed_by(first), default=None)
+    if muxed is not None and muxed.passed_on(first) >= EXACTLY * first.changes:
+        muxed = None
+    return muxed, first
+
+
+def _follows(one: _Told, output: _Told) -> bool:
+    """Whether `output` goes towards what `one` says, and not the other way about."""
+    share = one.followed_by(output)
+    return share >= FOLLOWS and share > output.followed_by(one)
+
+
+def _through_lines(through: _Told, command: _Told) -> list[str]:
+    topic, kind = through.fit
+    fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
+    return [
+        f"# {through.followed_by(command):.0%} of the commands of {command.fit[0].name} lie towards"
+        " what it said last, or are a part of it:",
+        "[command_through]  # who drove is by whose command it repeats; unknown where it is silent",
+        f"topic = {json.dumps(topic.name)}",
+        f'type = "{topic.type}"',
+        f"fields = {{ {fields} }}",
+        *([_STEERED] if "steering_rad" in kind.fields else []),
+        f"max_age_s = {_age_s(through):g}",
+        "",
+    ]
+
+
+def _age_s(one: _Told) -> float:
+    """Four periods of it."""
+    gaps = np.diff(one.log_time_ns) * 1e-9
+    return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
 
 def _feeds(one: _Told, output: _Told, share: float) -> bool:
@@ -118,8 +199,6 @@ def _policy(topic: str) -> str:
 def _lines(name: str, one: _Told, output: _Told) -> list[str]:
     topic, kind = one.fit
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
-    gaps = np.diff(one.log_time_ns) * 1e-9
-    age_s = float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
     return [
         f"# {one.passed_on(output):,} of {output.changes:,} changes of {output.fit[0].name} are"
         " to what it said last:",
@@ -128,7 +207,7 @@ def _lines(name: str, one: _Told, output: _Told) -> list[str]:
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
         *([_STEERED] if "steering_rad" in kind.fields else []),
-        f"max_age_s = {age_s:g}",
+        f"max_age_s = {_age_s(one):g}",
         "",
     ]
 

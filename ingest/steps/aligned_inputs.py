@@ -14,7 +14,13 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
-from restock.ingest.profile.inputs import COMMAND_SOURCES, FALLBACKS, POSE_FALLBACK, Input
+from restock.ingest.profile.inputs import (
+    COMMAND_SOURCES,
+    COMMAND_THROUGH,
+    FALLBACKS,
+    POSE_FALLBACK,
+    Input,
+)
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import (
@@ -206,12 +212,18 @@ class AlignedInputs:
         """At each tick the source whose command is the one in force, or None.
 
         It is looked for at the command itself, among what had come up to then: of the sources
-        whose last command is the same the one that said so last, else one that is pressed.
+        whose last command is the same the one that said so last, else one that is pressed. A
+        smoothed command is no source's: it is looked for at the last one of what it follows.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
-        topic = self.profile.inputs.command.topic
+        through, topic = self.profile.command_through, self.profile.inputs.command.topic
+        chosen = "command" if through is None else COMMAND_THROUGH
+        if through is not None:
+            topic = through.topic
         by = np.full(len(topics[topic]), None, object)
-        command = np.stack([self.inputs.numbers("command", key) for key in keys])
+        if chosen not in self.inputs.by_name or not len(by):
+            return [None] * len(self.latest("command").row)
+        command = np.stack([self.inputs.numbers(chosen, key) for key in keys])
         sources = [
             (name.removeprefix(f"{COMMAND_SOURCES}."), name, source)
             for name, source in self.inputs.by_name.items()
@@ -233,7 +245,14 @@ class AlignedInputs:
                     drives = last.fresh & same & (at_ns > said_ns)
                     said_ns[drives] = at_ns[drives]
                 by[given.row[drives]] = policy
-        return [by[row] for row in self.latest("command").row]
+        if through is None:
+            return [by[row] for row in self.latest("command").row]
+        follows = np.full(len(topics[self.profile.inputs.command.topic]), None, object)
+        for segment in self.segments:
+            given = segment.topics[self.profile.inputs.command.topic]
+            last = segment.topics[topic].hold(given.stamp_ns, through.max_age_s)
+            follows[given.row[last.fresh]] = by[last.row[last.fresh]]
+        return [follows[row] for row in self.latest("command").row]
 
     def poses(self) -> list[PoseSeries]:
         """Every pose of each segment, in the fixed frame."""

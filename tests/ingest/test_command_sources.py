@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import START_NS, Drive, columns, write_topics
+from support.driven_robot import START_NS, Drive, columns, without, write_topics
+from support.paths import ROOT
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -151,6 +152,78 @@ def test_a_recording_without_them_is_of_unknown_drivers_and_keeps_its_hash(tmp_p
     assert main(["profile", "check", str(profile), str(bag), "--json"]) == 0
     inputs = {one["input"]: one for one in json.loads(capsys.readouterr().out)["inputs"]}
     assert inputs["command_sources.teleop"]["messages"] == 30
+
+
+MUX, STEP = "/chosen", np.array([0.025, 0.06])
+
+
+def smoothed(limit: float = 1.0, *, mux: bool = True) -> dict[str, tuple[str, TopicColumns]]:
+    """The same drive, the multiplexer's output republished at 20 Hz by a smoother, as /cmd_vel.
+
+    `limit` is what a collision monitor leaves of it between 9 and 10 s.
+    """
+    topics = taken_over()
+    chosen = topics.pop(OUT)[1]
+    told = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
+    told_s = (chosen.log_time_ns - START_NS) * 1e-9
+    out_s, now, out = np.arange(0.1, 12, 0.05) + 0.013, np.zeros(2), []
+    for at in out_s:
+        target = told[np.searchsorted(told_s, at, "right") - 1]
+        now = now + np.clip(target - now, -STEP, STEP)
+        out.append(now * (limit if 9 < at < 10 else 1.0))
+    topics[OUT] = (TWIST, twists(out_s, *np.transpose(out)))
+    if mux:
+        topics[MUX] = (TWIST, chosen)
+    return topics
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.4])
+def test_the_source_is_followed_through_a_smoother(limit, tmp_path):
+    """By topics and timing: no smoothed command is one of any source."""
+    bag, file = write_topics(smoothed(limit), tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    profile = load_profile(file)
+    assert profile.inputs.command.topic == OUT
+    assert profile.command_through is not None
+    assert profile.command_through.topic == MUX
+    sources = {name: one.topic for name, one in profile.command_sources.items()}
+    assert sources == {"navigation": NAV, "teleop": TELEOP}
+    rows = policies(bag, file, tmp_path / "s")
+    assert len(rows) > 50
+    assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
+    assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
+
+
+def test_without_the_multiplexers_output_nobody_is_named(tmp_path):
+    bag, file = write_topics(smoothed(mux=False), tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert load_profile(file).command_through is None
+
+
+def test_a_source_is_unknown_where_the_multiplexer_was_silent(tmp_path, capsys):
+    topics = smoothed()
+    chosen = topics[MUX][1]
+    kept = (chosen.log_time_ns < START_NS + 8 * 10**9) | (
+        chosen.log_time_ns > START_NS + 10 * 10**9
+    )
+    topics[MUX] = (TWIST, without(chosen, kept))
+    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    rows = policies(bag, file, tmp_path / "s")
+    assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
+    assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
+
+
+def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
+    text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
+    chain = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\n"
+    with pytest.raises(ConfigError, match="`command_through` is given and no"):
+        parse_profile(
+            text + chain + "fields = {speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}",
+            where="p",
+        )
+    with pytest.raises(ConfigError, match="does not say when it drives"):
+        parse_profile(text + SOURCES + chain + "fields = {speed_mps = 'linear.x'}", where="p")
 
 
 @pytest.mark.parametrize(
