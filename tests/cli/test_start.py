@@ -14,6 +14,7 @@ from support.driven_robot import Drive, write_bag
 from restock import cli
 from restock.cli.start.decisions import no_room
 from restock.cli.start.stage import Stage
+from restock.cli.start.start import StartCommand, _way
 from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
 
@@ -136,6 +137,23 @@ def test_a_dry_run_prints_commands_and_writes_nothing(
     assert commands[0] == "$ restock info bags"
     assert commands[-1] == f"$ restock report {out / 'run'}"
     assert not out.exists()
+
+
+@pytest.mark.parametrize("fails", ["ways", "eval", "judge"])
+def test_a_failed_evaluation_does_not_end_well(tmp_path: Path, fails: str) -> None:
+    class Failing(Work):
+        def do(self, stage: Stage) -> Ended:
+            ended = super().do(stage)
+            if stage.name == fails:
+                ended.status, ended.errors = "failed", ["no room"]
+            return ended
+
+    work = Failing(tmp_path / "out", Verbs(), SILENT, plan=True)
+    stopped = _way(StartCommand(("bags",), tmp_path / "out"), work)
+    assert work.ended[-1].name == "report"
+    assert stopped is not None
+    assert "restock eval" in stopped.why
+    assert stopped.remedies[0] == "no room"
 
 
 def test_no_recording_stops_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -304,9 +304,9 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if not reported.good:
         return Stop("there is no report", (again,))
     if failed := [ended for ended in judged if not ended.good]:
-        told = [one for ended in failed for one in ended.errors[:1]]
+        why_failed = [one for ended in failed for one in ended.errors[:1]]
         names = " and ".join(f"`{ended.command}`" for ended in failed)
-        return Stop(f"the report is without what failed: {names}", (*told, again))
+        return Stop(f"the report is without what failed: {names}", (*why_failed, again))
     return None
 
 
