@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,8 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.camera.frame_rows import KeptFrames, frame_rows, kept_frames
+from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
@@ -31,6 +34,7 @@ from restock.ingest.store.corrections import (
     lay_over,
     rules_of,
 )
+from restock.ingest.store.lineage import own_path
 from restock.ingest.store.manifest import (
     definitions,
     manifest_row,
@@ -201,8 +205,12 @@ class _Ingest:
             "labels_version": table["labels_version"][0].as_py(),
             "corrections": correction_rows(self.corrections),
         }
+        kept = kept_frames(steps.cameras, rows.tick)
+        path = own_path(provenance.recording_id, self.ingest_id)
+        file = path if sum(len(one.row) for one in kept) else ""
+        facts["cameras"] = [one.manifest_row(self.recording, file) for one in kept]
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
-        at, repeats = self._write(store, manifest, table) if store else (None, None)
+        at, repeats = self._write(store, manifest, table, kept) if store else (None, None)
         holding = held(table["conditions"], list(rows.labels))
         counts = {name: int(holds.sum()) for name, holds in holding.items()}
         counts[NOMINAL] = first[NOMINAL]
@@ -223,7 +231,11 @@ class _Ingest:
         )
 
     def _write(
-        self, store: StoreWriter, manifest: dict[str, Any], table: pa.Table
+        self,
+        store: StoreWriter,
+        manifest: dict[str, Any],
+        table: pa.Table,
+        kept: Sequence[KeptFrames],
     ) -> tuple[int, RepeatedDrive | None]:
         """The store's version with these rows, and a recording that has them under other ids."""
         period_s = self.profile.task.control_period_s
@@ -236,9 +248,38 @@ class _Ingest:
         made = (pa.Table.from_pylist([manifest], recording_schema()), table)
         # What another process corrects meanwhile is not written over.
         read = {manifest["recording_id"]: self.before["ingest_id"]} if self.corrections else {}
-        at = store.write_all([made], instead_of=read)
+        with self._frames_written(store, manifest, kept):
+            at = store.write_all([made], instead_of=read)
         # Looked for after the commit: another process may have written the same drive meanwhile.
         return at, store.repeated(table, period_s)
+
+    @contextmanager
+    def _frames_written(
+        self, store: StoreWriter, manifest: Mapping[str, Any], kept: Sequence[KeptFrames]
+    ) -> Iterator[None]:
+        """The frames in their file; gone again where the block fails.
+
+        Raises:
+            RecordingError: a frame that was read before is not there any more.
+        """
+        file = next((row["file"] for row in manifest["cameras"] if row["file"]), "")
+        if not file:
+            yield
+            return
+        count = store.write_frames(
+            file, (batch for one in kept for batch in frame_rows(self.recording, one))
+        )
+        try:
+            if count != (due := sum(len(one.row) for one in kept)):
+                raise RecordingError(
+                    f"{due - count} of {due} frames are not there any more: it changed meanwhile",
+                    where=self.path,
+                    remedy="ingest it again",
+                )
+            yield
+        except BaseException:
+            store.discard_frames(file)
+            raise
 
     def _messages(self) -> dict[str, int]:
         accounts = self.recording.accounts.values()
@@ -250,7 +291,13 @@ class _Ingest:
         }
 
     def _lost_messages(self, steps: Steps) -> list[str]:
-        lost = [
+        frames = [
+            f"cameras.{name}: {reason} ({count:,} messages)"
+            for name, camera in steps.cameras.items()
+            for reason, count in camera.problems.items()
+            if count and reason != OFF_CLOCK  # which is said of the topic
+        ]
+        lost = frames + [
             f"{loss.topic or 'the file'}: {loss.reason}"
             + (f" ({loss.messages:,} messages)" if loss.messages is not None else "")
             for loss in self.recording.lost_messages

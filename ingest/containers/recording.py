@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,11 +18,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
 from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed, Storage
 from restock.ingest.containers.topic_reading import (
     Account,
+    Fields,
     LostMessages,
     Reduction,
     TopicInfo,
@@ -259,6 +262,20 @@ class Recording:
         for storage in self._storages:
             self.notes += [note for note in storage.notes if note not in self.notes]
         return columns
+
+    def batches(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[Ints, Fields]]:
+        """Some messages of a topic after the other, in the order they lie in: their log times (N,),
+        and columns of these fields. What cannot be decoded is left out; `read` accounts for it."""
+        for storage in self._storages:
+            decoders: dict[int, Decoder] = {}
+            for stream in self._streams[topic]:
+                if stream.storage is storage:
+                    with suppress(CannotDecode):
+                        decoders[stream.channel.id] = self._decoder(topic, stream, fields)
+            for channel, batch in storage.batches(list(decoders)):
+                for plain, _ in decompressed(batch):
+                    decoded = decoders[channel].decode(plain)
+                    yield plain.log_time_ns[decoded.rows], decoded.fields
 
     def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
         """Every message logged in [low_ns, high_ns], and what was in force before: by log time.

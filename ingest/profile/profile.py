@@ -3,9 +3,9 @@
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
 (which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
-transforms), `[motion]` (speeds from poses), `[signals.*]` (custom columns), `[tags]` (whose drive
-it is), `[robot]` (what the twin builds), `[limiter]` (of a policy's commands) and `[[zone]]` (named
-rectangles of the map).
+transforms), `[motion]` (speeds from poses), `[signals.*]` (custom columns), `[cameras.*]` (frames
+that are kept), `[tags]` (whose drive it is), `[robot]` (what the twin builds), `[limiter]` (of a
+policy's commands) and `[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -25,6 +25,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
+from restock.ingest.profile.camera import Camera, camera_name_problem
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
@@ -151,6 +152,7 @@ class Profile(Checked, frozen=True):
     frames: Frames | None = None
     motion: Motion | None = None
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
+    cameras: dict[str, Camera] = msgspec.field(default_factory=dict)
     tags: TagRules = TagRules()
     noise: Noise = Noise()
     robot: Robot | None = None  # None: the twin's own
@@ -197,8 +199,7 @@ class Profile(Checked, frozen=True):
             apart |= {"goal"}
         if self.motion is None:
             apart |= {"motion"}
-        if not self.command_sources:
-            apart |= {"command_sources"}
+        apart |= {name for name in ("command_sources", "cameras") if not values[name]}
         for source in values["command_sources"].values():
             for key in FIX_SETTINGS:
                 del source[key]
@@ -234,6 +235,7 @@ class Profile(Checked, frozen=True):
         """Every topic that the profile names."""
         named = [source.topic for source in self.sources.values()]
         named += [signal.topic for signal in self.signals.values()]
+        named += [camera.topic for camera in self.cameras.values()]
         return list(dict.fromkeys([*named, *self.transform_topics]))
 
     @property
@@ -321,6 +323,9 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     # Each by itself first: msgspec's paths leave out the keys of a table of tables.
     for name, table in signals.items() if isinstance(signals, dict) else ():
         typed(table, CustomSignal, where=where, prefix=f"signals.{name}")
+    cameras = document.get("cameras")
+    for name, table in cameras.items() if isinstance(cameras, dict) else ():
+        typed(table, Camera, where=where, prefix=f"cameras.{name}")
     profile = typed(document, Profile, where=where)
     if profile.inputs.scan is None:
         profile = without_lidar(profile)  # whatever number of sectors it gives
@@ -426,6 +431,9 @@ def _check(profile: Profile, where: str) -> None:
     for name in profile.signals:
         if problem := name_problem(name):
             raise ConfigError(f"`signals.{name}`: {problem}", where=where)
+    for name in profile.cameras:
+        if problem := camera_name_problem(name):
+            raise ConfigError(f"`cameras.{name}`: {problem}", where=where)
     _check_conditions(profile, where)
 
 

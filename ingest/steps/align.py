@@ -110,7 +110,7 @@ def align(
     A message whose stamp is more than `clock.jump_s` from where its segment's clock has it is
     left out and counted, but one of a `latched` topic (it may have been published long before
     the recording began) is put at its log time instead. `transforms` may be stamped ahead: they
-    do not say what time it is, and count from when they were received.
+    do not say what time it is, and count from when they were received. So do images of cameras.
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
+from restock.ingest.camera.frames import CameraFrames, usable_frames
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.inputs import (
     COMMAND_SOURCES,
@@ -42,6 +44,7 @@ from restock.ingest.task.signals import yaw_of
 PROVENANCE_LEAD_S = 0.1
 SAME_COMMAND = 1e-6  # m/s or rad/s: what only passes a command on does not change it
 SIDEWAYS_MPS = 1e-3  # slower is none
+T = TypeVar("T")
 
 
 class InputColumns:
@@ -208,6 +211,23 @@ class AlignedInputs:
             parts.append(samples.hold(stamps + lead_ns, max_age_s))
         return LatestMessages.join(parts)
 
+    def camera_frames(self) -> dict[str, CameraFrames]:
+        """The frames of each camera that the recording has, and those in force at the ticks."""
+        found: dict[str, CameraFrames] = {}
+        for name, camera in self.profile.cameras.items():
+            columns = self.inputs.topics.get(camera.topic)
+            if columns is None:
+                continue
+            stamp_ns = np.full(len(columns), -1)
+            for segment in self.segments:
+                samples = segment.topics[camera.topic]
+                stamp_ns[samples.row] = samples.stamp_ns
+            usable = usable_frames(columns, stamp_ns, camera.max_hz)
+            latest = self.latest_of(camera.topic, camera.max_age_s, keep=usable)
+            at_tick = np.where(latest.fresh, latest.row, -1).astype(np.int64)
+            found[name] = CameraFrames(camera, columns, stamp_ns, usable, at_tick)
+        return found
+
     def commanded_by(self) -> list[str | None]:
         """At each tick the source whose command is the one in force, or None.
 
@@ -303,18 +323,21 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     edges = transforms_of(profile, inputs)
     ages = [(source.topic, source.max_age_s) for source in inputs.by_name.values()]
     ages += [(signal.topic, signal.max_age_s) for signal in profile.signals.values()]
+    ages += [(camera.topic, camera.max_age_s) for camera in profile.cameras.values()]
     latched = {topic for topic, age in ages if age is None}
     latched -= {topic for topic, age in ages if age is not None}
     segments, report = align(
         {**topics, **edges.topics},
         profile.clock,
         edges.static.union(latched),
-        frozenset(edges.topics),
+        frozenset(edges.topics)
+        | frozenset(topics.keys() - without_cameras(profile, topics).keys()),
         tolerance_s=profile.task.control_period_s / 2,
     )
     ticks, between = [], 0
     for segment in segments:
-        end = max((int(s.stamp_ns[-1]) for s in segment.topics.values() if len(s.row)), default=0)
+        ends = without_cameras(profile, segment.topics).values()
+        end = max((int(s.stamp_ns[-1]) for s in ends if len(s.row)), default=0)
         command = segment.topics[profile.inputs.command.topic]
         stamps, extra = ticks_of(command, profile.clock, profile.task.control_period_s, end)
         ticks.append(stamps)
@@ -336,11 +359,23 @@ def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict
         if source.optional and not (source.topic in topics and len(topics[source.topic]))
     }
     silent = {
-        f"signals.{name}": f"null: no message of {signal.topic}"
-        for name, signal in profile.signals.items()
-        if not (signal.topic in topics and len(topics[signal.topic]))
+        f"{key}.{name}": f"{instead}: no message of {one.topic}"
+        for key, instead, several in (
+            ("signals", "null", profile.signals),
+            ("cameras", "no frame", profile.cameras),
+        )
+        for name, one in several.items()
+        if not (one.topic in topics and len(topics[one.topic]))
     }
     return profile.fallbacks | absent | silent
+
+
+def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
+    """These topics but those of which only images are taken: whether frames are kept changes
+    nothing about rows, so cameras say neither what time it is nor when a recording ends."""
+    named = {source.topic for source in (*profile.sources.values(), *profile.signals.values())}
+    beside = {camera.topic for camera in profile.cameras.values()} - named
+    return {name: one for name, one in topics.items() if name not in beside}
 
 
 def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:

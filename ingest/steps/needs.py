@@ -8,6 +8,8 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import RecordingError
+from restock.ingest.camera.frame_columns import frame_reduction
+from restock.ingest.camera.images import TYPES
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
@@ -16,7 +18,7 @@ from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
-from restock.ingest.steps.aligned_inputs import sideways_path
+from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
@@ -32,8 +34,8 @@ def read_topics(
     """The columns that a profile needs of a recording.
 
     Where header stamps run at another pace than log time, `/clock` is read too: it says which.
-    `reduced`: scans as clearance and messages as custom signals alone, which is all that steps
-    are made of; else with all fields as they were recorded.
+    `reduced`: scans as clearance, messages as custom signals and images as their layout alone,
+    which is all that steps are made of; else with all fields as they were recorded, but images.
 
     Raises:
         RecordingError: as `wanted_fields`.
@@ -44,12 +46,13 @@ def read_topics(
     if not reduced:
         wanted = {
             topic: [*paths, *(made[topic].fields if topic in made else ())]
-            for topic, paths in wanted.items()
+            for topic, paths in without_cameras(profile, wanted).items()
         }
     columns = recording.read(wanted, made if reduced else {})
     by_stamp = profile.clock.alignment == STAMP and CLOCK_TOPIC not in columns
     half_period_s = profile.task.control_period_s / 2
-    if by_stamp and CLOCK_TOPIC in readable and clock_drifts(columns, half_period_s):
+    clocks = without_cameras(profile, columns)
+    if by_stamp and CLOCK_TOPIC in readable and clock_drifts(clocks, half_period_s):
         columns |= recording.read({CLOCK_TOPIC: [CLOCK_FIELD]})
     return columns
 
@@ -98,9 +101,9 @@ def wanted_fields(
     for topic in profile.transform_topics:
         if topic in available:
             wanted.setdefault(topic, []).extend(FIELDS)
-    for signal in profile.signals.values():
-        if signal.topic in available:
-            wanted.setdefault(signal.topic, [])
+    for beside in (*profile.signals.values(), *profile.cameras.values()):
+        if beside.topic in available:
+            wanted.setdefault(beside.topic, [])
     for topic, paths in wanted.items():
         has = {leaf.path for leaf in leaves[topic]}
         kept = [path for path in paths if path not in optional or path in has]
@@ -109,7 +112,8 @@ def wanted_fields(
 
 
 def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Reduction]:
-    """topic -> what is made of its messages as they are read: clearance, and custom signals."""
+    """topic -> what is made of its messages as they are read: clearance, custom signals, and what
+    a camera's images are."""
     parts: dict[str, list[Reduction]] = {}
     if (scan := profile.inputs.scan) is not None and scan.topic in available:
         parts.setdefault(scan.topic, []).append(
@@ -121,6 +125,9 @@ def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Redu
             signals.setdefault(signal.topic, {})[name] = signal
     for topic, here in signals.items():
         parts.setdefault(topic, []).append(custom_reduction(here))
+    for topic in dict.fromkeys(camera.topic for camera in profile.cameras.values()):
+        if topic in available:
+            parts.setdefault(topic, []).append(frame_reduction(available[topic].type))
     return {topic: _both(some) for topic, some in parts.items()}
 
 
@@ -166,6 +173,11 @@ def input_problems(
             wrong.setdefault(what, []).append(name)
         elif topic is not None and leaves is not None:
             fields += _field_problems(name, source, leaves[source.topic])
+    for name, camera in profile.cameras.items():
+        topic = available.get(camera.topic)
+        if topic is not None and topic.type not in TYPES:
+            what = f"{camera.topic} holds {topic.type}, which is no image"
+            wrong.setdefault(what, []).append(f"cameras.{name}")
     hints = {what: near(what.split()[-1], available) for what in needed}
     lacking = [
         f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")

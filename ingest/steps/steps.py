@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
+from restock.ingest.camera.frames import CameraFrames
 from restock.ingest.containers.topic_reading import Fields
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
@@ -57,6 +58,7 @@ class Steps:
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
     custom: Custom  # the profile's own signals
+    cameras: dict[str, CameraFrames] = field(default_factory=dict)
     clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
     notes: list[str] = field(default_factory=list)  # for people
 
@@ -98,6 +100,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         aligned.clock,
         aligned.commands_between,
         custom,
+        aligned.camera_frames(),
         topic_clocks(topics, profile.clock.jump_s),
         [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
     )

@@ -219,11 +219,20 @@ class Location:
 
     def listing(self, folder: str) -> set[str]:
         """The files below a folder of the store, by their paths in that folder."""
+        return set(self.times(folder))
+
+    def times(self, folder: str) -> dict[str, float]:
+        """The files below a folder of the store, by their paths in it, and when each was written:
+        seconds since 1970."""
         with self.translate_errors():
             infos = self.files.get_file_info(
                 pa.fs.FileSelector(folder, recursive=True, allow_not_found=True)
             )
-        return {info.path.removeprefix(f"{folder}/") for info in infos if info.is_file}
+        return {
+            info.path.removeprefix(f"{folder}/"): info.mtime_ns * 1e-9
+            for info in infos
+            if info.is_file
+        }
 
     def delete(self, paths: Iterable[str]) -> None:
         """Delete files; one that does not exist is not an error."""

@@ -75,6 +75,7 @@ def manifest_row(
         "label_counts": count_rows(scores),
         "clocks": [],
         "signals": [],
+        "cameras": [],
         "unknown_conditions": unknown_rows(profile.definitions, lidar=profile.task.lidar),
         "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),

@@ -20,7 +20,13 @@ from restock.ingest.store.episode_rows import EpisodeRows, episode_rows, groups,
 from restock.ingest.store.summary import ENDS
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
-from restock.ingest.task.schema import COVERAGE, STEP_BITS, signal_columns, transition_schema
+from restock.ingest.task.schema import (
+    COVERAGE,
+    STEP_BITS,
+    signal_columns,
+    transition_ids,
+    transition_schema,
+)
 from restock.ingest.task.task import observe, reward
 
 # Columns that rows of an older store may lack.
@@ -139,9 +145,8 @@ def transition_table(
     # The twin evaluates no condition over signals that it does not fill.
     evaluated = [one for one in profile.conditions if one.name in rows.labels]
     named = primary(rows.labels, evaluated) or [NOMINAL] * len(rows.tick)
-    number = int(provenance.recording_id, 16) >> (64 - (63 - STEP_BITS))
     columns: dict[str, Any] = {
-        "transition_id": (number << STEP_BITS) + tick,
+        "transition_id": transition_ids(provenance.recording_id, tick),
         "recording_id": provenance.recording_id,
         "episode_id": [f"{provenance.recording_id}/{e}" for e in rows.episode[begin]],
         "episode_index": rows.episode[begin],

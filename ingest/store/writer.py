@@ -8,6 +8,9 @@ old rows in the same commit that adds the new ones; the manifests of what was re
 the writer that replaced it. A manifest that joins nothing yet is removed by its age only: another
 writer may be about to commit its transitions. Files outlive their removal by the same window, so
 that who opened a version before can read it: its manifests too, by the names of its rows' files.
+
+Frames of cameras are plain Parquet, a file an ingest, in `frames`: written before both commits, and
+there for whom a manifest names them to. A file lives for as long as a manifest that names it.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from typing import TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Schema, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction, RemoveAction
@@ -41,10 +45,10 @@ from restock.ingest.store.repeated import (
 )
 from restock.ingest.store.summary import SUMMARY_SCHEMA, summarised, with_ends
 from restock.ingest.store.version import Version
-from restock.ingest.task.schema import recording_schema
+from restock.ingest.task.schema import frame_schema, recording_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS
 
-TRANSITIONS, RECORDINGS = "transitions", "recordings"
+TRANSITIONS, RECORDINGS, FRAMES = "transitions", "recordings", "frames"
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
 # Files that no version of a table needs are kept this long: a writer may be about to commit them,
 # and a reader that opened an older version may be about to read them.
@@ -183,6 +187,37 @@ class StoreWriter:
         ]
         return find_repeat(rows, sketches, self.rows, period_s)
 
+    def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
+        """Write a recording's frames to a file of `frames`; returns how many they are.
+
+        No manifest names it yet: `discard_frames` where none will.
+
+        Raises:
+            StoreError: it cannot be written.
+        """
+        count = 0
+        try:
+            with (
+                self.path.writing(f"{FRAMES}/{path}") as sink,
+                pq.ParquetWriter(sink, frame_schema(), compression="zstd") as writer,
+            ):
+                for batch in batches:
+                    writer.write_batch(batch)
+                    count += len(batch)
+        except BaseException as error:
+            self.discard_frames(path)
+            if isinstance(error, OSError):
+                raise StoreError(
+                    f"cannot be written: {first_line(error)}", where=str(self.path)
+                ) from error
+            raise
+        return count
+
+    def discard_frames(self, path: str) -> None:
+        """Delete a file of frames that no manifest names."""
+        with suppress(OSError, StoreError):
+            self.path.delete([f"{FRAMES}/{path}"])
+
     def write(self, manifest: pa.Table, rows: pa.Table) -> int:
         """Write one recording's manifest row and transitions, replacing its old ones.
 
@@ -260,7 +295,21 @@ class StoreWriter:
             deleted += [f"{name}/{file}" for file in stale]
         # Without commits of its own: cleaning changes no version of a table.
         self.path.delete(deleted)
-        return deleted
+        frames = self._unnamed_frames(retention_hours)
+        self.path.delete(frames)
+        return deleted + frames
+
+    def _unnamed_frames(self, retention_hours: int) -> list[str]:
+        """Files of frames older than the window that no manifest names, removed ones included."""
+        before_s = time.time() - retention_hours * 3600
+        found = {path for path, at_s in self.path.times(FRAMES).items() if at_s < before_s}
+        if not found:
+            return []
+        for path in self.path.listing(RECORDINGS):
+            if path.endswith(".parquet"):
+                told = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
+                found -= set(frame_files(told))
+        return [f"{FRAMES}/{path}" for path in sorted(found)]
 
     def _abandoned(self, retention_hours: int) -> list[str]:
         """Manifests that join nothing, and are too old for a writer to be on its way to commit."""
@@ -446,6 +495,12 @@ class StoreWriter:
 def recording_columns() -> pa.Schema:
     """The columns of `recordings`: the manifest's, and the summary's."""
     return pa.schema([*recording_schema(), *SUMMARY_SCHEMA])
+
+
+def frame_files(manifests: pa.Table) -> list[str]:
+    """The files of `frames` that manifests name."""
+    rows = manifests["cameras"].to_pylist() if "cameras" in manifests.column_names else []
+    return sorted({camera["file"] for cameras in rows for camera in cameras or ()} - {""})
 
 
 def _with_sketch(manifests: pa.Table) -> pa.Table:

@@ -19,6 +19,12 @@ from restock.ingest.task.signals import OPTIONAL_SIGNALS, STORED_SIGNALS, Signal
 STEP_BITS = 25
 
 
+def transition_ids(recording_id: str, tick: Ints) -> Ints:
+    """The ids of a recording's steps (N,) by their places on its control clock."""
+    number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
+    return (number << STEP_BITS) + tick
+
+
 @dataclass(frozen=True)
 class Column:
     """One column of the table. `observation` types get their length from the task."""
@@ -253,6 +259,18 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         "custom signals: unit and source, messages, those that have it, steps that know it",
         nullable=True,
     ),
+    Column(
+        "cameras",
+        _rows_of(
+            camera=pa.string(), topic=pa.string(), type=pa.string(), expected=pa.int64(),
+            decoded=pa.int64(), kept=pa.int64(), thinned=pa.int64(), unused=pa.int64(),
+            problems=_rows_of(reason=pa.string(), count=pa.int64()), steps=pa.int64(),
+            size_bytes=pa.int64(), file=pa.string(),
+        ),
+        "of each camera the messages expected and decoded; frames kept, thinned out (max_hz),"
+        " unused (in force at no step); problems; steps that have one; null: older than that",
+        nullable=True,
+    ),
     Column("task_json", pa.string(), "the task, as JSON"),
     Column("conditions_json", pa.string(), "the conditions: name, timing, sql, …, as JSON"),
     Column(
@@ -282,6 +300,34 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     ),
     Column("profile_toml", pa.string(), "the profile, the SQL of its files in it", nullable=True),
 )  # fmt: skip
+
+# One row a frame of a camera that is in force at a step: `frames/` of a store.
+FRAME_COLUMNS: tuple[Column, ...] = (
+    Column("recording_id", pa.string(), "of the recording"),
+    Column("camera", pa.string(), "its name in the profile"),
+    Column("frame_index", pa.int64(), "of the message in its topic, by log time, from 0"),
+    Column("topic", pa.string(), "that it was received on"),
+    Column("type", pa.string(), "of the message"),
+    Column("log_time_ns", pa.int64(), "when the message was recorded"),
+    Column("stamp_ns", pa.int64(), "when the frame was taken, on the alignment clock"),
+    Column("first_transition_id", pa.int64(), "of the first step at which it is the last one"),
+    Column("last_transition_id", pa.int64(), "of the last; steps that only end an episode count"),
+    Column("encoding", pa.string(), "jpeg or png: the file as recorded; else that of raw pixels"),
+    Column("width", pa.int32(), "in pixels"),
+    Column("height", pa.int32(), "in pixels"),
+    Column("channels", pa.int16(), "colours, and alpha where it has one"),
+    Column("bits", pa.int16(), "of a channel"),
+    Column("row_bytes", pa.int32(), "of a row of raw pixels; 0 for files"),
+    Column("big_endian", pa.bool_(), "of raw pixels"),
+    Column("size_bytes", pa.int64(), "of the bytes"),
+    Column("sha256", pa.string(), "of the bytes as the recording has them, 64 hex digits"),
+    Column("data", pa.binary(), "the bytes as the recording has them"),
+)
+
+
+def frame_schema() -> pa.Schema:
+    """The Arrow schema of a recording's frames."""
+    return pa.schema([pa.field(one.name, one.type, nullable=False) for one in FRAME_COLUMNS])
 
 
 def recording_schema() -> pa.Schema:

@@ -18,7 +18,10 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
+VIEWS = (
+    *("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql"),
+    "frames.sql",
+)
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
@@ -41,6 +44,7 @@ ON_DEMAND = (
     ("return_order.sql", "returns.sql"),
     ("capacity.sql",),
     ("repeated_rows.sql",),
+    ("frames.sql",),
 )
 _LISTS = {
     "columns",

@@ -28,7 +28,13 @@ FROM (
         NULL::STRUCT(
             condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
             event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT
-        )[] AS label_counts
+        )[] AS label_counts,
+        NULL::STRUCT(
+            camera VARCHAR, topic VARCHAR, "type" VARCHAR, expected BIGINT, decoded BIGINT,
+            kept BIGINT, thinned BIGINT, unused BIGINT,
+            problems STRUCT(reason VARCHAR, count BIGINT)[], steps BIGINT, size_bytes BIGINT,
+            file VARCHAR
+        )[] AS cameras
     WHERE false
 )
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);

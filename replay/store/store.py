@@ -29,8 +29,16 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
 from restock.ingest.store.version import Version
-from restock.ingest.store.writer import RECORDINGS, RETENTION_HOURS, TRANSITIONS, StoreWriter
+from restock.ingest.store.writer import (
+    FRAMES,
+    RECORDINGS,
+    RETENTION_HOURS,
+    TRANSITIONS,
+    StoreWriter,
+    frame_files,
+)
 from restock.ingest.task.conditions import Condition
+from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import install_computed
 from restock.replay.store.query import definitions, install_first, query
@@ -112,6 +120,7 @@ class Store:
         try:
             self._manifests = self._held(self._recordings)
             self._present_all(self.connection, "main")
+            self._present(self.connection, "main", self._frames())
         except StoreError as error:
             if version is None:
                 raise
@@ -279,6 +288,13 @@ class Store:
         _register(connection, schema, "stored_ingests", self._ingests)
         _register(connection, schema, self._recordings.view, manifests)
         self._present(connection, schema, self._transitions)
+
+    def _frames(self) -> _Stored:
+        """The frames of cameras that the manifests of its rows name."""
+        live = self._manifests.filter(
+            pc.is_in(self._manifests["ingest_id"], self._ingests["ingest_id"])
+        )
+        return _Stored("stored_frames", FRAMES, frame_schema(), frame_files(live))
 
     def _present(self, connection: duckdb.DuckDBPyConnection, schema: str, table: _Stored) -> None:
         if table.paths and self.path.folder is not None:

@@ -20,19 +20,20 @@ MOST_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
 SHARED = {"arrays", "errors", "files", "imports", "public", "state", "stats", "toml", "toml_schema"}
 MAY_IMPORT = {
-    "ingest": "containers profile steps store task",
+    "ingest": "camera containers profile steps store task",
     "ingest/decoding": "",
     "ingest/containers": "decoding",
+    "ingest/camera": "containers decoding profile task",
     "ingest/task": "",
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
     "ingest/propose": "containers decoding profile propose/driven steps task urdf",
     "ingest/propose/driven": "steps task",
     "ingest/live": "decoding profile steps task",
-    "ingest/steps": "containers decoding profile task",
+    "ingest/steps": "camera containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
     "replay": "panel store ingest/store",
-    "replay/store": "ingest/store ingest/task",
+    "replay/store": "ingest/camera ingest/store ingest/task",
     "replay/mixture": "",
     "replay/sampling": "mixture",
     "replay/ring": "mixture",

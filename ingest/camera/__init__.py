@@ -1,0 +1,1 @@
+"""Frames of a robot's cameras: what their messages hold, and those in force at steps."""
