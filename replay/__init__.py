@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from restock.replay.store.audit import load_thresholds as load_thresholds
     from restock.replay.store.audit import run_audits as run_audits
     from restock.replay.store.capacity import recommend_capacity as recommend_capacity
+    from restock.replay.store.frames import CameraFrame as CameraFrame
+    from restock.replay.store.frames import camera_frames as camera_frames
     from restock.replay.store.spark import install_views as install_views
     from restock.replay.store.store import Store as Store
     from restock.replay.trace.trace import TracePlaces as TracePlaces
@@ -67,6 +69,7 @@ else:
             "restock.replay.sampling.sampler": ["QuotaSampler", "Sampler"],
             "restock.replay.store.audit": ["load_audits", "load_thresholds", "run_audits"],
             "restock.replay.store.capacity": ["recommend_capacity"],
+            "restock.replay.store.frames": ["CameraFrame", "camera_frames"],
             "restock.replay.store.spark": ["install_views"],
             "restock.replay.store.store": ["Store"],
             "restock.replay.trace.trace": ["TracePlaces", "audited_rows", "trace_row"],

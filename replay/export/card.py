@@ -90,6 +90,11 @@ def card(
         + ", ".join(f"`{name}`" for name in task.observation_names)
         + ".",
         "- Reward: that of the task, recomputed from what was logged.",
+        *(
+            f"- `observation.images.{camera}`: at each step the last frame of the camera"
+            f" `{camera}`, as far as it can be as recorded."
+            for camera in selection.cameras
+        ),
         *_table("condition", contents.conditions),
         *_table("behaviour policy", contents.policies),
         *("## How it was made", ""),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from restock.ingest.store.version import Version
 from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
+from restock.replay.panel.panel import HEADER
 
 # name -> (module, what must be installed, what a file's name must end with or "" for a directory)
 FORMATS: dict[str, tuple[str, str, str]] = {
@@ -30,6 +31,7 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     "parquet": ("one_file", "", ".parquet"),
     "npz": ("one_file", "", ".npz"),
 }
+WITH_IMAGES = ("lerobot",)
 
 
 def export_dataset(
@@ -42,6 +44,7 @@ def export_dataset(
     version: Version | None = None,
     continuous: bool = False,
     license: str | None = None,
+    cameras: Sequence[str] | None = None,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
     """Write a data set; all or nothing.
@@ -52,6 +55,7 @@ def export_dataset(
         out: a file or directory that must not exist yet.
         query, panel, version, continuous: see `open_selection`.
         license: its identifier (`cc-by-4.0`), for the card of a data set that is a directory.
+        cameras: whose frames go with the steps, of a store to lerobot; None: all that it has.
         advance: called with the number of steps written, as it goes on.
 
     Returns what was written: the counts of `Counts`, `notes`, and the provenance that the data
@@ -70,6 +74,14 @@ def export_dataset(
             remedy=f"pip install {needs}, or `pip install restock[libraries]`",
         )
     check_license(license)
+    if cameras and to not in WITH_IMAGES:
+        raise StoreError(
+            f"the format {to} holds no images",
+            remedy=f"leave --cameras out, or export to {', '.join(WITH_IMAGES)}",
+        )
+    panelled = (Path(source) / HEADER).is_file()
+    if to not in WITH_IMAGES or (cameras is None and panelled):
+        cameras = ()
     out = Path(out)
     if ending and out.suffix != ending:
         raise StoreError(f"the format {to} is a file that ends in {ending}", where=str(out))
@@ -78,8 +90,15 @@ def export_dataset(
     counts = Counts()
     write = getattr(importlib.import_module(f"restock.replay.export.{module}"), f"write_{to}")
     with open_selection(
-        source, query=query, panel=panel, version=version, continuous=continuous
+        source,
+        query=query,
+        panel=panel,
+        version=version,
+        continuous=continuous,
+        cameras=cameras,
     ) as selection:
+        counts.rows += sum(selection.left_out.values())
+        counts.left_out.update(selection.left_out)
         contents = Contents()
         written = contents.counted(_trajectories(selection, counts))
         episodes = _advancing(written, advance)

@@ -6,7 +6,8 @@
     meta/restock.json                           where it is from
 
 A frame is an observation and the action taken there. The layout has no frame for the observation
-after the last action, so `next.observation.state` keeps it in every frame.
+after the last action, so `next.observation.state` keeps it in every frame. A camera's frame in
+force at a step is its `observation.images.CAMERA`, a file within the table; there are no videos.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from restock.replay.export.images import ImageFeature, pictures
 from restock.replay.export.one_file import fixed_lists
 from restock.replay.export.selection import Selection
 from restock.replay.export.trajectory import Counts, Trajectory
@@ -32,6 +34,7 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 OWN = "restock."  # columns about a frame, not of it: without statistics
 PATTERN = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
+PICTURE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])  # as `datasets` has images
 Stats = dict[str, dict[str, NDArray[np.float64]]]
 
 
@@ -46,6 +49,7 @@ def write_lerobot(
     frames = 0
     features: dict[str, dict[str, Any]] = {}
     fps = 1 / selection.task.control_period_s
+    cameras = [ImageFeature(camera) for camera in selection.cameras]
     for number, trajectory in enumerate(trajectories):
         columns = _frames(trajectory, number, frames, fps)
         features = features or _features(selection, columns)
@@ -54,7 +58,11 @@ def write_lerobot(
             for name, values in columns.items()
             if not name.startswith(OWN)
         }
-        place = data.add(_table(columns))
+        images: dict[str, pa.Array] = {}
+        for feature, rows, some in pictures(selection.store, trajectory, cameras):
+            images[feature.name] = pa.array(rows, PICTURE)
+            stats[feature.name] = _image_stats(some)
+        place = data.add(_table(columns, images))
         every.append(stats)
         length = len(trajectory)
         episodes.append(
@@ -103,10 +111,10 @@ def write_lerobot(
             "splits": {"train": f"0:{len(episodes)}"},
             "data_path": f"data/{PATTERN}",
             "video_path": None,
-            "features": features,
+            "features": features | {camera.name: camera.describe() for camera in cameras},
         },
     )
-    return []
+    return [camera.note() for camera in cameras]
 
 
 class _DataFiles:
@@ -181,9 +189,10 @@ def _features(selection: Selection, columns: dict[str, Any]) -> dict[str, dict[s
     return features
 
 
-def _table(columns: dict[str, Any]) -> pa.Table:
+def _table(columns: dict[str, Any], images: dict[str, pa.Array]) -> pa.Table:
     return pa.table(
-        {
+        images
+        | {
             name: fixed_lists(values)
             if isinstance(values, np.ndarray) and values.ndim == 2
             else pa.array(values)
@@ -206,12 +215,20 @@ def _stats(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
     return stats | {f"q{int(q * 100):02d}": quantiles[i] for i, q in enumerate(QUANTILES)}
 
 
+def _image_stats(images: NDArray[np.uint8]) -> dict[str, NDArray[np.float64]]:
+    """Of pictures (N, H, W, 3), by colour and from 0 to 1: (3, 1, 1) each, as LeRobot has them."""
+    stats = _stats(images.reshape(-1, 3) / 255)
+    shaped = {name: value.reshape(3, 1, 1) for name, value in stats.items() if name != "count"}
+    return shaped | {"count": np.array([len(images)])}
+
+
 def _together(every: list[Stats]) -> Stats:
     """Of all episodes. Quantiles are means of the episodes' own, as LeRobot aggregates them."""
     whole: Stats = {}
     for name in every[0]:
         parts = {kind: np.stack([stats[name][kind] for stats in every]) for kind in every[0][name]}
-        weight = parts["count"] / parts["count"].sum()  # (episodes, 1)
+        weight = parts["count"] / parts["count"].sum()  # (episodes, 1), or as wide as images'
+        weight = weight.reshape(-1, *[1] * (parts["mean"].ndim - 1))
         mean = (parts["mean"] * weight).sum(axis=0)
         variance = ((parts["std"] ** 2 + (parts["mean"] - mean) ** 2) * weight).sum(axis=0)
         whole[name] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from restock import __version__
 from restock.errors import PanelError, QueryError, StoreError
 from restock.ingest.store.version import Version
 from restock.ingest.task.task import Task
+from restock.replay.export.images import chosen_cameras
 from restock.replay.export.trajectory import (
     CARRIED,
     COMMAND,
@@ -33,6 +34,10 @@ from restock.replay.store.store import Store
 
 BATCH_ROWS = 16_384
 EVERYTHING = "FROM transitions"
+FROM_THE_STORE = (
+    "export its rows from the store: --panel PANEL --query"
+    ' "FROM transitions SEMI JOIN panel.rows USING (transition_id)"'
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,9 @@ class Selection:
     continuous: bool
     command_range: tuple[tuple[float, float], tuple[float, float]]  # low, high; of the actions
     provenance: dict[str, Any]  # of the data set, as JSON
+    store: Store | None = None  # that the rows are of, where frames of cameras go with them
+    cameras: tuple[str, ...] = ()  # each row has a frame of each
+    left_out: Mapping[str, int] = field(default_factory=dict)  # rows, by reason
 
     @property
     def observation_size(self) -> int:
@@ -59,6 +67,7 @@ def open_selection(
     panel: str | Path | None = None,
     version: Version | None = None,
     continuous: bool = False,
+    cameras: Sequence[str] | None = (),
 ) -> Iterator[Selection]:
     """The rows of a panel, or of a query to a store.
 
@@ -68,9 +77,10 @@ def open_selection(
         panel: whose tables the query may use: `panel.rows`, `panel.strata`.
         version: of a store, its number or a moment; the newest.
         continuous: the action is the command that was logged, not the index of the nearest.
+        cameras: of a store: rows without a frame of each are left out; None: every camera.
 
     Raises:
-        StoreError, PanelError: nothing there, rows of several tasks, no rows.
+        StoreError, PanelError: nothing there, rows of several tasks, no rows, no such camera.
         QueryError: a query that does not run or lacks columns.
     """
     path = Path(path)
@@ -80,6 +90,10 @@ def open_selection(
         if query is not None or panel is not None:
             raise QueryError("a panel is exported as it is, without a query", where=str(path),
                              remedy="query its store, with --panel beside it")  # fmt: skip
+        if cameras:
+            raise PanelError(
+                "a panel keeps no frames of cameras", where=str(path), remedy=FROM_THE_STORE
+            )
         yield _of_panel(Panel.open(path), continuous)
         return
     text = (query or EVERYTHING).strip().rstrip(";")
@@ -88,7 +102,8 @@ def open_selection(
         Store(path, version=version) as store,
         open_place(path, beside=beside, only_store=True, version=version) as connection,
     ):
-        yield _of_query(store, connection, text, panel, continuous)
+        chosen = chosen_cameras(store, cameras)
+        yield _of_query(store, connection, text, panel, continuous, chosen)
 
 
 def _of_query(
@@ -97,6 +112,7 @@ def _of_query(
     text: str,
     panel: str | Path | None,
     continuous: bool,
+    cameras: Sequence[str],
 ) -> Selection:
     where = str(store.path)
     result = run_query(connection, text, where=where)
@@ -111,6 +127,11 @@ def _of_query(
     for name, kind in zip(columns, result.types, strict=True):
         if name in ("observation", "next_observation") and not str(kind).endswith("]"):
             raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
+    asked, left_out = text, dict[str, int]()
+    for camera in cameras:
+        text, left_out[f"no frame of camera {camera}"] = _with_frames(
+            connection, text, columns, camera, where
+        )
     by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
     hashes, recordings = (
         f"list(DISTINCT {name})" if name in columns else "NULL"
@@ -152,12 +173,48 @@ def _of_query(
         provenance={
             "store": where,
             "store_version": store.version,
-            "query": text,
+            "query": asked,
             "panel": Panel.open(panel).id if panel is not None else None,
             "tags": _tags(store, facts[2] or []),
+            **({"cameras": list(cameras)} if cameras else {}),
             **_of_task(task, continuous),
         },
+        store=store,
+        cameras=tuple(cameras),
+        left_out={why: count for why, count in left_out.items() if count},
     )
+
+
+def _with_frames(
+    connection: duckdb.DuckDBPyConnection,
+    text: str,
+    columns: Sequence[str],
+    camera: str,
+    where: str,
+) -> tuple[str, int]:
+    """The query for those of its rows at which a camera has a frame, and how many have none."""
+    if "transition_id" not in columns:
+        raise QueryError(
+            "the query gives no transition_id, by which frames are found",
+            where=where,
+            remedy="select it too, or give --cameras none",
+        )
+    name = camera.replace("'", "''")
+    having = (
+        f"FROM ({text}) WHERE transition_id IN"
+        f" (SELECT transition_id FROM transition_frames WHERE camera = '{name}')"
+    )
+    counts = [
+        fetch(connection, f"SELECT count(*) FROM ({one})", where=where)[1][0][0]
+        for one in (text, having)
+    ]
+    if counts[0] and not counts[1]:
+        raise StoreError(
+            f"none of the {counts[0]:,} rows has a frame of camera {camera!r}",
+            where=where,
+            remedy="name the other cameras with --cameras, or none",
+        )
+    return having, counts[0] - counts[1]
 
 
 def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -190,8 +247,7 @@ def _of_panel(panel: Panel, continuous: bool) -> Selection:
         raise PanelError(
             "a panel keeps the index of the action, not the command",
             where=str(panel.path),
-            remedy="export its rows from the store: --panel PANEL --query"
-            ' "FROM transitions SEMI JOIN panel.rows USING (transition_id)"',
+            remedy=FROM_THE_STORE,
         )
     task = panel.task
     return Selection(

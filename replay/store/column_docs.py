@@ -15,7 +15,9 @@ import pyarrow as pa
 
 from restock.ingest.task.schema import (
     COLUMNS,
+    FRAME_COLUMNS,
     RECORDING_COLUMNS,
+    frame_schema,
     recording_schema,
     transition_schema,
 )
@@ -54,6 +56,7 @@ def column_docs() -> dict[tuple[str, str], str]:
     }
     meanings |= {("transitions", column.name): column.meaning for column in COLUMNS}
     meanings |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
+    meanings |= {("frames", column.name): column.meaning for column in FRAME_COLUMNS}
     return meanings
 
 
@@ -107,12 +110,14 @@ def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
 
 def markdown() -> str:
     """The tables of docs/sql.md: every view and column."""
-    from restock.replay.store.query import install
+    from restock.replay.store.query import FRAMES, definitions
 
     with duckdb.connect() as connection:
         connection.register("stored_transitions", transition_schema(2).empty_table())
         connection.register("stored_recordings", recording_schema().empty_table())
-        install(connection, "FLOAT[]")
+        connection.register("stored_frames", frame_schema().empty_table())
+        connection.execute(definitions("FLOAT[]") + definitions(names=[FRAMES]))
+        install_columns(connection)
         rows = connection.sql("FROM columns").fetchall()
     parts = []
     for view, doc in view_docs().items():

@@ -100,9 +100,10 @@ def camera_frames(
     found = store.connection.execute(
         "SELECT transition_id, recording_id, camera, frame_index, age_s, size_bytes"
         " FROM transition_frames"
-        " WHERE transition_id IN (SELECT unnest(?)) AND (? IS NULL OR camera = ?)"
+        " WHERE transition_id BETWEEN ? AND ?"  # which skips the files of other recordings
+        " AND transition_id IN (SELECT unnest(?)) AND (? IS NULL OR camera = ?)"
         " ORDER BY recording_id, transition_id, camera",
-        [ids, camera, camera],
+        [min(ids, default=0), max(ids, default=0), ids, camera, camera],
     ).fetchall()
     sources = dict(store.sql("SELECT recording_id, source_file FROM recordings").fetchall())
     begin = size = 0

@@ -18,10 +18,8 @@ from restock.replay.store.column_docs import install_columns
 T = TypeVar("T")
 
 # In their order: a view may use those before it.
-VIEWS = (
-    *("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql"),
-    "frames.sql",
-)
+VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
+FRAMES = "frames.sql"  # over stored_frames, which a store alone has
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
@@ -44,7 +42,7 @@ ON_DEMAND = (
     ("return_order.sql", "returns.sql"),
     ("capacity.sql",),
     ("repeated_rows.sql",),
-    ("frames.sql",),
+    (FRAMES,),
 )
 _LISTS = {
     "columns",

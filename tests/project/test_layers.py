@@ -43,7 +43,7 @@ MAY_IMPORT = {
     "replay/trace": (
         "replay panel store ingest/containers ingest/store ingest/profile ingest/steps ingest/task"
     ),
-    "replay/export": "replay panel store ingest/store ingest/profile ingest/task",
+    "replay/export": "replay panel store ingest/camera ingest/store ingest/profile ingest/task",
     "train": (
         "dqn evaluation feed run twin/env twin/floors twin/physics replay/fleet replay/mixture"
         " replay/panel replay/ring replay/sampling replay/store ingest/profile ingest/store"

@@ -10,11 +10,15 @@ import sys
 import types
 from typing import ClassVar
 
+import numpy as np
+import PIL.Image
+import torch
+
 os.environ["HF_HUB_OFFLINE"] = "1"
 
 
 class Absent(types.ModuleType):
-    """Stands for torchvision, which only transforms and decodes pictures, where it cannot load."""
+    """Stands for torchvision, which only transforms pictures, where it cannot load."""
 
     __path__: ClassVar[list[str]] = []
 
@@ -22,6 +26,15 @@ class Absent(types.ModuleType):
         if name.startswith("__"):
             raise AttributeError(name)
         return type(name, (), {"__module__": self.__name__})
+
+
+class ToTensor:
+    """torchvision's: a picture as (C, H, W), from 0 to 1."""
+
+    def __call__(self, picture: "PIL.Image.Image") -> "torch.Tensor":
+        values = torch.from_numpy(np.array(picture))
+        values = values[None] if values.ndim == 2 else values.permute(2, 0, 1)
+        return values.float() / 255
 
 
 try:
@@ -32,6 +45,9 @@ except (ImportError, RuntimeError):  # its wheels want a torch with CUDA
     for name in ("", ".transforms", ".transforms.v2", ".transforms.v2.functional", ".io"):
         sys.modules["torchvision" + name] = module = Absent("torchvision" + name)
         module.__spec__ = importlib.machinery.ModuleSpec(module.__name__, None)
+    transforms = sys.modules["torchvision.transforms"]
+    transforms.ToTensor = ToTensor  # type: ignore[attr-defined]
+    sys.modules["torchvision"].transforms = transforms  # type: ignore[attr-defined]
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: E402
 
@@ -40,7 +56,7 @@ frames = [dataset[index] for index in range(len(dataset))]
 few = LeRobotDataset(
     "restock/logs",
     root=sys.argv[1],
-    episodes=[1],
+    episodes=[min(1, dataset.num_episodes - 1)],
     delta_timestamps={"action": [0.0, 1 / dataset.fps]},
 )
 found = {
@@ -58,5 +74,13 @@ found = {
     "transition_id": [int(frame["restock.transition_id"]) for frame in frames],
     "condition": [frame["restock.condition"] for frame in frames],
     "chunk": few[0]["action"].tolist(),
+    "images": {
+        key: {
+            "shape": list(frames[0][key].shape),
+            "corner": [frame[key][:, 0, -1].tolist() for frame in frames],
+            "mean": dataset.meta.stats[key]["mean"].reshape(-1).tolist(),
+        }
+        for key in dataset.meta.camera_keys
+    },
 }
 sys.stdout.write("\n" + json.dumps(found) + "\n")

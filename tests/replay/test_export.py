@@ -8,9 +8,6 @@ CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON name
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
+from support.neighbours import read_with
 from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
 
@@ -289,26 +287,6 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path: Path) -> Non
     assert env.observation_space.shape == (task.observation_size,)
     assert isinstance(env.action_space, gymnasium.spaces.Box)
     assert gymnasium.spec("restock/Warehouse-v0").kwargs == registered
-
-
-def read_with(library: str, path: Path) -> Any:
-    """What the real library finds, in a Python that has it; the test is skipped where none has."""
-    apart = TESTS.parent / ".venv-neighbours" / "bin" / "python"
-    python = os.environ.get("RESTOCK_NEIGHBOURS_PYTHON") or str(
-        apart if apart.exists() else sys.executable
-    )
-    probe = f"import importlib.util as u; raise SystemExit(u.find_spec('{library}') is None)"
-    if subprocess.run([python, "-c", probe], check=False).returncode:
-        pytest.skip(f"{python} has no {library}")
-    done = subprocess.run(
-        [python, str(TESTS / f"read_with_{library}.py"), str(path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=path.parent,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.parametrize("continuous", [False, True])

@@ -36,6 +36,9 @@ class ExportCommand:
     """The index of the task's action, or the logged command (m/s, rad/s)."""
     license: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
     """The licence that the card of a minari or lerobot data set names: cc-by-4.0, apache-2.0, …"""
+    cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
+    """Of a store to lerobot: the cameras whose frames go with the steps, with commas between, all
+    or none. A step without a frame of each is left out and counted."""
     json: bool = False
     """Print what was written as one JSON document."""
 
@@ -71,6 +74,7 @@ class ExportCommand:
                 version=given_version(self.version),
                 continuous=self.action == "continuous",
                 license=self.license,
+                cameras=self._cameras(),
                 advance=lambda steps: advance(steps),
             )
         if self.json:
@@ -78,6 +82,13 @@ class ExportCommand:
             return
         for line in _summary(document):
             output.stdout().print(line)
+
+    def _cameras(self) -> list[str] | None:
+        """As `export_dataset` takes them."""
+        if self.cameras == "all":
+            return None
+        names = [name.strip() for name in self.cameras.split(",")]
+        return [] if names == ["none"] else names
 
 
 def _summary(document: dict[str, Any]) -> list[str]:

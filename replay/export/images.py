@@ -1,0 +1,142 @@
+"""A camera's frames as an image feature of LeRobot: one picture a step, by episode.
+
+JPEG and PNG of three colours go out byte for byte as they were recorded. Others become PNG without
+loss of what three channels of 8 bits can hold; deeper images (depth) are refused.
+"""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.errors import StoreError
+from restock.ingest.camera.images import JPEG, PNG
+from restock.replay.export.trajectory import Trajectory
+from restock.replay.store.frames import CameraFrame, camera_frames, cameras_of
+from restock.replay.store.store import Store
+
+SAMPLES = 100  # pictures of an episode that its statistics are of, as LeRobot's
+SMALL_PX = 150  # they are thinned to about so many
+
+
+@dataclass
+class ImageFeature:
+    """What `observation.images.CAMERA` of a data set is, as its frames go by."""
+
+    camera: str
+    shape: tuple[int, int] | None = None  # height, width
+    as_recorded: int = 0  # pictures whose bytes are the recording's
+    packed: Counter[str] = field(default_factory=Counter)  # others, by what they were
+
+    @property
+    def name(self) -> str:
+        return f"observation.images.{self.camera}"
+
+    def describe(self) -> dict[str, Any]:
+        """As info.json has it."""
+        height, width = self.shape or (0, 0)
+        names = ["height", "width", "channels"]
+        return {"dtype": "image", "shape": [height, width, 3], "names": names}
+
+    def note(self) -> str:
+        """How its pictures went out, in words."""
+        packed = "".join(f"; {count:,} of {what} as PNG" for what, count in self.packed.items())
+        return f"{self.name}: {self.as_recorded:,} pictures as they were recorded{packed}"
+
+    def picture(self, frame: CameraFrame) -> tuple[bytes, NDArray[np.uint8] | None]:
+        """A frame as a file, and its pixels where they were decoded for that.
+
+        Raises:
+            StoreError: it has another size than those before, or more than 8 bits a channel.
+        """
+        layout = frame.layout
+        size = (layout.height, layout.width)
+        where = f"frame {frame.frame_index} of {frame.topic}, {frame.source_file}"
+        if self.shape not in (None, size):
+            raise StoreError(
+                f"camera {self.camera!r} has frames of {size[1]} x {size[0]} and of"
+                f" {self.shape[1]} x {self.shape[0]} pixels",  # type: ignore[index]
+                where=where,
+                remedy="a data set has one size: export the recordings apart, with --query",
+            )
+        if layout.bits > 8:
+            raise StoreError(
+                f"camera {self.camera!r} has {layout.bits} bits a channel ({layout.encoding}),"
+                " LeRobot's pictures have 8",
+                where=where,
+                remedy="name the other cameras with --cameras, or none",
+            )
+        self.shape = size
+        if layout.encoding in (JPEG, PNG) and layout.channels == 3 and layout.bits == 8:
+            self.as_recorded += 1
+            return frame.data, None
+        pixels = colours(frame.image())
+        self.packed[f"{layout.encoding}, {layout.channels} channels"] += 1
+        return png(pixels), pixels
+
+
+def colours(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Pixels as (H, W, 3): grey three times, alpha left out."""
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., :3], np.uint8)
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, "PNG")
+    return out.getvalue()
+
+
+def chosen_cameras(store: Store, named: Sequence[str] | None) -> list[str]:
+    """The cameras whose frames are exported: those named, or all (None).
+
+    Raises:
+        StoreError: the store has no such camera.
+    """
+    have = cameras_of(store)
+    if missing := sorted(set(named or ()) - set(have)):
+        raise StoreError(
+            f"no frames of a camera {missing[0]!r}",
+            where=str(store.path),
+            remedy=f"it has {', '.join(have) or 'none'}: [cameras.NAME] of a profile names them",
+        )
+    return have if named is None else list(dict.fromkeys(named))
+
+
+def pictures(
+    store: Store | None, trajectory: Trajectory, features: Sequence[ImageFeature]
+) -> Iterator[tuple[ImageFeature, list[dict[str, Any]], NDArray[np.uint8]]]:
+    """Of each camera the pictures (T) of a trajectory, as LeRobot's columns have them, and some of
+    them for statistics, thinned: (N, h, w, 3).
+
+    Raises:
+        StoreError: as `ImageFeature.picture`, or a damaged frame.
+    """
+    if store is None:
+        return
+    ids = [int(one) for one in trajectory.carried["transition_id"]]
+    sampled = {ids[place] for place in np.linspace(0, len(ids) - 1, SAMPLES).astype(int)}
+    for feature in features:
+        files: dict[int, bytes] = {}
+        small: list[NDArray[np.uint8]] = []
+        known: dict[int, tuple[bytes, NDArray[np.uint8] | None]] = {}  # the last frame
+        for frame in camera_frames(store, ids, feature.camera):
+            if frame.frame_index not in known:
+                known = {frame.frame_index: feature.picture(frame)}
+            file, seen = known[frame.frame_index]
+            files[frame.transition_id] = file
+            if frame.transition_id in sampled:
+                seen = colours(frame.image()) if seen is None else seen
+                step = max(max(seen.shape[:2]) // SMALL_PX, 1)
+                small.append(seen[::step, ::step])
+        rows = [{"bytes": files[one], "path": None} for one in ids]
+        yield feature, rows, np.stack(small)

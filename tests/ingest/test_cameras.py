@@ -1,0 +1,303 @@
+"""Frames of cameras: those in force at steps are kept as recorded, the others counted."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.cameras import (
+    CAMERAS,
+    FRONT,
+    REAR,
+    camera_bag,
+    compressed,
+    file_of,
+    front_and_rear,
+    picture,
+    profile_with,
+    raw,
+)
+
+from restock import cli
+from restock.errors import ConfigError, ExitCode, RecordingError, StoreError
+from restock.ingest.camera.images import (
+    ENCODINGS,
+    ImageLayout,
+    ImageProblem,
+    compressed_layout,
+    pixels,
+    raw_layout,
+)
+from restock.ingest.pipeline import IngestResult, ingest
+from restock.ingest.relabel import relabel_store
+from restock.ingest.store.writer import StoreWriter
+
+FRONT_ONLY = CAMERAS.split("[cameras.rear]")[0]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return camera_bag(tmp_path_factory.mktemp("camera") / "bag")
+
+
+def written(path: Path, store: Path, cameras: str = CAMERAS) -> tuple[IngestResult, list[Any]]:
+    """The result, and the rows of frames."""
+    result = ingest(path, profile_with(cameras), store=StoreWriter(store))
+    files = sorted((store / "frames").rglob("*.parquet"))
+    return result, [row for file in files for row in pq.read_table(file).to_pylist()]
+
+
+def counts(result: IngestResult, camera: str = "front") -> dict[str, Any]:
+    (row,) = (row for row in result.manifest["cameras"] if row["camera"] == camera)
+    assert row["decoded"] == sum(
+        [row["kept"], row["thinned"], row["unused"], *(p["count"] for p in row["problems"])]
+    )
+    return dict(row)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_the_frame_in_force_is_kept_as_it_was_recorded(tmp_path: Path, storage: str) -> None:
+    result, frames = written(camera_bag(tmp_path / "bag", storage=storage), tmp_path / "store")
+    # 10 frames a second, 5 ticks: every second frame is in force at one tick, 5 ms after it came.
+    assert {counts(result, name)["kept"] for name in ("front", "rear")} == {30}
+    assert counts(result)["unused"] == 30
+    front = [row for row in frames if row["camera"] == "front"]
+    assert [row["frame_index"] for row in front] == list(range(0, 60, 2))
+    for row in front:
+        sent = file_of(picture(row["frame_index"]))
+        assert row["data"] == sent
+        assert row["sha256"] == hashlib.sha256(sent).hexdigest()
+        assert (row["encoding"], row["width"], row["height"]) == ("jpeg", 48, 32)
+        assert row["log_time_ns"] - row["stamp_ns"] == result.manifest["clock_offset_ns"]
+    ticks = [row["first_transition_id"] & ((1 << 25) - 1) for row in front]
+    assert ticks == list(range(30))
+    assert all(row["first_transition_id"] == row["last_transition_id"] for row in front)
+    rear = [row for row in frames if row["camera"] == "rear"]
+    assert [row["data"] for row in rear] == [picture(row["frame_index"]).tobytes() for row in rear]
+
+
+def test_whether_frames_are_kept_changes_nothing_about_rows(bag: Path, tmp_path: Path) -> None:
+    with_frames, _ = written(bag, tmp_path / "a")
+    without, none = written(bag, tmp_path / "b", "")
+    assert none == []
+    left, right = (
+        StoreWriter(tmp_path / name)
+        .rows(result.manifest["recording_id"], result.manifest["ingest_id"])
+        .drop_columns(["ingest_id", "profile_hash"])
+        for name, result in (("a", with_frames), ("b", without))
+    )
+    assert left.equals(right)
+    assert profile_with("").hash != profile_with().hash
+
+
+def test_thinned_frames_are_counted_and_the_last_one_kept_holds(bag: Path, tmp_path: Path) -> None:
+    text = FRONT_ONLY + "max_hz = 2\nmax_age_s = 2.0\n"
+    result, frames = written(bag, tmp_path / "store", text)
+    row = counts(result)
+    assert (row["kept"], row["thinned"], row["steps"]) == (12, 48, 30)
+    assert [one["frame_index"] for one in frames] == list(range(0, 60, 5))
+    spans = [one["last_transition_id"] - one["first_transition_id"] + 1 for one in frames]
+    assert sum(spans) == 30
+    assert set(spans) == {2, 3}
+
+
+def test_a_frame_that_is_too_old_is_in_force_no_more(tmp_path: Path) -> None:
+    times = np.concatenate([np.arange(10) * 0.1, 3 + np.arange(10) * 0.1])  # silent for two seconds
+    files = [file_of(picture(number)) for number in range(20)]
+    bag = camera_bag(tmp_path / "bag", {FRONT: compressed(files, times)})
+    result, frames = written(bag, tmp_path / "store", FRONT_ONLY)
+    assert counts(result)["steps"] < 30
+    last_before = next(row for row in frames if row["frame_index"] == 9)
+    held = last_before["last_transition_id"] & ((1 << 25) - 1)
+    assert held * 0.2 + 0.005 - 0.9 <= 0.5 < (held + 1) * 0.2 + 0.005 - 0.9
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda data: data[: len(data) // 2], "truncated JPEG"),
+        (lambda data: b"\x00\x00\x00\x01\x67" + data, "neither JPEG nor PNG (its format says"),
+        (lambda data: b"", "no bytes"),
+        (lambda data: b"\xff\xd8\xff\xd9", "damaged JPEG"),
+    ],
+)
+def test_what_is_no_image_is_counted_and_named(
+    tmp_path: Path, make: Any, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [file_of(picture(number)) for number in range(60)]
+    files[20:23] = [make(data) for data in files[20:23]]
+    bag = camera_bag(tmp_path / "bag", {FRONT: compressed(files)})
+    result, frames = written(bag, tmp_path / "store", FRONT_ONLY)
+    (problem,) = counts(result)["problems"]
+    assert problem["reason"].startswith(said)
+    assert problem["count"] == 3
+    assert any(line.startswith(f"cameras.front: {said}") for line in result.lost_messages)
+    assert {20, 21, 22}.isdisjoint(row["frame_index"] for row in frames)
+    # The last good one holds over the damaged ones.
+    (held,) = (row for row in frames if row["frame_index"] == 19)
+    assert held["first_transition_id"] & ((1 << 25) - 1) == 10
+    (tmp_path / "p.toml").write_text(_text(), encoding="utf-8")
+    code = cli.main(
+        ["ingest", str(bag), "--profile", str(tmp_path / "p.toml"), "--store", str(tmp_path / "c")]
+    )
+    assert code == ExitCode.LOSSY
+    assert said in capsys.readouterr().out
+
+
+def _text() -> str:
+    from support.profile_texts import WAREHOUSE
+
+    return WAREHOUSE + FRONT_ONLY
+
+
+def test_an_unknown_encoding_and_a_short_raw_image_are_counted(tmp_path: Path) -> None:
+    kind, columns = raw([picture(number) for number in range(60)])
+    columns.fields["encoding"][10:12] = "bayer_rggb8"  # type: ignore[index]
+    columns.fields["step"][30] = 10_000  # type: ignore[index]
+    columns.fields["step"][31] = 3  # type: ignore[index]
+    bag = camera_bag(tmp_path / "bag", {REAR: (kind, columns)})
+    text = CAMERAS.replace(FRONT_ONLY, "")
+    result, _ = written(bag, tmp_path / "store", text)
+    assert {one["reason"]: one["count"] for one in counts(result, "rear")["problems"]} == {
+        "unknown encoding 'bayer_rggb8'": 2,
+        "cut short: fewer bytes than its rows have": 1,
+        "rows shorter than their width": 1,
+    }
+
+
+def test_a_topic_that_is_no_image_is_refused_and_one_that_is_missing_said(bag: Path) -> None:
+    with pytest.raises(RecordingError, match=r"/odom holds nav_msgs/msg/Odometry, which is no im"):
+        ingest(bag, profile_with('[cameras.front]\ntopic = "/odom"\n'), store=None)
+    missing = ingest(bag, profile_with('[cameras.front]\ntopic = "/nowhere"\n'), store=None)
+    assert {"input": "cameras.front", "instead": "no frame: no message of /nowhere"} in (
+        missing.manifest["stand_ins"]
+    )
+    assert missing.manifest["cameras"] == []
+    with pytest.raises(ConfigError, match=r"cameras\.Front"):
+        profile_with('[cameras.Front]\ntopic = "/x"\n')
+    with pytest.raises(ConfigError, match="max_hz"):
+        profile_with('[cameras.front]\ntopic = "/x"\nmax_hz = 0\n')
+
+
+def test_frames_go_and_stay_with_their_recording(bag: Path, tmp_path: Path) -> None:
+    """A second ingest replaces them; labelling again keeps them; the old file outlives its rows by
+    the retention window."""
+    store = tmp_path / "store"
+    written(bag, store)
+    (first,) = (store / "frames").rglob("*.parquet")
+    again, _ = written(bag, store, FRONT_ONLY)
+    files = set((store / "frames").rglob("*.parquet"))
+    assert len(files) == 2
+    writer = StoreWriter(store)
+    assert writer.clean() == []  # within the window
+    relabel_store(writer, lambda name: profile_with().definitions[:1])
+    (live,) = writer.live().to_pylist()
+    assert live["ingest_id"] != again.manifest["ingest_id"]
+    assert live["cameras"][0]["file"] == again.manifest["cameras"][0]["file"]
+    old_s = time.time() - 3600
+    for file in store.rglob("*.parquet"):
+        os.utime(file, (old_s, old_s))
+    writer.clean(retention_hours=0)
+    kept = live["cameras"][0]["file"]
+    assert not first.exists()
+    assert set((store / "frames").rglob("*.parquet")) == {store / "frames" / kept}
+
+
+def test_nothing_is_left_of_frames_where_the_commit_fails(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise StoreError("no")
+
+    monkeypatch.setattr(StoreWriter, "write_all", fail)
+    with pytest.raises(StoreError):
+        ingest(bag, profile_with(), store=StoreWriter(tmp_path / "store"))
+    assert list((tmp_path / "store").rglob("*.parquet")) == []
+
+
+def test_a_dry_run_writes_no_frames(bag: Path) -> None:
+    assert counts(ingest(bag, profile_with(), store=None))["kept"] == 30
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_files_decode_to_what_was_encoded(kind: str, channels: int) -> None:
+    image = picture(7, channels)
+    data = file_of(image, kind)
+    layout = compressed_layout(data, "")
+    assert (layout.encoding, layout.width, layout.height) == (kind.lower(), 48, 32)
+    assert (layout.channels, layout.bits) == (channels, 8)
+    got = pixels(data, layout)
+    np.testing.assert_allclose(got.astype(int), image.squeeze(), atol=12 if kind == "JPEG" else 0)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_raw_pixels_are_read_row_by_row_as_red_green_blue(encoding: str, big_endian: bool) -> None:
+    kind, channels, order = ENCODINGS[encoding]
+    colours = np.arange(2 * 3 * channels).reshape(2, 3, channels).astype(kind)
+    stored = np.empty_like(colours)
+    stored[..., list(order)] = colours  # BGR has red last
+    rows = stored.astype(np.dtype(kind).newbyteorder(">" if big_endian else "<")).tobytes()
+    width_bytes = len(rows) // 2
+    padded = b"".join(rows[i : i + width_bytes] + b"\xee" * 5 for i in (0, width_bytes))
+    layout = raw_layout(len(padded), encoding, 3, 2, width_bytes + 5, big_endian)
+    np.testing.assert_array_equal(pixels(padded, layout), colours.squeeze(axis=2)
+                                  if channels == 1 else colours)  # fmt: skip
+
+
+def test_a_file_that_claims_to_be_huge_is_refused_by_its_header() -> None:
+    data = bytearray(file_of(picture(1), "PNG"))
+    data[16:24] = struct.pack(">II", 100_000, 100_000)
+    with pytest.raises(ImageProblem, match="more than 100,000,000 pixels"):
+        compressed_layout(bytes(data), "png")
+    with pytest.raises(ImageProblem, match="more than 100,000,000 pixels"):
+        raw_layout(100, "mono8", 1 << 31, 1 << 31, 1 << 31, big_endian=False)
+
+
+def test_a_file_damaged_inside_is_found_when_it_is_decoded() -> None:
+    data = bytearray(file_of(picture(1), "PNG"))
+    data[50:60] = b"\0" * 10
+    layout = compressed_layout(bytes(data), "png")
+    with pytest.raises(ImageProblem, match="cannot be decoded"):
+        pixels(bytes(data), layout)
+    small = file_of(picture(1)[:8, :8], "PNG")
+    with pytest.raises(ImageProblem, match="another size"):
+        pixels(small, layout)
+
+
+@given(st.binary(max_size=64), st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"]))
+def test_whatever_the_bytes_are_they_are_an_image_or_said_not_to_be(
+    data: bytes, start: bytes
+) -> None:
+    for ending in (b"", b"\xff\xd9", b"IEND\xaeB`\x82"):
+        try:
+            layout = compressed_layout(start + data + ending, "jpeg")
+        except ImageProblem:
+            continue
+        assert isinstance(layout, ImageLayout)
+        with pytest.raises(ImageProblem):
+            pixels(start + data + ending, layout)
+
+
+def test_damage_of_a_file_is_counted_once(tmp_path: Path) -> None:
+    """Frames are read twice, and what is lost is lost once."""
+    bag = camera_bag(tmp_path / "bag", front_and_rear(), storage="mcap")
+    file = next(bag.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.7)])
+    profile = profile_with()
+    plain = ingest(file, profile_with(""), store=None, salvage=True)
+    result = ingest(file, profile, store=StoreWriter(tmp_path / "s"), salvage=True)
+    whole = [line for line in result.lost_messages if line.startswith("the file")]
+    assert whole == [line for line in plain.lost_messages if line.startswith("the file")]
+    assert whole
+    assert 0 < counts(result)["kept"] < 30

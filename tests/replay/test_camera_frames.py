@@ -1,0 +1,165 @@
+"""Frames of cameras for rows of a store: in SQL, decoded in Python, and as LeRobot's images."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+from support.cameras import (
+    CAMERAS,
+    FRONT,
+    REAR,
+    camera_bag,
+    compressed,
+    file_of,
+    picture,
+    profile_with,
+    raw,
+)
+from support.neighbours import read_with
+
+from restock import cli
+from restock.errors import ExitCode, QueryError, StoreError
+from restock.ingest.pipeline import ingest
+from restock.ingest.store.writer import StoreWriter
+from restock.replay import Store, camera_frames, export_dataset
+
+FRONT_ONLY = CAMERAS.split("[cameras.rear]")[0]
+
+
+@pytest.fixture(scope="module")
+def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    ingest(camera_bag(folder / "bag"), profile_with(), store=StoreWriter(folder / "store"))
+    return folder / "store"
+
+
+def stored(folder: Path, cameras: dict, text: str = FRONT_ONLY) -> Path:  # type: ignore[type-arg]
+    ingest(camera_bag(folder / "bag", cameras), profile_with(text), store=StoreWriter(folder / "s"))
+    return folder / "s"
+
+
+def test_frames_are_views_of_the_store(store_path: Path) -> None:
+    with Store(store_path) as store:
+        rows = store.sql(
+            "SELECT camera, count(*), min(age_s), max(age_s) FROM transition_frames"
+            " JOIN transitions USING (transition_id) GROUP BY ALL ORDER BY ALL"
+        ).fetchall()
+        assert [row[:2] for row in rows] == [("front", 29), ("rear", 29)]
+        assert all(0 <= low <= high < 0.1 for _, _, low, high in rows)
+        assert "data" not in store.sql("FROM frames").columns
+        documented = store.sql(
+            "SELECT count(*) FROM columns WHERE view IN ('frames', 'transition_frames')"
+            " AND meaning = ''"
+        ).fetchall()
+        assert documented == [(0,)]
+
+
+def test_frames_of_rows_are_decoded_when_asked(store_path: Path) -> None:
+    with Store(store_path) as store:
+        found = list(camera_frames(store, "FROM transitions WHERE step_index < 3", "rear"))
+        for step, frame in enumerate(found):
+            assert (frame.frame_index, frame.topic, frame.camera) == (2 * step, REAR, "rear")
+            assert frame.source_file.endswith("bag")
+            np.testing.assert_array_equal(frame.image(), picture(2 * step))
+        (front,) = camera_frames(store, [found[1].transition_id], "front")
+        np.testing.assert_allclose(front.image().astype(int), picture(2), atol=12)
+        assert [f.camera for f in camera_frames(store, [front.transition_id])] == ["front", "rear"]
+        with pytest.raises(StoreError, match="no frames of a camera 'side'"):
+            list(camera_frames(store, "FROM transitions", "side"))
+        with pytest.raises(QueryError, match="no transition_id"):
+            list(camera_frames(store, "SELECT 1 AS x"))
+
+
+def test_a_frame_whose_bytes_changed_is_not_shown(store_path: Path) -> None:
+    import dataclasses
+
+    with Store(store_path) as store:
+        frame = next(camera_frames(store, "FROM transitions", "rear"))
+    changed = dataclasses.replace(frame, data=b"\0" + frame.data[1:])
+    with pytest.raises(StoreError, match="not those that were recorded"):
+        changed.image()
+
+
+def test_lerobot_has_the_frames_as_they_were_recorded(store_path: Path, tmp_path: Path) -> None:
+    document = export_dataset(store_path, "lerobot", tmp_path / "a")
+    assert (document["transitions"], document["left_out"]) == (29, {})
+    info = json.loads((tmp_path / "a/meta/info.json").read_text())
+    expected = {"dtype": "image", "shape": [32, 48, 3], "names": ["height", "width", "channels"]}
+    assert info["features"]["observation.images.front"] == expected
+    (file,) = (tmp_path / "a/data").rglob("*.parquet")
+    rows = pq.read_table(file)
+    front = [row["bytes"] for row in rows["observation.images.front"].to_pylist()]
+    assert front == [file_of(picture(2 * step)) for step in range(29)]
+    rear = rows["observation.images.rear"].to_pylist()[3]["bytes"]
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(rear))), picture(6))
+    stats = json.loads((tmp_path / "a/meta/stats.json").read_text())["observation.images.rear"]
+    pixels = np.stack([picture(2 * step) for step in range(29)]) / 255
+    np.testing.assert_allclose(np.ravel(stats["mean"]), pixels.mean(axis=(0, 1, 2)), rtol=1e-6)
+    assert np.shape(stats["q01"]) == (3, 1, 1)
+    assert "`observation.images.front`" in (tmp_path / "a/README.md").read_text()
+    assert json.loads((tmp_path / "a/meta/restock.json").read_text())["cameras"] == [
+        "front",
+        "rear",
+    ]
+
+
+def test_lerobot_itself_reads_the_images(store_path: Path, tmp_path: Path) -> None:
+    export_dataset(store_path, "lerobot", tmp_path / "a")
+    images = read_with("lerobot", tmp_path / "a")["images"]
+    assert images.keys() == {"observation.images.front", "observation.images.rear"}
+    rear = images["observation.images.rear"]
+    assert rear["shape"] == [3, 32, 48]
+    expected = [picture(2 * step)[0, -1] / 255 for step in range(29)]
+    np.testing.assert_allclose(rear["corner"], expected, rtol=1e-6)
+    np.testing.assert_allclose(images["observation.images.front"]["corner"], expected, atol=0.05)
+
+
+def test_steps_without_a_frame_are_left_out_and_counted(tmp_path: Path) -> None:
+    times = 2 + np.arange(40) * 0.1  # the camera is late by two seconds
+    files = [file_of(picture(number)) for number in range(40)]
+    store = stored(tmp_path, {FRONT: compressed(files, times)})
+    document = export_dataset(store, "lerobot", tmp_path / "a")
+    assert document["left_out"] == {"no frame of camera front": 10}
+    assert document["rows"] == document["transitions"] + 10 == 29
+    assert export_dataset(store, "lerobot", tmp_path / "b", cameras=[])["transitions"] == 29
+    assert "images" not in (tmp_path / "b/meta/info.json").read_text()
+
+
+def test_grey_frames_become_three_channels_and_deep_ones_are_refused(tmp_path: Path) -> None:
+    grey = [file_of(picture(number, 1)) for number in range(60)]
+    depth = [np.full((4, 6), number * 500, np.uint16) for number in range(60)]
+    store = stored(tmp_path, {FRONT: compressed(grey), REAR: raw(depth, "16UC1")}, CAMERAS)
+    document = export_dataset(store, "lerobot", tmp_path / "a", cameras=["front"])
+    assert document["notes"] == [
+        "observation.images.front: 0 pictures as they were recorded; 29 of jpeg, 1 channels as PNG"
+    ]
+    with pytest.raises(StoreError, match="16 bits a channel"):
+        export_dataset(store, "lerobot", tmp_path / "b")
+    assert not (tmp_path / "b").exists()
+    with Store(store) as opened:
+        frame = next(camera_frames(opened, "FROM transitions WHERE step_index = 2", "rear"))
+        assert frame.image().dtype == np.uint16
+        assert frame.image()[0, 0] == 2000
+
+
+def test_frames_of_two_sizes_are_refused(tmp_path: Path) -> None:
+    files = [file_of(picture(number)[: 32 if number < 30 else 16]) for number in range(60)]
+    store = stored(tmp_path, {FRONT: compressed(files)})
+    with pytest.raises(StoreError, match="48 x 16 and of 48 x 32 pixels"):
+        export_dataset(store, "lerobot", tmp_path / "a")
+
+
+def test_the_command_line_names_cameras(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export = ["export", str(store_path), "--out", str(tmp_path / "a"), "--to"]
+    assert cli.main([*export, "lerobot", "--cameras", "front"]) == ExitCode.OK
+    assert "observation.images.front: 29 pictures as they were recorded" in capsys.readouterr().out
+    assert cli.main([*export, "minari", "--cameras", "front"]) == ExitCode.USAGE
+    assert "holds no images" in capsys.readouterr().err
