@@ -51,6 +51,7 @@ class CustomSignal(Checked, frozen=True):
     values: dict[str, float] | None = None  # what a text, bool or number stands for
     scale: float = 1.0  # stored = found * scale + offset
     offset: float = 0.0
+    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # of a list that is a vector
     doc: str = ""
 
     def check(self) -> None:
@@ -68,6 +69,8 @@ class CustomSignal(Checked, frozen=True):
             )
         if self.reduce not in (None, "yaw") and not path.lists:
             raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
+        if self.length is not None and not self.is_list:
+            raise ValueError(f"path {self.path!r} gives one value: a vector's length is of a list")
         if not self.unit:
             raise ValueError('unit is empty: write "1" for a quantity without one')
 
@@ -96,6 +99,7 @@ class CustomSignal(Checked, frozen=True):
     def field(self, name: str) -> pa.Field:
         """Its column, with unit and source in the metadata."""
         about = {"unit": self.unit, "topic": self.topic, "path": self.path, "meaning": self.doc}
+        about |= {"length": str(self.length or "")}
         kind = LIST if self.is_list else NUMBER
         return pa.field(name, kind, nullable=True, metadata={k: v for k, v in about.items() if v})
 
@@ -134,8 +138,11 @@ def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str)
         stored = have.get(field.name)
         if unit is None or stored is None:
             continue
-        kind = "list" if field.type == LIST else "number"
-        stored_kind = "list" if "Array" in type(stored.type).__name__ else "number"
+        length = (field.metadata or {}).get(b"length", b"").decode()
+        kind = _kind(field.type == LIST, length)
+        stored_kind = _kind(
+            "Array" in type(stored.type).__name__, str(stored.metadata.get("length", ""))
+        )
         stored_unit = stored.metadata.get("unit", "")
         if (kind, unit.decode()) != (stored_kind, stored_unit):
             raise StoreError(
@@ -144,6 +151,10 @@ def refuse_other_signals(have: Mapping[str, Any], schema: pa.Schema, where: str)
                 where=where,
                 remedy="rename the signal in the profile, or use another store",
             )
+
+
+def _kind(is_list: bool, length: str) -> str:
+    return (f"vector of {length}" if length else "list") if is_list else "number"
 
 
 @cache

@@ -200,6 +200,9 @@ class Profile(Checked, frozen=True):
         if self.motion is None:
             apart |= {"motion"}
         apart |= {name for name in ("command_sources", "cameras") if not values[name]}
+        for signal in values["signals"].values():
+            if signal["length"] is None:
+                del signal["length"]
         for source in values["command_sources"].values():
             for key in FIX_SETTINGS:
                 del source[key]

@@ -37,11 +37,22 @@ class CustomColumn:
             return np.ones(len(self.values), np.bool_)
         return np.asarray(self.values.lengths > 0, np.bool_)
 
+    @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """(N,) which messages of a list have one of the length that it must have."""
+        lengths, due = self.values.lengths, self.signal.length
+        return np.asarray(lengths > 0 if due is None else lengths == due, np.bool_)
+
+    @property
+    def of_other_length(self) -> int:
+        """How many messages hold a vector of another length."""
+        return 0 if self.signal.length is None else int((~self.whole).sum())
+
     @property
     def found(self) -> int:
         """How many messages have it, as a number or a list of them."""
         if self.signal.is_list:
-            return int((self.values.lengths > 0).sum())
+            return int(self.whole.sum())
         return int(np.isfinite(np.asarray(self.values.values, np.float64)).sum())
 
     def take(self, message: NDArray[np.intp], known: NDArray[np.bool_]) -> pa.Array:
@@ -54,6 +65,8 @@ class CustomColumn:
             values = every[np.where(has, self.values.offsets[message], -1)]
             return pa.array(values, NUMBER, mask=~known | ~np.isfinite(values))
         rows = self.values.take(message)
+        if self.signal.length is not None:
+            known = known & self.whole[message]
         values = np.asarray(rows.values, np.float32)
         flat = pa.array(values, pa.float32(), mask=~np.isfinite(values))
         offsets = pa.array(rows.offsets, pa.int32())
@@ -164,6 +177,11 @@ class Custom:
             f" a value that is not a number, such as {shorten(column.unread[0], 60)!r}"
             for name, column in self.columns.items()
             if column.unread
+        ] + [
+            f"signals.{name}: {count:,} of {len(column.values):,} messages have another length than"
+            f" {column.signal.length}: null"
+            for name, column in self.columns.items()
+            if (count := column.of_other_length)
         ]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -176,13 +194,13 @@ class Custom:
                 {
                     "name": column.name,
                     "unit": about.get("unit", ""),
-                    "type": "list" if column.type == LIST else "number",
+                    "type": _said(column.type == LIST, about.get("length")),
                     "topic": about["topic"],
                     "path": about["path"],
                     "meaning": about.get("meaning", ""),
                     "messages": len(read.values) if read else 0,
                     "found": read.found if read else 0,
-                    "unread": len(read.unread) if read else 0,
+                    "unread": len(read.unread) + read.of_other_length if read else 0,
                     "steps": len(self.table) - self.table[column.name].null_count,
                 }
             )
@@ -191,6 +209,10 @@ class Custom:
     def take(self, ticks: NDArray[np.int64]) -> pa.Table:
         """The columns at these ticks."""
         return self.table.take(pa.array(ticks))
+
+
+def _said(is_list: bool, length: str | None) -> str:
+    return (f"list[{length}]" if length else "list") if is_list else "number"
 
 
 def custom_signals(aligned: AlignedInputs) -> Custom:

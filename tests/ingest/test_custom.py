@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from deltalake.schema import ArrayType, Field
 from support.driven_robot import Drive, columns
 from support.paths import ROOT, sample_transitions
 from support.profile_texts import WAREHOUSE as TEXT
@@ -352,3 +354,30 @@ def test_whole_messages_are_never_kept(monkeypatch):
         )
     assert "ranges" not in read["/scan"].fields
     assert "signal beams_m" in read["/scan"].fields
+
+
+def test_a_vector_has_one_length_and_others_are_null_and_counted():
+    fields = {"v": ragged([[1, 2], [3, 4, 5], [6, 7], []])}
+    table = signal("s", "v[]", "length = 2", "max_age_s = 1.0")
+    steps = steps_with(table, fields)
+    held = steps.custom.table["s"].to_pylist()
+    assert held[2:4] == [[1.0, 2.0]] * 2
+    assert held[6:9] == [None] * 3
+    assert held[11:14] == [[6.0, 7.0]] * 3
+    (row,) = steps.custom.rows()
+    assert (row["type"], row["messages"], row["found"], row["unread"]) == ("list[2]", 4, 2, 2)
+    assert any("2 of 4 messages have another length than 2" in note for note in steps.notes)
+
+
+def test_a_vectors_length_is_part_of_what_a_column_means(tmp_path: Path):
+    with pytest.raises(ConfigError, match="a vector's length is of a list"):
+        parse_profile(with_signals(signal("s", "v[0]", "length = 2")), where="p")
+    two, three, none = (
+        parse_profile(with_signals(signal("s", "v[]", *more)), where="p").signals["s"].field("s")
+        for more in (["length = 2"], ["length = 3"], [])
+    )
+    have = {"s": Field("s", ArrayType("float", True), metadata={"unit": "1", "length": "2"})}
+    refuse_other_signals(have, pa.schema([two]), "store")
+    for other in (three, none):
+        with pytest.raises(StoreError, match="is a vector of 2 in 1"):
+            refuse_other_signals(have, pa.schema([other]), "store")

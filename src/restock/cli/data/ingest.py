@@ -226,6 +226,22 @@ def show(outcome: IngestResult) -> None:
                 for signal in row["signals"]
             ]
         )
+    if row.get("cameras"):
+        output.print_table(
+            [
+                {
+                    "camera": one["camera"],
+                    "messages": one["expected"],
+                    "frames kept": one["kept"],
+                    "bytes": one["size_bytes"],
+                    "thinned out": one["thinned"],
+                    "in force at no step": one["unused"],
+                    "no image": sum(problem["count"] for problem in one["problems"]),
+                    "steps with a frame": one["steps"],
+                }
+                for one in row["cameras"]
+            ]
+        )
     scores = {score.condition: score for score in outcome.scores}
 
     def against_truth(name: str) -> dict[str, Any]:

@@ -242,4 +242,7 @@ def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
         rows.append(row("frames", topic, kind, profile.frames.max_age_s if moving else None, True))
     for name, signal in profile.signals.items():
         rows.append(row(f"signals.{name}", signal.topic, signal.type, signal.max_age_s, True))
+    for name, camera in profile.cameras.items():
+        kind = topics[camera.topic].type if camera.topic in topics else ""
+        rows.append(row(f"cameras.{name}", camera.topic, kind, camera.max_age_s, True))
     return rows
