@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
 from restock.errors import RecordingError, RestockError
 
 if TYPE_CHECKING:
+    from restock.ingest.containers.recording import Watch
     from restock.ingest.pipeline import IngestResult, OnRepeat
     from restock.ingest.profile.profile import Profile
 
@@ -48,7 +49,7 @@ class IngestJob:
     repeated: OnRepeat = "keep"  # a recording that is in the store under another id
     tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
 
-    def run(self, path: Path) -> Result:
+    def run(self, path: Path, watch: Watch | None = None) -> Result:
         """Ingest one recording; an error is returned, so that the others continue."""
         from restock.ingest.pipeline import ingest
         from restock.ingest.store.writer import StoreWriter
@@ -63,6 +64,7 @@ class IngestJob:
                 typestore=self.typestore,
                 repeated=self.repeated,
                 tags=self.tags,
+                watch=watch,
             )
         except RestockError as error:
             return path, error
@@ -79,13 +81,19 @@ class IngestJob:
 
 
 def ingest_all(
-    paths: Sequence[Path], job: IngestJob, *, workers: int = 1, engine: Engine = "processes"
+    paths: Sequence[Path],
+    job: IngestJob,
+    *,
+    workers: int = 1,
+    engine: Engine = "processes",
+    watch: Watch | None = None,
 ) -> Iterator[Result]:
     """Each recording's outcome or error, in the order of `paths`.
 
     With several workers each recording is read and committed by one of them; commits that collide
     are tried again, so the store is the same as after one worker. With Ray, `workers` is how many
-    it may start at once where it starts on this machine.
+    it may start at once where it starts on this machine. `watch` is told how far a recording is,
+    where they are read one after the other.
 
     Raises:
         ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
@@ -95,7 +103,8 @@ def ingest_all(
 
         yield from run_on_ray(job, paths, workers=workers)
     elif min(workers, len(paths)) <= 1:
-        yield from map(job.run, paths)
+        for path in paths:
+            yield job.run(path, watch)
     else:
         yield from side_by_side(job.run, paths, min(workers, len(paths)), died=_died)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.recording import Recording, Watch
 from restock.ingest.containers.topic_reading import LATEST_NS
 from restock.ingest.steps.clocks import STAMP, topic_clock
 
@@ -29,16 +29,19 @@ def describe_recording(
     typestore: str | None = None,
     salvage: bool = False,
     clocks: bool = False,
+    watch: Watch | None = None,
 ) -> dict[str, Any]:
     """Format, size, time span and topics of one recording; nothing is decoded but for `clocks`.
 
     Times are log times. `rate_hz` is the messages of a topic over the recording's duration. With
-    `clocks` the whole recording is read for its header stamps, and every topic has its `clock`.
+    `clocks` the whole recording is read for its header stamps, and every topic has its `clock`;
+    `watch` is told how far that is.
 
     Raises:
         RecordingError: it cannot be opened; see `open_recording`.
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
+        recording.watch = watch or recording.watch
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)

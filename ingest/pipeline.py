@@ -21,7 +21,7 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.camera.frame_rows import KeptFrames, frame_rows, kept_frames
 from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.recording import Recording, Watch
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
@@ -86,6 +86,7 @@ def ingest(
     typestore: str | None = None,
     repeated: OnRepeat = "keep",
     tags: Mapping[str, str] | None = None,
+    watch: Watch | None = None,
 ) -> IngestResult:
     """Read one recording and write its transitions to the store (None: a dry run).
 
@@ -94,7 +95,7 @@ def ingest(
     recording in the store (a part of it, a copy) is kept and said, or refused, by `repeated`.
     `tags` say whose drive it is, before what the recording says itself; "" takes a tag off. Where
     only tags or the profile's [robot] are new, the rows that are there are written with them: the
-    status is "tagged".
+    status is "tagged". `watch` is told what is being done, how much of it is, and of how much.
 
     Raises:
         RecordingError: no recording, damaged (unless `salvage`), not of this profile, it gives
@@ -103,6 +104,7 @@ def ingest(
         StoreError: the store cannot be written.
     """
     with open_recording(path, typestore=typestore, salvage=salvage) as recording:
+        recording.watch = watch or recording.watch
         profile = as_recorded(profile, recording.topics)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}
@@ -182,6 +184,7 @@ class _Ingest:
         steps = steps_of(profile, columns)
         # The next stages need to know which topics had messages, not their values: free those.
         columns = {name: column.times(0, 1) for name, column in columns.items()}
+        watch, ticks = self.recording.watch, len(steps)
         episodes = split(profile.task, steps)
         if not episodes.transitions:
             raise RecordingError(
@@ -192,7 +195,11 @@ class _Ingest:
         provenance = Provenance(
             self.recording.recording_id, self.ingest_id, self.path, software_version()
         )
-        table, rows = recording_table(profile, steps, episodes, provenance)
+        watch("rows and labels, ticks", 0, ticks)
+        table, rows = recording_table(
+            *(profile, steps, episodes, provenance),
+            done=lambda tick: watch("rows and labels, ticks", tick, ticks),
+        )
         table, self.corrections = lay_over(
             table, self.corrections, profile.conditions, steps.clock.offset_ns
         )

@@ -34,6 +34,7 @@ ENCODINGS: dict[str, tuple[str, int, tuple[int, ...]]] = {
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"IEND\xaeB`\x82"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # a palette's colours are three
+_PLAIN_MODES = {"P": "RGB", "CMYK": "RGB", "YCbCr": "RGB", "LA": "RGBA", "1": "L"}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers that begin a frame's header
 
 
@@ -119,13 +120,8 @@ def _decoded(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
         with Image.open(io.BytesIO(data), formats=["JPEG", "PNG"]) as image:
             if image.size != (layout.width, layout.height):
                 raise ImageProblem("another size than its header said")
-            if image.mode in ("P", "CMYK", "YCbCr"):
-                image = image.convert("RGB")
-            elif image.mode == "LA":
-                image = image.convert("RGBA")
-            elif image.mode == "1":
-                image = image.convert("L")
-            array = np.asarray(image)
+            plain = _PLAIN_MODES.get(image.mode)
+            array = np.asarray(image.convert(plain) if plain else image)
     except ImageProblem:
         raise
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError, struct.error) as error:

@@ -38,6 +38,7 @@ from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import Decoder
 
 STATIC_TRANSFORMS = "/tf_static"
+Watch = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
 MOST_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
 
 
@@ -88,6 +89,7 @@ class Recording:
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
+        self.watch: Watch = lambda doing, done, whole: None  # is told how far a long read is
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
@@ -104,11 +106,14 @@ class Recording:
     def recording_id(self) -> str:
         """16 hex digits of the content of its files, in order: the same wherever it lies."""
         digest = hashlib.blake2b(digest_size=8)
+        done, whole = 0, self.size_bytes
         for file in self.files:
             digest.update(str(file.stat().st_size).encode())
             with file.open("rb") as content:
                 while block := content.read(1 << 20):
                     digest.update(block)
+                    done += len(block)
+                    self.watch("checking content, bytes", done, whole)
         return digest.hexdigest()
 
     @cached_property
@@ -252,8 +257,11 @@ class Recording:
             topic: TopicReading(self.topics[topic], paths, (reductions or {}).get(topic))
             for topic, paths in wanted.items()
         }
+        done, whole = 0, sum(self.topics[topic].expected for topic in wanted)
         for storage in self._storages:
-            self._read_storage(storage, readings)
+            for count in self._read_storage(storage, readings):
+                done += count
+                self.watch("reading, messages", done, whole)
         columns = {}
         for topic, reading in readings.items():
             self.accounts[topic] = reading.close(self._lost(topic))
@@ -305,7 +313,8 @@ class Recording:
         self,
         storage: Storage,
         readings: Mapping[str, TopicReading],
-    ) -> None:
+    ) -> Iterator[int]:
+        """Yields how many messages were read, some after the other."""
         decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
@@ -322,6 +331,7 @@ class Recording:
                     reading.skip(str(reason), count)
         for channel, batch in together(storage.batches(list(decoders))):
             readings[topics[channel]].take(decoders[channel].decode, batch)
+            yield len(batch)
 
     def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
         channel, kind = stream.channel, self._type(stream)

@@ -358,14 +358,12 @@ def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict
         for name, source in profile.inputs.items()
         if source.optional and not (source.topic in topics and len(topics[source.topic]))
     }
+    beside = [(f"signals.{name}", "null", one.topic) for name, one in profile.signals.items()]
+    beside += [(f"cameras.{name}", "no frame", one.topic) for name, one in profile.cameras.items()]
     silent = {
-        f"{key}.{name}": f"{instead}: no message of {one.topic}"
-        for key, instead, several in (
-            ("signals", "null", profile.signals),
-            ("cameras", "no frame", profile.cameras),
-        )
-        for name, one in several.items()
-        if not (one.topic in topics and len(topics[one.topic]))
+        name: f"{instead}: no message of {topic}"
+        for name, instead, topic in beside
+        if not (topic in topics and len(topics[topic]))
     }
     return profile.fallbacks | absent | silent
 
@@ -373,7 +371,8 @@ def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict
 def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
     """These topics but those of which only images are taken: whether frames are kept changes
     nothing about rows, so cameras say neither what time it is nor when a recording ends."""
-    named = {source.topic for source in (*profile.sources.values(), *profile.signals.values())}
+    named = {source.topic for source in profile.sources.values()}
+    named |= {signal.topic for signal in profile.signals.values()}
     beside = {camera.topic for camera in profile.cameras.values()} - named
     return {name: one for name, one in topics.items() if name not in beside}
 

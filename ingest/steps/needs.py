@@ -101,9 +101,10 @@ def wanted_fields(
     for topic in profile.transform_topics:
         if topic in available:
             wanted.setdefault(topic, []).extend(FIELDS)
-    for beside in (*profile.signals.values(), *profile.cameras.values()):
-        if beside.topic in available:
-            wanted.setdefault(beside.topic, [])
+    beside = [signal.topic for signal in profile.signals.values()]
+    for topic in (*beside, *(camera.topic for camera in profile.cameras.values())):
+        if topic in available:
+            wanted.setdefault(topic, [])
     for topic, paths in wanted.items():
         has = {leaf.path for leaf in leaves[topic]}
         kept = [path for path in paths if path not in optional or path in has]

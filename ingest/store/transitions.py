@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,12 +64,18 @@ class TransitionValues:
 
 
 def recording_table(
-    profile: Profile, steps: Steps, episodes: Split, provenance: Provenance
+    profile: Profile,
+    steps: Steps,
+    episodes: Split,
+    provenance: Provenance,
+    *,
+    done: Callable[[int], None] = lambda ticks: None,
 ) -> tuple[pa.Table, EpisodeRows]:
     """All transitions of a recording, and the steps they are made of (without their signals).
 
     Some whole episodes at a time, which changes no value: an episode's rows and labels depend on
-    its own steps alone, and only those of one group are in memory in full.
+    its own steps alone, and only those of one group are in memory in full. `done` is told how many
+    ticks are.
 
     Raises:
         RecordingError: as `transitions`.
@@ -80,6 +86,7 @@ def recording_table(
         tables.append(transitions(profile, steps, episodes, rows, provenance))
         ends.append(rows.ends_table())
         parts.append(rows.without_signals())
+        done(int(rows.tick.max()) + 1)
     table = pa.concat_tables(tables)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
     return table.replace_schema_metadata(metadata), EpisodeRows.join(parts)

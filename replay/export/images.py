@@ -58,10 +58,10 @@ class ImageFeature:
         layout = frame.layout
         size = (layout.height, layout.width)
         where = f"frame {frame.frame_index} of {frame.topic}, {frame.source_file}"
-        if self.shape not in (None, size):
+        if self.shape is not None and self.shape != size:
             raise StoreError(
                 f"camera {self.camera!r} has frames of {size[1]} x {size[0]} and of"
-                f" {self.shape[1]} x {self.shape[0]} pixels",  # type: ignore[index]
+                f" {self.shape[1]} x {self.shape[0]} pixels",
                 where=where,
                 remedy="a data set has one size: export the recordings apart, with --query",
             )

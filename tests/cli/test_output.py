@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
+from support.paths import ROOT
 
 from restock import cli
 from restock.cli import output
@@ -86,3 +92,58 @@ def test_help_has_no_noise(verb: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert "{None" not in text
     assert "None)" not in text
     assert "(default: False)" not in text
+
+
+def test_a_long_recording_shows_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """On stderr, if that is a terminal: what is read of a recording, and of how much."""
+    told: list[tuple[str, int, int]] = []
+    original = output.Advance.part
+
+    def part(self: output.Advance, *how_far: Any) -> None:
+        told.append(how_far)
+        original(self, *how_far)
+
+    monkeypatch.setattr(output.Advance, "part", part)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    sample = ROOT / "sample_logs" / "amr_tuesday"
+    assert cli.main(["ingest", str(sample), "--dry-run", "--json"]) == 0
+    out = capsys.readouterr().out
+    assert json.loads(out)["recordings"][0]["status"] == "dry run"
+    by_stage = {}
+    for doing, done, whole in told:
+        by_stage.setdefault(doing, []).append((done, whole))
+    assert by_stage.keys() == {
+        "checking content, bytes",
+        "reading, messages",
+        "rows and labels, ticks",
+    }
+    for steps in by_stage.values():
+        done, whole = zip(*steps, strict=True)
+        assert list(done) == sorted(done)
+        assert len(set(whole)) == 1
+        assert 0.9 * whole[-1] <= done[-1] <= whole[-1]
+
+
+def test_a_bar_leaves_what_goes_into_a_file_alone(tmp_path: Path) -> None:
+    """A terminal that shows a bar, while stdout is a file: what is printed meanwhile is data."""
+    import pty
+
+    code = (
+        "from restock.cli import output\n"
+        "with output.progress('x', 2) as advance:\n"
+        "    advance.part('y', 1, 3)\n"
+        "    print('data')\n"
+        "    advance(1)\n"
+    )
+    ours, theirs = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=theirs, check=True
+    )
+    os.close(theirs)
+    shown = os.read(ours, 100_000)
+    os.close(ours)
+    assert done.stdout == b"data\n"
+    assert b"x" in shown
+    assert b"data" not in shown

@@ -359,11 +359,12 @@ def test_whole_messages_are_never_kept(monkeypatch):
 def test_a_vector_has_one_length_and_others_are_null_and_counted():
     fields = {"v": ragged([[1, 2], [3, 4, 5], [6, 7], []])}
     table = signal("s", "v[]", "length = 2", "max_age_s = 1.0")
-    steps = steps_with(table, fields)
+    steps = steps_with(table, fields, [0.0, 1.0, 2.0, 3.0])
     held = steps.custom.table["s"].to_pylist()
-    assert held[2:4] == [[1.0, 2.0]] * 2
-    assert held[6:9] == [None] * 3
-    assert held[11:14] == [[6.0, 7.0]] * 3
+    assert held[:5] == [[1.0, 2.0]] * 5
+    assert held[5:10] == [None] * 5
+    assert held[10:15] == [[6.0, 7.0]] * 5
+    assert held[15:] == [None] * 15
     (row,) = steps.custom.rows()
     assert (row["type"], row["messages"], row["found"], row["unread"]) == ("list[2]", 4, 2, 2)
     assert any("2 of 4 messages have another length than 2" in note for note in steps.notes)

@@ -14,6 +14,7 @@ from restock.errors import visible
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress, TaskID
 
 Row = Mapping[str, Any]
 
@@ -219,11 +220,43 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+class Advance:
+    """Moves a progress bar, and one below it of the part at hand; or nothing, without a bar."""
+
+    def __init__(self, bar: Progress | None = None, task: TaskID | None = None) -> None:
+        self._bar, self._task = bar, task
+        self._part: tuple[str, TaskID] | None = None
+
+    def __call__(self, amount: float = 1.0, note: str = "") -> None:
+        """So much more of the whole is done; the part at hand is over."""
+        if self._bar is None or self._task is None:
+            return
+        self._bar.update(self._task, advance=amount, note=note)
+        self._end_part()
+
+    def part(self, doing: str, done: float, whole: float) -> None:
+        """How far the part at hand is."""
+        if self._bar is None:
+            return
+        if self._part is None or self._part[0] != doing:
+            self._end_part()
+            self._part = doing, self._bar.add_task(doing, total=whole, note="")
+        self._bar.update(self._part[1], completed=done)
+
+    def _end_part(self) -> None:
+        if self._bar is not None and self._part is not None:
+            self._bar.remove_task(self._part[1])
+        self._part = None
+
+
 @contextmanager
-def progress(description: str, total: float | None) -> Iterator[Any]:
-    """A progress bar on a terminal, silence elsewhere. Yields `advance(amount, note="")`."""
+def progress(description: str, total: float | None) -> Iterator[Advance]:
+    """A progress bar on a terminal, silence elsewhere. Yields what moves it.
+
+    Without a total it shows that something moves, and for how long.
+    """
     if not sys.stderr.isatty():
-        yield lambda amount=1.0, note="": None
+        yield Advance()
         return
     from rich.progress import (
         BarColumn,
@@ -243,11 +276,7 @@ def progress(description: str, total: float | None) -> Iterator[Any]:
         TextColumn("{task.fields[note]}"),
         console=stderr(),
         transient=True,
+        redirect_stdout=sys.stdout.isatty(),  # in a file it is data, whatever stderr shows
     )
     with bar:
-        task = bar.add_task(description, total=total, note="")
-
-        def advance(amount: float = 1.0, note: str = "") -> None:
-            bar.update(task, advance=amount, note=note)
-
-        yield advance
+        yield Advance(bar, bar.add_task(description, total=total, note=""))

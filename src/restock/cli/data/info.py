@@ -60,9 +60,14 @@ class InfoCommand:
                 continue
             for path in paths:
                 try:
-                    entry = describe_recording(
-                        path, typestore=typestore, salvage=self.salvage, clocks=self.clocks
-                    )
+                    with output.progress(f"info {path.name}", None) as advance:
+                        entry = describe_recording(
+                            path,
+                            typestore=typestore,
+                            salvage=self.salvage,
+                            clocks=self.clocks,
+                            watch=advance.part,
+                        )
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")
                     code = ExitCode.USAGE

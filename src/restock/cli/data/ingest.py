@@ -95,7 +95,9 @@ class IngestCommand:
         outcomes: list[dict[str, Any]] = []
         lossy = False
         with output.progress("ingest", len(paths)) as advance:
-            for path, result in ingest_all(paths, job, workers=self.workers, engine=self.engine):
+            for path, result in ingest_all(
+                paths, job, workers=self.workers, engine=self.engine, watch=advance.part
+            ):
                 advance(1, path.name)
                 if isinstance(result, RestockError):
                     failures.append({"path": str(path), "status": "failed", "error": str(result)})

@@ -85,7 +85,8 @@ class MixCommand:
             ) as store,
             open_source(store, mixture, folder=folder) as source,
         ):
-            plan = plan_panel(source.connection, mixture, source.conditions, source.others)
+            with output.progress("planning", None):
+                plan = plan_panel(source.connection, mixture, source.conditions, source.others)
             document = describe(plan) | {"store_version": store.version, "mixture": self.mixture}
             read_by = source.profiles(plan.task_hash)
             document["profiles"] = [{"name": p.name, "hash": p.hash} for p in read_by]

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from restock.cli.output import print_json
+from restock.cli.output import print_json, progress
 
 
 @dataclass
@@ -61,10 +61,11 @@ class ReportCommand:
             else:
                 sys.stdout.write(markdown)
             return None
-        if is_store(Location.of(self.run_directory)):
-            path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)
-        else:
-            path = build_report(self.run_directory, self.out, self.figures)
+        with progress("report", None):
+            if is_store(Location.of(self.run_directory)):
+                path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)
+            else:
+                path = build_report(self.run_directory, self.out, self.figures)
         if self.json:
             print_json({"report": str(path), "bytes": path.stat().st_size})
         else:
