@@ -353,8 +353,11 @@ def _save(session: Session) -> None:
 
 
 def _time_left(session: Session) -> bool:
-    seconds = session.config.schedule.seconds
-    return seconds is None or session.wall_s < seconds
+    """Whether the time is not up; a first interval of updates is made whatever it is, so that
+    there is something to keep and to report."""
+    config = session.config
+    seconds, least = config.schedule.seconds, config.record.every_updates
+    return seconds is None or session.wall_s < seconds or session.learner.gradient_steps < least
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:

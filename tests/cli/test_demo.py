@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rich.text import Text
 
 from restock import cli
+from restock.cli.start import stages
 from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
 from restock.cli.start.stage import Stage
 from restock.cli.start.stages import Settings
@@ -25,10 +29,62 @@ def plan(tmp_path: Path) -> list[Stage]:
 
 def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
     verbs = [stage.command[0] for stage in plan(tmp_path)]
-    before = ["info", "ingest", "sql", "audit", "mix"]
-    assert verbs == [*before, "train", "train", "eval", "eval", "report"]
+    before = ["info", "ingest", "sql", "audit", "mix", "mix"]
+    assert verbs == [*before, "train", "train", "train", "eval", "eval", "report"]
     for stage in plan(tmp_path):
         assert cli.main([*stage.command, "--help"]) == 0
+        assert not stage.beside or cli.main([*stage.beside, "--help"]) == 0
+
+
+def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
+    settings = ("practice.rule=success", "seed=3")
+    to = Settings(("logs",), tmp_path, seconds=9, train=settings)
+    stage = stages.train_beside_uniform(to)
+    told = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
+    first, second = (
+        {flag: value for flag, value in one.items() if flag.startswith("--")} for one in told
+    )
+    assert first.keys() == second.keys()
+    differing = {flag for flag in first if first[flag] != second[flag]}
+    assert differing == {"--panel", "--out"}
+    assert set(stage.command) - set(stage.beside) >= {"practice.rule=success"}
+    assert "seed=3" in stage.beside
+
+
+def test_the_run_that_is_behind_goes_on_until_both_have_driven_as_much(tmp_path: Path) -> None:
+    to = Settings(("logs",), tmp_path, seconds=9)
+
+    def driven(run: int, uniform: int) -> list[str] | None:
+        for path, steps in ((to.run, run), (to.uniform, uniform)):
+            path.mkdir(exist_ok=True)
+            (path / "config.json").write_text("{}")
+            table = pa.table({"env_steps": [0, steps]})
+            pq.write_table(table, path / "progress.parquet")
+        decided = stages.even_out(to).decided
+        assert decided is not None
+        return decided()
+
+    assert driven(500, 500) is None
+    behind = driven(480, 500)
+    assert behind is not None
+    assert behind[:5] == ["train", "--resume", str(to.run), "--env-steps", "500"]
+    ahead = driven(512, 500)
+    assert ahead is not None
+    assert ahead[:5] == ["train", "--resume", str(to.uniform), "--env-steps", "512"]
+
+
+def test_what_runs_beside_a_stage_ends_the_demo_where_it_fails(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def stage(*beside: str) -> Stage:
+        return Stage("x", "x", "x", ["info"], beside=beside)
+
+    assert run_demo([stage("doctor", "--help")], lambda command: 0, say=SILENT) == 0
+    missing = stage("info", str(tmp_path / "nothing"))
+    assert run_demo([missing], lambda command: 0, say=SILENT) == 2
+    assert "nothing" in capfd.readouterr().err
+    # What is beside one that fails does not go on.
+    assert run_demo([missing], lambda command: 130, say=SILENT) == 130
 
 
 def test_an_unexpected_exit_code_stops_the_demo(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from support.paths import ROOT
 
 from restock import cli
-from restock.cli.start import story
+from restock.cli.start import stages, story
 from restock.cli.start.stages import Settings
 from restock.replay.panel.panel import Panel
 from restock.train.run.kept_evaluations import FILE
@@ -93,6 +93,12 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
     assert slip["planner"] == rare["planner"]
     assert easy_row["planner"].startswith("2 of 2 [")
     assert easy_row["logs alone"] == ""
+    assert "fed uniformly" not in slip
+    uniform = stages.fed_uniformly(to)
+    write(to.run, [*after, *easy, *(driven(uniform, "wheel_slip", n < 2, n) for n in range(4))])
+    beside = story.before_and_after(to)[1]
+    assert beside["fed uniformly"].startswith("2 of 4 [")
+    assert list(beside)[1:] == ["logs alone", "fed uniformly", "fine-tuned", "planner"]
 
 
 def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:

@@ -6,11 +6,15 @@ a user could type; the demo runs the very same code.
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -24,16 +28,18 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 MARKER = ".restock-demo"
+LAST_LINES = 20  # of what a command beside another says, where it fails
 
 
 @dataclass
 class DemoCommand:
     """Run every stage on sample_logs/, explain each, and end with what came of it and a report.
 
-    Takes recordings through info, ingest, sql, audit, mix, train, eval and report: at most five
+    Takes recordings through info, ingest, sql, audit, mix, train, eval and report: about five
     minutes on two cores. Every stage shows its command, so that you can run it on
-    your own recordings. At the end stand the policy before and after fine-tuning, the shelves
-    before and after mixing, and one rare event from its message to an update.
+    your own recordings. At the end stand the policy before and after fine-tuning, one that was fed
+    uniformly, the shelves before and after mixing, and one rare event from its message to an
+    update.
 
     Example: `restock demo --out build/demo`
     """
@@ -45,8 +51,8 @@ class DemoCommand:
     profile: str | None = None
     """How their topics become signals: a profile that comes with Restock, or a TOML file. Default:
     that of the simulated robot (`restock start` proposes one for another robot)."""
-    seconds: float = 150.0
-    """How long to train."""
+    seconds: float = 200.0
+    """How long to train: two policies at the same time, by quotas and uniformly fed."""
     episodes: int = 20
     """Evaluation episodes per kind, policy and perturbation."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -146,10 +152,12 @@ def plan_of(to: Settings) -> list[Stage]:
         stages.coverage(to),
         stages.audit(to),
         stages.mix(to),
+        stages.mix_uniform(to),
         stages.train_on_logs(to),
-        stages.train(to),
+        stages.train_beside_uniform(to),
+        stages.even_out(to),
         stages.evaluate_logs_alone(to),
-        stages.evaluate(to),
+        stages.evaluate_beside_uniform(to),
         stages.report(to),
     ]
 
@@ -162,11 +170,19 @@ def run_demo(
     for number, stage in enumerate(plan, start=1):
         say(f"\n[bold]{number}/{len(plan)}  {stage.title}[/bold]")
         say(f"[dim]{stage.why}[/dim]")
+        if stage.decided is not None:
+            command = stage.decided()
+            if command is None:
+                say("[dim]They have: nothing is to be done.[/dim]")
+                continue
+            stage = replace(stage, command=command)
         say(f"[cyan]$ {escape(stage.line())}[/cyan]\n")
         sys.stdout.flush()
         started = time.monotonic()
-        code = dispatch(stage.command)
-        sys.stdout.flush()
+        with _beside(stage, say) as other:
+            code = dispatch(stage.command)
+            sys.stdout.flush()
+            code = code if code not in stage.expected else other() or code
         if code not in stage.expected:
             return code
         if code:
@@ -174,6 +190,39 @@ def run_demo(
         say(f"[dim]{time.monotonic() - started:.1f} s[/dim]")
     say(f"\n[bold]Done in {time.monotonic() - began:.0f} s.[/bold]")
     return int(ExitCode.OK)
+
+
+@contextmanager
+def _beside(stage: Stage, say: Callable[[str], None]) -> Iterator[Callable[[], int]]:
+    """Run a stage's other command in a process of its own; yields what waits for its exit code.
+
+    What it says is shown where it fails. It does not outlive the block.
+    """
+    if not stage.beside:
+        yield lambda: int(ExitCode.OK)
+        return
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # beside another, each has a core
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "restock", *stage.beside],
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            env=environment,
+        )
+
+        def wait() -> int:
+            if code := process.wait():
+                said.seek(0)
+                say(f"[red]beside it: {escape(stage.line().splitlines()[0])}[/red]")
+                sys.stderr.write("".join(said.readlines()[-LAST_LINES:]))
+            return code
+
+        try:
+            yield wait
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
 
 
 def find_logs() -> Path | None:

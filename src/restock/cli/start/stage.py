@@ -31,10 +31,14 @@ class Stage:
     outcome: Callable[[Document], list[str]] = nothing  # in a line or two
     shows_progress: bool = False  # it takes minutes
     resume: tuple[str, ...] = ()  # the command that goes on where it was interrupted
+    beside: tuple[str, ...] = ()  # of `restock demo`: a command that runs at the same time
+    # Of `restock demo`: the command, where that depends on what came before; None: not needed.
+    decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
-        """The command, to be copied."""
-        return f"restock {shlex.join(self.command)}"
+        """The command, to be copied; beside another, where two run at the same time."""
+        beside = f"restock {shlex.join(self.beside)} &\n" if self.beside else ""
+        return f"{beside}restock {shlex.join(self.command)}"
 
 
 @dataclass(frozen=True)

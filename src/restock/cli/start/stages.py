@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from restock.cli.start import outcomes
@@ -50,6 +50,15 @@ class Settings:
     def logs_alone(self) -> Path:
         """The run that never drives: what fine-tuning is compared with."""
         return self.out / "logs-alone"
+
+    @property
+    def uniform_panel(self) -> Path:
+        return self.out / "panel-uniform"
+
+    @property
+    def uniform(self) -> Path:
+        """The run that is fed the logs and the twin's missions as they come."""
+        return self.out / "uniform"
 
     @property
     def fitted(self) -> Path:
@@ -197,6 +206,17 @@ def mix(to: Settings) -> Stage:
     )
 
 
+def mix_uniform(to: Settings) -> Stage:
+    """The logs as they are, for what quotas are compared with."""
+    return Stage(
+        "mix-uniform",
+        "The same logs as they are, to compare with",
+        "Every row with the same probability: shelves only keep the books.",
+        ["mix", str(to.store), "--mixture", "uniform", "--out", str(to.uniform_panel)],
+        writes=(to.uniform_panel,),
+    )
+
+
 def floor(to: Settings) -> Stage:
     """The user's floor for the twin: their map, else scans, else the way that was driven."""
     picture = to.out / "floor.png"
@@ -266,6 +286,54 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
     )
 
 
+def train_beside_uniform(to: Settings) -> Stage:
+    """As `train`, and at the same time a policy that differs in what it is fed alone."""
+    fed = train(to)
+    plain = [setting for setting in to.train if not setting.startswith("practice.")]
+    return replace(
+        fed,
+        title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
+        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same network, settings and"
+        " seed. Of the first, half of each batch comes from the logs by quotas, half is fresh, of"
+        " missions that go wrong more often; the other is fed logs and missions as they come. Q"
+        " chooses among what the twin's operator finds plausible. Every row is recorded.",
+        beside=(
+            *("train", "--panel", str(to.uniform_panel), "--out", str(to.uniform)),
+            *("--seconds", f"{to.seconds:g}", "--device", to.device),
+            *(word for setting in plain for word in ("--set", setting)),
+        ),
+    )
+
+
+def even_out(to: Settings) -> Stage:
+    """As many steps for both: a comparison of feeds takes everything else alike."""
+
+    def decided() -> list[str] | None:
+        from restock.train.run.run import Run
+
+        steps = {
+            path: max(Run.open(path).table("progress")["env_steps"].to_pylist(), default=0)
+            for path in (to.run, to.uniform)
+        }
+        behind, ahead = sorted(steps, key=lambda path: steps[path])
+        if steps[behind] == steps[ahead]:
+            return None
+        longest_s = f"{10 * to.seconds + 600:g}"  # the steps end it
+        return [
+            *("train", "--resume", str(behind), "--env-steps", str(steps[ahead])),
+            *("--seconds", longest_s),
+        ]
+
+    return Stage(
+        "even-out",
+        "As many steps for both",
+        "The one that has driven less goes on until both have made the same number of steps.",
+        ["train", "--resume", str(to.uniform), "--env-steps", "AS_THE_OTHER"],
+        shows_progress=True,
+        decided=decided,
+    )
+
+
 def train_on_logs(to: Settings) -> Stage:
     """The policy before fine-tuning: of the same panel, and never in the twin."""
     settings = ("env.twin=false", "teacher.source=none", f"schedule.offline_updates={UPDATES}")
@@ -292,6 +360,23 @@ def evaluate_logs_alone(to: Settings) -> Stage:
             *("--policies", "agent", "--perturbations", "none"),
         ],
     )
+
+
+def evaluate_beside_uniform(to: Settings) -> Stage:
+    """As `evaluate`, beside the policy that was fed uniformly."""
+    alone = evaluate(to)
+    policies = f"agent,{fed_uniformly(to)},planner,random"
+    return replace(
+        alone,
+        why="The kept checkpoint, the policy fed uniformly, the scripted planner and a random"
+        " policy, clean and with less friction and more latency than in training.",
+        command=[*alone.command, "--policies", policies],
+    )
+
+
+def fed_uniformly(to: Settings) -> str:
+    """The policy that was fed uniformly, as evaluations name it."""
+    return f"run:{to.uniform}"
 
 
 def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from restock.cli.start.stages import Settings
+from restock.cli.start.stages import Settings, fed_uniformly
 from restock.stats import wilson
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ a learner hardly sees them.
   2. Rare rows get shelves of their own; every batch is filled from all shelves.
   3. A network learns from the logs alone: the policy before fine-tuning.
   4. Another goes on in a simulation of the robot, the twin: the one after.
-  5. Both drive the same missions as the scripted planner of the robot.
+  5. A third goes on as well, fed uniformly: logs and missions as they come.
+  6. All drive the same missions as the scripted planner of the robot.
 
 At the end: before and after, the shelves before and after, one rare event
 followed from the recording's message to the update that learnt from it, and
@@ -39,7 +40,8 @@ RARE = "all rare ones"
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:
-    """Per kind of mission, how many succeeded before and after fine-tuning, and the planner's.
+    """Per kind of mission, how many succeeded before and after fine-tuning, by quotas and fed
+    uniformly, and the planner's.
 
     On the floor as it was trained on. Empty where the task has no goal: nothing succeeds or fails.
     """
@@ -54,10 +56,13 @@ def before_and_after(to: Settings) -> list[dict[str, str]]:
         ]
         for name, table, policy in (
             ("logs alone", before, "agent"),
+            ("fed uniformly", after, fed_uniformly(to)),
             ("fine-tuned", after, "agent"),
             ("planner", after, "planner"),
         )
     }
+    if not driven["fed uniformly"]:
+        del driven["fed uniformly"]
     if any(row["success"] is None for rows in driven.values() for row in rows):
         return []
     kinds = sorted(
@@ -84,14 +89,23 @@ def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
 
 
 def trained(to: Settings) -> str:
-    """How far fine-tuning came, in a sentence."""
+    """How far fine-tuning came, and what was fed otherwise."""
     from restock.train.run.run import Run
 
     steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
-    return (
-        f"Fine-tuned means {max(steps, default=0):,} steps in the twin here;"
-        " docs/learning.md has what more give."
-    )
+    most = max(steps, default=0)
+    lines = [f"Fine-tuned means {most:,} steps in the twin here; docs/learning.md has more."]
+    if not most:
+        lines = ["Time was up before anything was driven: more --seconds fine-tune it."]
+    if to.uniform.is_dir():
+        lines += [
+            "Fed uniformly has the same network, settings, seed and number of steps, and logs",
+            "and missions as they come: what is compared are feeds, not methods, and so",
+            f"`restock compare {to.uniform} {to.run}` refuses",
+            "(--treatment mixture says that feeds are meant). One seed each is one draw:",
+            "docs/evidence.md has ten.",
+        ]
+    return "\n".join(lines)
 
 
 def shelves(panel: Path) -> list[str]:
