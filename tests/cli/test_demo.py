@@ -19,6 +19,7 @@ from restock.cli.start.stages import Settings
 from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
+from restock.train.run.run import FORMAT
 
 SILENT = lambda message: None  # noqa: E731
 
@@ -57,7 +58,7 @@ def test_the_run_that_is_behind_goes_on_until_both_have_driven_as_much(tmp_path:
     def driven(run: int, uniform: int) -> list[str] | None:
         for path, steps in ((to.run, run), (to.uniform, uniform)):
             path.mkdir(exist_ok=True)
-            (path / "config.json").write_text("{}")
+            (path / "config.json").write_text(json.dumps({"format": FORMAT}))
             table = pa.table({"env_steps": [0, steps]})
             pq.write_table(table, path / "progress.parquet")
         decided = stages.even_out(to).decided
