@@ -57,7 +57,7 @@ class Settings:
 
     @property
     def uniform(self) -> Path:
-        """The run that is fed the logs and the twin's missions as they come."""
+        """The run that is fed the logs as they come."""
         return self.out / "uniform"
 
     @property
@@ -289,14 +289,13 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
 def train_beside_uniform(to: Settings) -> Stage:
     """As `train`, and at the same time a policy that differs in what it is fed alone."""
     fed = train(to)
-    plain = [setting for setting in to.train if not setting.startswith("practice.")]
     return replace(
         fed,
         title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
-        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same network, settings and"
-        " seed. Of the first, half of each batch comes from the logs by quotas, half is fresh, of"
-        " missions that go wrong more often; the other is fed logs and missions as they come. Q"
-        " chooses among what the twin's operator finds plausible. Every row is recorded.",
+        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed. Half"
+        " of each batch comes from the logs, of the first by quotas, of the other uniformly; half"
+        " is fresh, of missions that go wrong more often. Q chooses among what the twin's operator"
+        " finds plausible. Every row is recorded.",
         beside=(
             *("train", "--panel", str(to.uniform_panel), "--out", str(to.uniform)),
             *("--seconds", f"{to.seconds:g}", "--device", to.device),

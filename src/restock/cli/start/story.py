@@ -28,7 +28,7 @@ a learner hardly sees them.
   2. Rare rows get shelves of their own; every batch is filled from all shelves.
   3. A network learns from the logs alone: the policy before fine-tuning.
   4. Another goes on in a simulation of the robot, the twin: the one after.
-  5. A third goes on as well, fed uniformly: logs and missions as they come.
+  5. A third goes on as well, fed uniformly: with the logs as they are.
   6. All drive the same missions as the scripted planner of the robot.
 
 At the end: before and after, the shelves before and after, one rare event
@@ -99,8 +99,8 @@ def trained(to: Settings) -> str:
         lines = ["Time was up before anything was driven: more --seconds fine-tune it."]
     if to.uniform.is_dir():
         lines += [
-            "Fed uniformly has the same network, settings, seed and number of steps, and logs",
-            "and missions as they come: what is compared are feeds, not methods, and so",
+            "Fed uniformly has the same network, settings, seed and number of steps, and every",
+            "row of the logs alike: what is compared are feeds, not methods, and so",
             f"`restock compare {to.uniform} {to.run}` refuses",
             "(--treatment mixture says that feeds are meant). One seed each is one draw:",
             "docs/evidence.md has ten.",
