@@ -292,14 +292,14 @@ def train_beside_uniform(to: Settings) -> Stage:
     return replace(
         fed,
         title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
-        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed. Half"
-        " of each batch comes from the logs, of the first by quotas, of the other uniformly; half"
-        " is fresh, of missions that go wrong more often. Q chooses among what the twin's operator"
-        " finds plausible. Every row is recorded.",
+        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed."
+        " Half of each batch comes from the logs, of the first by quotas, of the other uniformly;"
+        " half is fresh, of missions that go wrong more often. Q chooses among what the twin's"
+        " operator finds plausible. Every row is recorded.",
         beside=(
             *("train", "--panel", str(to.uniform_panel), "--out", str(to.uniform)),
             *("--seconds", f"{to.seconds:g}", "--device", to.device),
-            *(word for setting in plain for word in ("--set", setting)),
+            *(word for setting in to.train for word in ("--set", setting)),
         ),
     )
 
