@@ -74,7 +74,7 @@ class ClockChoice:
         streamed = middle is not None and gaps.mean_s * pace <= 2 * middle < 2 * STEADY_S[0]
         usual = (middle if steady or streamed else EVENTS_S) or EVENTS_S
         least = FASTEST_S if steady else max(FASTEST_S, gaps.sensor_s * pace)
-        period = round(float(np.clip(max(usual, least), FASTEST_S, SLOWEST_S)), 2)
+        period = drivable(float(np.clip(max(usual, least), FASTEST_S, SLOWEST_S)))
         driving = gaps.driving_s * pace
         return cls(
             alignment,
@@ -92,6 +92,15 @@ class ClockChoice:
     def at_a_rate(self) -> ClockChoice:
         """A tick every period instead of one a command."""
         return replace(self, steps="rate", max_gap_s=max(0.5, _up(2.5 * self.period_s)))
+
+
+def drivable(period_s: float) -> float:
+    """The nearest control period that the twin can drive, which is not every hundredth.
+
+    It drives a period in equal parts of a tenth at most, each some hundredths.
+    """
+    parts = int(np.ceil(round(period_s * 10, 6)))
+    return round(round(period_s * 100 / parts) * parts / 100, 2)
 
 
 def _up(seconds: float) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.driven.command_hold import CommandHold, limit_of
 from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.footprint import Footprint
@@ -193,7 +194,7 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     usable = [one for one in fullest if _fullness(one)[0] == _fullness(fullest[0])[0]]
     periods = [one.clock.period_s for one in usable]
     if max(periods) > SAME_PACE * min(periods):
-        middle = round(float(np.median(periods)), 2)
+        middle = drivable(float(np.median(periods)))
         rate = f"a tick every period: the drives' commands are {min(periods):g} to"
         comments = (f"{rate} {max(periods):g} s apart.",)
         usable = [

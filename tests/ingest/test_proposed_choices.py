@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,13 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.propose.clock_choice import drivable
 from restock.ingest.propose.driven.command_hold import CommandHold, command_hold
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.scan import Body
+from restock.ingest.task.task import Task
+from restock.train.twin.physics.simulation import BLOCK_S, _block_s
 
 PACES = [0.5, 0.9, 0.97, 1.0, 1.1]
 
@@ -204,3 +209,17 @@ def test_a_small_robots_rows_are_not_all_recovery(tmp_path, capsys):
     assert main(["profile", "new", bag, "--out", str(file)]) == 0
     assert main(["profile", "check", str(file), bag, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["outcome"]["conditions"]["recovery"] <= 1  # was 124
+
+
+def test_every_proposed_period_is_one_that_the_twin_can_drive() -> None:
+    """Of 145 s of a fra2mo, .13 s were proposed, and then no twin could be built."""
+    for period_s in np.arange(0.08, 0.5001, 0.001):
+        proposed = drivable(float(period_s))
+        assert proposed == pytest.approx(period_s, abs=0.025)
+        task = Task(
+            body=Body(0.6, 0.5), actions=((0.0, 0.0), (0.4, 0.0)), control_period_s=proposed
+        )
+        blocks = math.ceil(proposed / BLOCK_S - 1e-9)
+        assert _block_s(task, 0.01, blocks) * blocks == pytest.approx(proposed)
+    for kept in (0.08, 0.1, 0.12, 0.2, 0.3, 0.5):
+        assert drivable(kept) == kept

@@ -21,10 +21,11 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Zone
 from restock.ingest.propose.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
+from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_file import read_floor
-from restock.train.twin.floors.occupancy_grid import OccupancyGrid, out_of_frame
+from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.survey.picture import LONG_SIDE, MARGIN, PLACE, WAY, write_picture
 from restock.train.twin.survey.survey import survey
@@ -336,3 +337,19 @@ def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
 
 class _Zones(Checked, frozen=True):
     zone: list[Zone]
+
+
+def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could() -> None:
+    """Its places are nearer to each other than any mission: of the room that it saw, some are."""
+    cells = np.full((120, 80), 100, np.int8)
+    cells[2:-2, 2:-2] = 0
+    around = np.array([(3.65, 2.65), (3.75, 2.65), (3.75, 2.75)])  # in three squares
+    made = floor_of_grid(
+        OccupancyGrid(cells, 0.1), name="hall", where="a test", room_m=0.15, turn_m=0.2,
+        visited_m=around,
+    )  # fmt: skip
+    floor = made.floor
+    assert any("missions start there and also go to" in note for note in made.notes)
+    assert len(floor.goals_m) > 20
+    assert all(np.hypot(*(around - start).T).min() < 0.3 for start in floor.starts_m)
+    assert "nominal" in describe_floor(floor)["episodes"]

@@ -76,22 +76,31 @@ def with_missions(
 ) -> Warehouse:
     """The floor with the lengths of its missions; where the places that the robot was at are all
     near to each other, missions go from them to others, too."""
-    made = missions_way(connected(floor))
-    if made.way_m[1] >= NEAR_M or not elsewhere:
+    near = connected(floor)
+    ways = _ways(near)
+    made = _long_as(near, *ways)
+    longest_m = made.way_m[1] if len(ways[0]) else 0.0
+    if longest_m >= NEAR_M or not elsewhere:
         return made
     step = max(len(elsewhere) // PLACES, 1)
     wider = missions_way(connected(replace(floor, goals_m=floor.goals_m + elsewhere[::step])))
-    if wider.way_m[1] < 1.5 * made.way_m[1] or not wider.starts_m:
+    if wider.way_m[1] < 1.5 * longest_m or not wider.starts_m:
         return made
     notes.append(
-        f"the places that the robot was at are at most {made.way_m[1]:.1f} m apart: missions start"
-        f" there and also go to {len(elsewhere[::step])} places where it could have been"
+        f"the places that the robot was at are at most {longest_m or NEAREST_M:.1f} m apart:"
+        f" missions start there and also go to {len(elsewhere[::step])} places where it could have"
+        " been"
     )
     return wider
 
 
 def missions_way(floor: Warehouse) -> Warehouse:
     """The floor with lengths of missions that its places allow: the usual ones where they do."""
+    return _long_as(floor, *_ways(floor))
+
+
+def _ways(floor: Warehouse) -> tuple[F64, F64]:
+    """Lengths and costs (N,) in metres of ways between its places, of those that are missions."""
     planner = Planner(floor, trees_kept=1)
     starts = [segment.area.center for segment in floor.starts]
     starts = starts[:: max(len(starts) // SAMPLE, 1)]
@@ -103,9 +112,13 @@ def missions_way(floor: Warehouse) -> Warehouse:
                 way = planner.plan(*start, (x, y))
                 costs.append(away)
                 lengths.append(float(np.hypot(*np.diff(way, axis=0).T).sum()))
-    if not lengths:
+    return np.array(lengths), np.array(costs)
+
+
+def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
+    """The floor with missions of these lengths, where the usual ones are not among them."""
+    if not len(length):
         return floor
-    length, cost = np.array(lengths), np.array(costs)
     low, high = WAY_M
     usual = (length >= low) & (length <= high) & (cost <= 1.3 * high)  # as episodes are drawn
     if usual.mean() >= OFTEN:
