@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
-from restock.train.twin.env.operator_policy import Operator
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Task
+from restock.train.twin.env.operator_policy import Operator, harsh_actions
 from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
-def success(policy: BehaviourPolicy, kind: str, count: int = 24) -> dict[str, float]:
+def success(
+    policy: BehaviourPolicy, kind: str, count: int = 24, task: Task | None = None
+) -> dict[str, float]:
     """Success by block kind ('none' outside blocked aisles), over fixed episodes."""
-    env = WarehouseVectorEnv(count)
+    env = WarehouseVectorEnv(count, task=task)
     env.set_episodes([EpisodeSpec(kind, 500 + index) for index in range(count)])
     observation, _ = env.reset(seed=0)
     result: dict[int, tuple[str, bool]] = {}
@@ -39,6 +44,18 @@ def test_the_planner_is_good_in_nominal_aisles_and_stuck_in_partly_blocked_ones(
 def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
     # 24 episodes: 4 to 10 points of noise below what benchmarks/drivers.py asks over 100.
     assert min(success(Operator(), kind).values()) >= 0.8
+
+
+def test_the_operator_of_a_fast_robot_comes_over_slippery_floor() -> None:
+    """None of its actions is as gentle as the operator would like: it takes the gentlest."""
+    task = load_profile("warehouse_amr").task
+    fast = [(0, 0), (0.5, 0), (1, 0), (0.8, 0.6), (0.8, -0.6), (0, 1.2), (0, -1.2), (-0.4, 0)]
+    actions = tuple((float(v), float(w)) for v, w in fast)
+    assert harsh_actions(np.array(actions)).tolist() == [False, False, *[True] * 5, False]
+    usual = harsh_actions(np.array(task.actions))
+    assert usual.tolist() == [abs(v) > 0.45 or abs(w) > 1.0 for v, w in task.actions]
+    task = msgspec.structs.replace(task, actions=actions)
+    assert success(Operator(), "wheel_slip", 6, task=task)["none"] >= 0.5
 
 
 def test_random_driving_hardly_ever_arrives() -> None:

@@ -30,9 +30,22 @@ ROOMY_M = 0.12
 PERSON_MARGIN_M = 0.4
 STANDING_MARGIN_M = 0.2
 CAREFUL_M = 1.8  # from the robot's middle to a person's
-GENTLE_MPS = 0.45
+GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
 PATIENCE_STEPS = 20  # with somebody in the way; then it moves about, to be let pass
+
+
+def harsh_actions(table: F64) -> Bools:
+    """Which actions (A, 2), in m/s and rad/s, are none for slippery floor: the faster ones.
+
+    The slowest ahead and the slowest turn of a fast robot are taken all the same: who drives no
+    other would never come over it.
+    """
+    speed, turn = np.abs(table).T
+    ahead = table[:, 0][table[:, 0] > 0]
+    gentle_mps = max(GENTLE_MPS, float(ahead.min()) if len(ahead) else 0.0)
+    gentle_radps = max(GENTLE_RADPS, float(turn[turn > 0].min()) if (turn > 0).any() else 0.0)
+    return np.asarray((speed > gentle_mps) | (turn > gentle_radps), np.bool_)
 
 
 class Operator(SoftPolicy, Stateful):
@@ -79,8 +92,7 @@ class Operator(SoftPolicy, Stateful):
         hits = (np.minimum(room, people) < TOUCH_M).any(axis=2)
         score -= np.where(hits, 20.0 + 5.0 * (HORIZON - when), 0.0)
         icy = self._icy(env, pose)
-        harsh = (np.abs(table[:, 0]) > GENTLE_MPS) | (np.abs(table[:, 1]) > 1.0)
-        score -= np.where(icy[:, None] & harsh[None, :], 3.0, 0.0)
+        score -= np.where(icy[:, None] & harsh_actions(table)[None, :], 3.0, 0.0)
         score += 1.0 * arrived.any(axis=2)
         alone = people.min(axis=(1, 2)) > 0.6
         score[alone, 0] -= 0.2  # nobody to wait for
