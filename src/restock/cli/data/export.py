@@ -59,7 +59,8 @@ class ExportCommand:
             else:
                 output.stdout().print(
                     f"policy {made['version']} of task {made['task_hash']} -> {made['path']}"
-                    f" ({made['bytes']:,} bytes)"
+                    f" ({made['bytes']:,} bytes)",
+                    markup=False,
                 )
             return
         from restock.replay.export.dataset import export_dataset
@@ -81,7 +82,7 @@ class ExportCommand:
             output.print_json(document)
             return
         for line in _summary(document):
-            output.stdout().print(line)
+            output.stdout().print(line, markup=False)
 
     def _cameras(self) -> list[str] | None:
         """As `export_dataset` takes them."""

@@ -143,7 +143,7 @@ def _print(answer: dict[str, Any]) -> None:
             + f": enough for each gap with {answer['confidence']:.0%}"
         )
     if "missions_file" in answer:
-        output.stdout().print(f"-> {answer['missions_file']}")
+        output.stdout().print(f"-> {answer['missions_file']}", markup=False)
 
 
 def _table(title: str, rows: list[dict[str, Any]]) -> None:
