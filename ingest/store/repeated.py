@@ -3,7 +3,8 @@
 Ids come from bytes, so a salvaged part, another cut or a drive that was replayed and recorded again
 has another one. Rows are compared by what they hold. Beside each manifest lies a sketch of its
 recording, the smallest hashes of its rows (bottom-k, Broder 1997), so that an ingest reads the rows
-of those recordings alone that look alike. The audit `repeated_steps` finds the same in SQL.
+of those recordings alone that look alike. The audit `repeated_steps` finds the same in SQL, of all
+rows: by the hashes in the manifests, or where an older Restock wrote one, by the rows.
 """
 
 from __future__ import annotations
@@ -58,9 +59,9 @@ class Sketch:
     hashes: Hashes
 
 
-def sketch(rows: pa.Table) -> bytes:
-    """The sketch of a recording's transitions, for `SKETCH`."""
-    return distinctive_hashes(rows)[:SKETCH_HASHES].astype("<u8").tobytes().hex().encode()
+def sketch(hashes: Hashes) -> bytes:
+    """The sketch of a recording's `distinctive` hashes, for `SKETCH`."""
+    return hashes[:SKETCH_HASHES].astype("<u8").tobytes().hex().encode()
 
 
 def read_sketch(metadata: dict[bytes, bytes] | None) -> Hashes:
@@ -110,8 +111,8 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive |
     One constant shift between the stamps of the two is taken out; rows further apart than half a
     control period do not count.
     """
-    mine, at = _distinctive(row_hashes(rows))
-    theirs, there = _distinctive(row_hashes(other))
+    mine, at = distinctive(rows)
+    theirs, there = distinctive(other)
     _, here, where = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
     if not len(here):
         return None
@@ -140,7 +141,7 @@ def find_repeat(
 
     `read(recording_id, ingest_id)` gives the rows of one whose sketch looks alike.
     """
-    mine = distinctive_hashes(rows)
+    mine, _ = distinctive(rows)
     found = []
     for one in sketches:
         if looks_alike(mine, one):
@@ -154,14 +155,10 @@ def find_repeat(
     )
 
 
-def distinctive_hashes(rows: pa.Table) -> Hashes:
-    """The hashes of the rows that look like no other of their recording, ascending."""
-    return _distinctive(row_hashes(rows))[0]
-
-
-def _distinctive(hashes: Hashes) -> tuple[Hashes, Ints]:
-    """Hashes that occur once, ascending, and their rows. A robot that stands proves nothing."""
-    found, first, counts = np.unique(hashes, return_index=True, return_counts=True)
+def distinctive(rows: pa.Table) -> tuple[Hashes, Ints]:
+    """The hashes of the rows that look like no other of their recording, ascending, and which rows
+    they are of. A robot that stands proves nothing."""
+    found, first, counts = np.unique(row_hashes(rows), return_index=True, return_counts=True)
     once: Bools = counts == 1
     return found[once], first[once].astype(np.int64)
 

@@ -1,8 +1,8 @@
 """What is kept of a recording in its manifest, so that common questions need not scan its rows.
 
 Its episodes, how many rows and episodes each cell of coverage has, what drift compares, the rows
-that are flawed, the ends of its episodes and its sketch. Every writer of rows writes them, so they
-are true for as long as the rows are there.
+that are flawed, what its rows hold in one number each, the ends of its episodes and its sketch.
+Every writer of rows writes them, so they are true for as long as the rows are there.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from importlib.resources.abc import Traversable
 from typing import Any
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 
-from restock.ingest.store.repeated import sketch
+from restock.ingest.store.repeated import distinctive, sketch
 from restock.ingest.task.schema import COLUMNS
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
-VERSION = 2  # of summary.sql: a summary by another one is not used
+VERSION = 3  # of summary.sql: a summary by another one is not used
 
 
 def _rows_of(**columns: pa.DataType) -> pa.DataType:
@@ -29,7 +30,7 @@ def _rows_of(**columns: pa.DataType) -> pa.DataType:
 
 
 _TEXT, _TEXTS, _COUNT, _NUMBER = pa.string(), pa.list_(pa.string()), pa.int64(), pa.float64()
-TABLES = {  # of summary.sql, each a column
+TABLES = {  # of summary.sql, and `distinctive_rows`; each a column
     "episode_rows": _rows_of(
         episode_id=_TEXT,
         episode_index=pa.int32(),
@@ -85,6 +86,11 @@ TABLES = {  # of summary.sql, each a column
         is_null=pa.bool_(),
         is_not_finite=pa.bool_(),
     ),
+    "zone_steps": _rows_of(episode_id=_TEXT, zone=_TEXT, start_ns=_COUNT, steps=_COUNT),
+    "condition_steps": _rows_of(
+        episode_id=_TEXT, zone=_TEXT, condition=_TEXT, steps=_COUNT, events=_COUNT
+    ),
+    "distinctive_rows": _rows_of(transition_id=_COUNT, content=_COUNT),
 }
 # Beside the columns of `recording_schema`; null in manifests of an older store.
 SUMMARY_SCHEMA = pa.schema(
@@ -99,16 +105,26 @@ SUMMARY_SCHEMA = pa.schema(
 
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     """A manifest row with the summary of its recording's rows."""
+    hashes, at = distinctive(rows)
     values: dict[str, Any] = {
         "summary_version": VERSION,
-        "sketch": sketch(rows).decode(),
+        "sketch": sketch(hashes).decode(),
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
     with _database().cursor() as connection:  # with temporary tables of its own
         connection.register("transitions", _complete(rows))
         connection.register("recordings", manifest)
         connection.execute(_definitions())
-        tables = {name: connection.table(name).to_arrow_table() for name in TABLES}
+        in_order = np.argsort(at)
+        tables = {
+            "distinctive_rows": pa.table(
+                {
+                    "transition_id": rows["transition_id"].take(pa.array(at[in_order])),
+                    "content": hashes[in_order].view(np.int64),
+                }
+            )
+        }
+        tables |= {n: connection.table(n).to_arrow_table() for n in TABLES.keys() - tables.keys()}
     for field in SUMMARY_SCHEMA:
         column = (
             _listed(tables[field.name], field.type)

@@ -87,3 +87,11 @@ ORDER BY episode_id, signal;
 CREATE TEMP TABLE flawed_rows AS
 -- include: flawed_rows.sql
 ORDER BY transition_id;
+
+CREATE TEMP TABLE zone_steps AS
+-- include: zone_steps.sql
+ORDER BY ALL;
+
+CREATE TEMP TABLE condition_steps AS
+-- include: condition_steps.sql
+ORDER BY ALL;

@@ -56,6 +56,7 @@ RETENTION_HOURS = 7 * 24
 ROW_GROUP_ROWS = 32_768
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
 _JITTER = random.SystemRandom()
+_SKETCHES: dict[tuple[Location, str], Sketch] = {}  # by ingest, which never changes; 2 kB each
 T = TypeVar("T")
 
 
@@ -173,19 +174,20 @@ class StoreWriter:
             return None
         own = rows["recording_id"][0].as_py()
         others = [one for one in self.shown() if one.recording_id != own]
+        return find_repeat(rows, self._sketches(others), self.rows, period_s)
+
+    def _sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
+        """Their sketches, each read once: many recordings would read all others' as many times."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
+        new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]
         # What cannot be read is another recording's, which `restock sql` reports.
-        told = self.manifests(others, schema, skip=UNREADABLE).to_pylist()
-        sketches = [
-            Sketch(
-                one["recording_id"],
-                one["ingest_id"],
-                read_sketch({SKETCH: (one["sketch"] or "").encode()}),
-            )
-            for one in told
-        ]
-        return find_repeat(rows, sketches, self.rows, period_s)
+        for told in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
+            hashes = read_sketch({SKETCH: (told["sketch"] or "").encode()})
+            sketch = Sketch(told["recording_id"], told["ingest_id"], hashes)
+            _SKETCHES[self.path, sketch.ingest_id] = sketch
+        keys = [(self.path, one.ingest_id) for one in ingests]
+        return [_SKETCHES[key] for key in keys if key in _SKETCHES]
 
     def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
         """Write a recording's frames to a file of `frames`; returns how many they are.

@@ -118,6 +118,8 @@ def refuse_archives(
         MixtureError: a condition is far more frequent among the episodes of one than of the others.
     """
     said = list(mixture.sources.said.values())
+    if len(sources) < 2:
+        return
     met, of_all = zip(*(_episodes(source, len(strata)) for source in sources), strict=True)
     for number, source in enumerate(sources):
         others = [k for k, what in enumerate(said) if k != number and what in (None, "natural")]

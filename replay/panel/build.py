@@ -174,8 +174,7 @@ def write_panel(
         task_json = source.task_json(plan.task_hash)
         steps = SourceSteps(
             scratch,
-            source.connection,
-            len(plan.stratum),
+            plan.rows,
             random_probability=_random_probability(task_json),
             cut_at_off_policy=plan.mixture.cut_at_off_policy,
         )

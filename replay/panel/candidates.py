@@ -1,8 +1,12 @@
-"""The rows a mixture may choose from: what DuckDB says of each transition, as columns."""
+"""The rows a mixture may choose from: what DuckDB says of each transition, as columns.
+
+They are read as they come and put in order here: DuckDB would sort whole rows, text and all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import duckdb
 import numpy as np
@@ -12,7 +16,6 @@ import pyarrow.compute as pc
 from restock.arrays import Bools, Ints
 from restock.errors import ConfigError, MixtureError, StoreError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.panel.scratch import ORDER
 from restock.replay.panel.strata import ResolvedStratum
 
 META_COLUMNS = (
@@ -24,7 +27,7 @@ META_COLUMNS = (
 LATER = ("perturbation", "robot", "site")
 _TEXT = (
     *("recording_id", "episode_id", "condition", "zone", "behaviour_policy", "behaviour_version"),
-    *LATER,
+    *("task_hash", *LATER),
 )
 _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
 _CODED = pa.dictionary(pa.int32(), pa.string())
@@ -53,10 +56,10 @@ def read_candidates(
     """Every row of the connection's `transitions`, by recording, episode and step.
 
     META_COLUMNS, `task_hash`, `labelled`, `uncertain` (a condition is too near to call), and one
-    boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0`, `state_0` (of
-    the row's state alone) …, of a stratum of episodes the rows of the episode in which it holds
-    (int); text columns come as dictionaries; `store` (int) says which store a
-    row is from. Predicates see `conditions` as the mixture's `uncertain` has them.
+    boolean for each predicate of the mixture: `admitted`, `unsafe`, `stratum_0` …, and `state_0` …
+    where the row's state alone has one of its own; text columns come as dictionaries, in order of
+    appearance; `store` (int) says which store a row is from. Predicates see `conditions` as the
+    mixture's `uncertain` has them.
 
     Raises:
         ConfigError: a predicate that does not run; names it.
@@ -67,19 +70,11 @@ def read_candidates(
     predicates["unsafe"] = ("safety.unsafe", unsafe)
     for index, stratum in enumerate(strata):
         predicates[f"stratum_{index}"] = (f"stratum {stratum.name!r}", stratum.predicate)
-        state = stratum.state_predicate or stratum.predicate
-        predicates[f"state_{index}"] = (f"stratum {stratum.name!r}", state)
-    counted = {
-        f"{kind}_{index}"
-        for index, stratum in enumerate(strata)
-        for kind in ("stratum", "state")
-        if stratum.steps_of_episode
-    }
+        if stratum.state_predicate is not None:
+            state = (f"stratum {stratum.name!r}", stratum.state_predicate)
+            predicates[f"state_{index}"] = state
     tests = ", ".join(
-        f"coalesce(({sql}\n)::INTEGER, 0) AS {name}"
-        if name in counted
-        else f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}"
-        for name, (_, sql) in predicates.items()
+        f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
     )
     store = STORE_COLUMN if several_stores else "0"
     rows, has_uncertain = "transitions", "false"
@@ -88,18 +83,66 @@ def read_candidates(
         if mixture.uncertain == "nominal":
             rows = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
     query = (
-        f"SELECT {meta_columns(connection)}, task_hash, ({store})::INTEGER AS store,"
+        f"SELECT {meta_columns(connection)}, task_hash, episode_index, ({store})::TINYINT AS store,"
         " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
-        f" {has_uncertain} AS uncertain, {tests} FROM {rows} {ORDER}"
+        f" {has_uncertain} AS uncertain, {tests} FROM {rows}"
     )
     try:
-        # Text becomes codes batch by batch: whole columns of it would be most of the memory.
-        reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
-        table = pa.Table.from_batches([_encoded(batch) for batch in reader], _schema(reader.schema))
+        with any_order(connection):
+            # Text becomes codes batch by batch: whole columns of it would be most of the memory.
+            reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+            schema = _schema(reader.schema)
+            table = pa.Table.from_batches([_encoded(batch) for batch in reader], schema)
     except duckdb.Error as error:
         _blame(connection, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
-    return table.unify_dictionaries().combine_chunks()
+    return _in_order(table.unify_dictionaries())
+
+
+def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
+    """What has the rows of the connection's `transitions` as they lie, or more: reading them costs
+    less without what the view makes of them."""
+    views = connection.sql(_VIEWS).fetchall()
+    return "stored_transitions" if ("stored_transitions",) in views else "transitions"
+
+
+@contextmanager
+def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
+    """Rows may come as the threads that read them finish, for as long as the block runs."""
+    connection.execute("SET preserve_insertion_order = false")
+    try:
+        yield
+    finally:
+        connection.execute("RESET preserve_insertion_order")
+
+
+def _in_order(table: pa.Table) -> pa.Table:
+    """The rows by recording, episode and step; a column at a time, to hold one of them twice."""
+    recording = table["recording_id"].combine_chunks()
+    rank = np.empty(len(recording.dictionary), np.int64)
+    rank[pc.array_sort_indices(recording.dictionary).to_numpy()] = np.arange(len(rank))
+    keys = ("transition_id", "step_index", "episode_index")  # the id where all others are the same
+    parts = [table[name].combine_chunks().to_numpy() for name in keys]
+    order = pa.array(np.lexsort([*parts, rank[recording.indices.to_numpy()]]))
+    del recording, parts
+    columns = dict(zip(table.column_names, table.columns, strict=True))
+    del table, columns["episode_index"]
+    for name in list(columns):
+        column = columns.pop(name).combine_chunks().take(order)
+        columns[name] = _by_appearance(column) if name in _TEXT else column
+    return pa.table(columns)
+
+
+def _by_appearance(column: pa.DictionaryArray) -> pa.DictionaryArray:
+    """The same text with codes in the order of its first rows, whichever thread read them first."""
+    size, code = len(column.dictionary), column.indices.fill_null(-1).to_numpy()
+    first = np.full(size + 1, len(code))  # the last is of null
+    first[code[::-1]] = np.arange(len(code) - 1, -1, -1)
+    names = np.argsort(first[:size], kind="stable")
+    new = np.empty(size + 1, np.int32)
+    new[names] = np.arange(size)
+    indices = pa.array(new[code], mask=code < 0)
+    return pa.DictionaryArray.from_arrays(indices, column.dictionary.take(pa.array(names)))
 
 
 def _schema(schema: pa.Schema) -> pa.Schema:

@@ -16,7 +16,7 @@ from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
-from restock.replay.store.query import repeated_rows
+from restock.replay.store.query import install_repeated_rows
 
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.
@@ -99,7 +99,7 @@ def repeats_of(
     repeated = np.zeros(len(table), np.bool_)
     if not evaluation_split.any():
         return repeated
-    connection.execute(repeated_rows())
+    install_repeated_rows(connection)
     found = connection.sql(
         "SELECT transition_id, same_as_transition_id FROM repeated_rows(1)"
     ).to_arrow_table()

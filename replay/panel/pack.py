@@ -1,14 +1,15 @@
 """Packing: a plan's rows into one file of float32 rows, with metadata beside, in bounded memory.
 
-Whatever the size of the store, memory holds the plan and a batch: what must be known of every row
-lies on disk (`scratch`), rows are written through a memory map. Observations are read in the order
-in which the files have them and put where they belong, because sorting rows this wide would spill
-all of them to disk first.
+Whatever the size of the store, memory holds the plan and a batch: rows are written through a memory
+map, whose pages are given back. Observations are read in the order in which the files have them
+and put where they belong, because sorting rows this wide would spill all of them to disk first: a
+recording's rows lie together in both, so what is written together lies together.
 """
 
 from __future__ import annotations
 
 import hashlib
+import mmap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,14 @@ from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import row_columns, row_width
-from restock.replay.panel.candidates import meta_columns
+from restock.replay.panel.candidates import any_order, as_stored
 from restock.replay.panel.plan import PanelPlan
-from restock.replay.panel.scratch import BATCH_ROWS, ORDER, STRETCH, SourceSteps
+from restock.replay.panel.scratch import STRETCH, SourceSteps
 from restock.replay.panel.strata import NO_STRATUM
 
 ROW_GROUP_ROWS = 65_536
+BATCH_ROWS = 16_384  # of what stands beside the rows, in memory at a time
+KEPT_BYTES = 64 << 20  # of packed rows, in this process' memory before they are given back
 BATCH_BYTES = 4 << 20  # of observations, in memory at a time
 FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
@@ -101,7 +104,7 @@ class Packer:
 
         Raises PanelError where an observation or reward is not finite, or of another size.
         """
-        of_task = f"FROM transitions WHERE task_hash = '{self.plan.task_hash}'"
+        of_task = f"FROM {as_stored(self.connection)} WHERE task_hash = '{self.plan.task_hash}'"
         first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
         size = int(first[0][0])
         at_a_time = max(BATCH_BYTES // (8 * size), 1)
@@ -110,16 +113,16 @@ class Packer:
         shape = (len(self.chosen), row_width(size))
         rows = np.memmap(path, np.dtype("<f4"), "w+", shape=shape)
         places = self.steps.places()
-        filled = 0
-        # Rows may come as the threads that read them finish: each knows where it belongs.
-        self.connection.execute("SET preserve_insertion_order = false")
-        try:
+        filled = kept_bytes = 0
+        with any_order(self.connection):  # each row knows where it belongs
             for batch in self.connection.sql(query).to_arrow_reader(at_a_time):
                 place = places.of(batch.column("transition_id").to_numpy())
                 filled += self._write(rows, size, batch, place)
+                kept_bytes += len(batch) * rows.strides[0]
+                if kept_bytes > KEPT_BYTES:
+                    _give_back(rows)
+                    kept_bytes = 0
                 advance(len(batch))
-        finally:
-            self.connection.execute("RESET preserve_insertion_order")
         if filled != 2 * len(self.chosen):
             raise PanelError("the source changed while it was read", where=str(path.parent))
         rows.flush()
@@ -133,31 +136,33 @@ class Packer:
         target = np.searchsorted(self.chosen, place)
         packed = np.flatnonzero(_at(self.chosen, target) == place)
         target = target[packed]
-        observation = _matrix(batch.column("observation"), size)[packed]
+        observation = _chosen(_matrix(batch.column("observation"), size), packed)
         next_observation = _matrix(batch.column("next_observation"), size)
-        rows[target, part["observation"]] = observation
         horizon = self.last[target] - place[packed] + 1
         returns = np.zeros(len(packed))
         for ahead in range(int(horizon.max(initial=0))):
             reach = np.flatnonzero(horizon > ahead)
             reward = self.steps.reward[place[packed[reach]] + ahead]
             returns[reach] += self.mixture.discount**ahead * reward
-        rows[target, part["action"]] = batch.column("action").to_numpy()[packed, None]
-        rows[target, part["reward"]] = returns[:, None]
+        to = _span(target)
+        rows[to, part["observation"]] = observation
+        rows[to, part["action"]] = batch.column("action").to_numpy()[packed, None]
+        rows[to, part["reward"]] = returns[:, None]
         # Returns that end with a row of this batch take its next observation.
         first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
-        rows[ends, part["next_observation"]] = next_observation[source]
+        next_observation = _chosen(next_observation, source)
+        to = _span(ends)
+        rows[to, part["next_observation"]] = next_observation
         not_terminated = ~np.asarray(
             batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_
         )
         spanned = self.last[ends] - self.chosen[ends] + 1
-        rows[ends, part["discount"]] = (self.mixture.discount**spanned * not_terminated[source])[
+        rows[to, part["discount"]] = (self.mixture.discount**spanned * not_terminated[source])[
             :, None
         ]
-        fine = np.isfinite(observation).all(axis=1) & np.isfinite(returns)
-        if not fine.all() or not np.isfinite(next_observation[source]).all():
+        if not all(np.isfinite(one).all() for one in (observation, next_observation, returns)):
             raise PanelError(
                 "an observation or a reward is NaN or infinite, which no network survives",
                 where=f"recording {batch.column('recording_id')[0].as_py()}",
@@ -171,18 +176,11 @@ class Packer:
         to_go = None
         if self.mixture.return_to_go:
             to_go = self.steps.returns_to_go(self.mixture.discount)
-        columns = meta_columns(self.connection)
-        reader = self.connection.sql(f"SELECT {columns} FROM transitions {ORDER}").to_arrow_reader(
-            BATCH_ROWS
-        )
-        begin = at = 0
+        at = 0
         with _Table(meta) as kept, _Table(evaluation_split) as left:
-            for batch in reader:
-                end = begin + len(batch)
-                ids = batch.column("transition_id").to_numpy()
-                if not np.array_equal(ids, self.steps.ids[begin:end]):
-                    raise PanelError("the source changed while it was read", where=str(meta.parent))
-                table = _encoded(pa.Table.from_batches([batch]))
+            for begin in range(0, self.steps.rows, BATCH_ROWS):
+                table = _compact(self.plan.rows.slice(begin, BATCH_ROWS))
+                end = begin + len(table)
                 split = table.select(_SPLIT_COLUMNS).filter(
                     pa.array(self.plan.evaluation_split[begin:end])
                 )
@@ -208,7 +206,7 @@ class Packer:
                 for name, values in beside.items():
                     table = table.append_column(name, values)
                 kept.write(table)
-                begin, at = end, at + len(rows)
+                at += len(rows)
 
 
 class _Table:
@@ -240,12 +238,18 @@ class _Table:
             self._writer.write_table(table.unify_dictionaries())
 
 
-def _encoded(table: pa.Table) -> pa.Table:
-    """Text as dictionaries: there are few distinct values, and readers keep them as codes."""
+def _give_back(rows: NDArray[np.float32]) -> None:
+    """Take a memory map's pages out of this process' memory; the system writes them when it may."""
+    if isinstance(rows.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        rows.base.madvise(mmap.MADV_DONTNEED)
+
+
+def _compact(table: pa.Table) -> pa.Table:
+    """Text as codes of what these rows have alone: readers keep them so."""
     for place, field in enumerate(table.schema):
-        if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):
-            column = table.column(place).cast(_TEXT)
-            table = table.set_column(place, field.with_type(_TEXT), column)
+        if field.type == _TEXT:
+            column = table.column(place).cast(pa.string()).cast(_TEXT)
+            table = table.set_column(place, field, column)
     return table
 
 
@@ -256,6 +260,19 @@ def _matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
         raise PanelError(f"observations are not all of {size} entries; `restock audit` names them")
     matrix: NDArray[np.float32] = flat.reshape(len(column), size)
     return matrix
+
+
+def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:
+    """matrix[rows], without a copy where these are all of them, in order."""
+    whole = len(rows) == len(matrix) and np.array_equal(rows, np.arange(len(rows)))
+    return matrix if whole else matrix[rows]
+
+
+def _span(rows: Ints) -> Ints | slice:
+    """The same rows, as a slice where they lie one behind the other."""
+    if len(rows) and (np.diff(rows) == 1).all():
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
 
 
 def _at(values: Ints, place: Ints) -> Ints:

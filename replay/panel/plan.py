@@ -118,15 +118,14 @@ def plan_panel(
         table, measured = without_measured_actions(connection, table)
     task_hash = one_task(table)
     ids = table["transition_id"].to_numpy()
-    if len(np.unique(ids)) != len(ids):
+    in_order = np.sort(ids)
+    if twice := int((in_order[1:] == in_order[:-1]).sum()):
         raise StoreError(
-            f"{len(ids) - len(np.unique(ids))} transition ids occur twice",
+            f"{twice} transition ids occur twice",
             remedy="`restock audit` names them; ingest those recordings again",
         )
-    member, state = (
-        np.stack([_member(table, f"{kind}_{i}", s) for i, s in enumerate(strata)], axis=1)
-        for kind in ("stratum", "state")
-    )
+    member = _members(table, strata)
+    state = _members(table, strata, of_state=True)
     if mixture.unlabelled == "nominal":
         for index, named in enumerate(strata):
             if named.name == NOMINAL and named.rule.where is None:
@@ -171,12 +170,20 @@ def plan_panel(
     )
 
 
-def _member(table: pa.Table, column: str, stratum: ResolvedStratum) -> Bools:
-    """Which rows (N,) a stratum's predicate is for."""
-    if not stratum.steps_of_episode:
-        return bools(table, column)
-    steps = table[column].to_numpy()
-    return np.asarray(steps >= least_steps(stratum.rule, steps), np.bool_)
+def _members(
+    table: pa.Table, strata: Sequence[ResolvedStratum], *, of_state: bool = False
+) -> Bools:
+    """Which rows the strata's predicates are for, (N, S); `of_state`: those of the state alone."""
+    member = np.empty((len(table), len(strata)), np.bool_, order="F")
+    episode = codes(table, "episode_id")
+    for index, stratum in enumerate(strata):
+        own_state = of_state and stratum.state_predicate is not None
+        holds = bools(table, f"state_{index}" if own_state else f"stratum_{index}")
+        if stratum.steps_of_episode:
+            steps = np.bincount(episode[holds], minlength=int(episode.max()) + 1)
+            holds = (steps >= least_steps(stratum.rule, steps))[episode]
+        member[:, index] = holds
+    return member
 
 
 def _dealt(

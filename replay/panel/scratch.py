@@ -1,6 +1,7 @@
-"""What packing must know of every row of the source, on disk and not in memory: a few bytes a row.
+"""What packing must know of every row of a plan: what each is to the next, and where it is.
 
-Lies beside the panel while it is built, and is gone when it is there.
+What is worked out of it lies on disk beside the panel while it is built, a few bytes a row, and is
+gone when the panel is there.
 """
 
 from __future__ import annotations
@@ -9,13 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
-from restock.errors import PanelError
 from restock.replay.mixture.n_step import (
     CONTINUES,
     ON_POLICY,
@@ -25,26 +25,17 @@ from restock.replay.mixture.n_step import (
     return_to_go,
     step_flags,
 )
+from restock.replay.panel.candidates import codes
 
-# The order of the rows of a source: the order in which a plan numbers them.
-ORDER = "ORDER BY recording_id, episode_index, step_index"
-BATCH_ROWS = 16_384  # of the source, in memory at a time
 STRETCH = 1 << 18  # scalars in memory at a time
-
-_STEPS = f"""
-SELECT transition_id, episode_id, step_index, reward,
-    behaviour_policy || '@' || coalesce(behaviour_version, '') AS policy,
-    terminated, truncated, coalesce(action_probability < $random_probability, false) AS explored
-FROM transitions {ORDER}
-"""
 
 
 class SourceSteps:
-    """Every row of the source in order: ids, rewards and what each is to the next, (N,) on disk.
+    """Every row of a plan in order: ids, rewards and what each is to the next, (N,).
 
     Args:
         folder: where the files go.
-        connection: with the view `transitions`, of `rows` rows.
+        rows: META_COLUMNS of the plan's rows.
         random_probability: of an action chosen blindly; below it a policy explores. 0: unknown.
         cut_at_off_policy: end returns before off-policy actions; see `n_step`.
     """
@@ -52,40 +43,21 @@ class SourceSteps:
     def __init__(
         self,
         folder: Path,
-        connection: duckdb.DuckDBPyConnection,
-        rows: int,
+        rows: pa.Table,
         *,
         random_probability: float,
         cut_at_off_policy: bool,
     ) -> None:
-        self.rows = rows
+        self.rows = len(rows)
         self._bit = ON_POLICY if cut_at_off_policy else CONTINUES
-        self.ids: Ints = _on_disk(folder / "ids", np.int64, rows)
-        self.reward: F32 = _on_disk(folder / "reward", np.float32, rows)
-        self.flags: NDArray[np.uint8] = _on_disk(folder / "flags", np.uint8, rows)
+        self.ids: Ints = rows["transition_id"].to_numpy()
+        self.reward: F32 = rows["reward"].to_numpy()
+        self.flags: NDArray[np.uint8] = _on_disk(folder / "flags", np.uint8, self.rows)
         self._folder = folder
-        self._read(connection, random_probability)
-
-    def _read(self, connection: duckdb.DuckDBPyConnection, random_probability: float) -> None:
-        at, before = 0, None
-        reader = connection.sql(
-            _STEPS, params={"random_probability": random_probability}
-        ).to_arrow_reader(BATCH_ROWS)
-        for batch in reader:
-            count = len(batch)
-            if at + count > self.rows:
-                raise _changed(self._folder)
-            self.ids[at : at + count] = batch.column("transition_id").to_numpy()
-            self.reward[at : at + count] = batch.column("reward").to_numpy(zero_copy_only=False)
-            # With the last row of the batch before: what that one is to this batch's first.
-            both = pa.Table.from_batches([batch] if before is None else [before, batch])
-            start = at if before is None else at - 1
-            self.flags[start : at + count - 1] = _flags(both)
-            before = batch.slice(count - 1)
-            at += count
-        if at != self.rows:
-            raise _changed(self._folder)
-        if before is not None and before.column("terminated")[0].as_py():
+        for begin, end in _stretches(self.rows - 1):
+            # With the row behind: what that one is to the last.
+            self.flags[begin:end] = _flags(rows.slice(begin, end + 1 - begin), random_probability)
+        if rows["terminated"][-1].as_py():
             self.flags[-1] = TERMINATED
 
     def _continues(self, begin: int, end: int) -> Bools:
@@ -126,7 +98,7 @@ class SourceSteps:
 
     def places(self) -> Places:
         """Where a transition is, by its id."""
-        return Places(self.ids, self._folder)
+        return Places(self.ids)
 
 
 class Places:
@@ -136,8 +108,8 @@ class Places:
     sorted in memory.
     """
 
-    def __init__(self, ids: Ints, where: Path) -> None:
-        self._ids, self._where = ids, where
+    def __init__(self, ids: Ints) -> None:
+        self._ids = ids
         self._order: Ints | None = None
         starts = [0]
         for begin, end in _stretches(len(ids) - 1):
@@ -155,7 +127,7 @@ class Places:
             self._first = self._ids[:1]
 
     def of(self, ids: Ints) -> Ints:
-        """The place of each of these ids. Raises PanelError for one that was not there."""
+        """The place of each of these ids; -1 of one that is not there."""
         place = np.empty(len(ids), np.int64)
         run = np.maximum(np.searchsorted(self._first, ids, "right") - 1, 0)
         for number in np.unique(run).tolist():
@@ -163,25 +135,24 @@ class Places:
             begin, end = int(self._begins[number]), int(self._ends[number])
             place[in_run] = begin + np.searchsorted(self._ids[begin:end], ids[in_run])
         place = np.minimum(place, len(self._ids) - 1)
-        if not np.array_equal(self._ids[place], ids):
-            raise _changed(self._where)
-        return place if self._order is None else self._order[place]
+        there = self._ids[place] == ids
+        return np.where(there, place if self._order is None else self._order[place], -1)
 
 
-def _flags(rows: pa.Table) -> NDArray[np.uint8]:
+def _flags(rows: pa.Table, random_probability: float) -> NDArray[np.uint8]:
+    # A row without a version is of the version "" of its policy.
+    version = pc.coalesce(rows["behaviour_version"].cast(pa.string()), "")
+    version = version.combine_chunks().dictionary_encode()
+    policy = codes(rows, "behaviour_policy")
+    pair = policy * len(version.dictionary) + version.indices.to_numpy()
     return step_flags(
-        episode=_codes(rows, "episode_id"),
+        episode=codes(rows, "episode_id"),
         step_index=rows["step_index"].to_numpy(),
-        policy=_codes(rows, "policy"),
+        policy=np.where(policy < 0, -1, pair),
         terminated=rows["terminated"].to_numpy(),
         truncated=rows["truncated"].to_numpy(),
-        explored=rows["explored"].to_numpy(),
+        explored=rows["action_probability"].to_numpy() < random_probability,
     )
-
-
-def _codes(rows: pa.Table, name: str) -> Ints:
-    column = rows[name].combine_chunks().dictionary_encode()
-    return np.asarray(column.indices.fill_null(-1).to_numpy(zero_copy_only=False), np.int64)
 
 
 def _stretches(rows: int) -> Iterator[tuple[int, int]]:
@@ -191,7 +162,3 @@ def _stretches(rows: int) -> Iterator[tuple[int, int]]:
 
 def _on_disk(path: Path, dtype: Any, rows: int) -> NDArray[Any]:
     return np.memmap(path, dtype, "w+", shape=(rows,))
-
-
-def _changed(where: Path) -> PanelError:
-    return PanelError("the source changed while it was read", where=str(where.parent))

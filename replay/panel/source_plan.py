@@ -80,9 +80,8 @@ def plan_source(
     """
     size = len(strata)
     rows = np.bincount(source.code, minlength=size).astype(np.int64)
-    per_episode = [
-        np.unique(source.episode[source.code == i], return_counts=True)[1] for i in range(size)
-    ]
+    of_each = (np.bincount(source.episode[source.code == i]) for i in range(size))
+    per_episode = [counts[counts > 0] for counts in of_each]
     episodes = np.array([len(counts) for counts in per_episode], np.int64)
     draws = mixture.planned.updates * mixture.planned.batch_size * source.part
     rules = [stratum.rule for stratum in strata]

@@ -54,7 +54,7 @@ class ResolvedStratum:
     """A stratum as resolved against a store's conditions."""
 
     rule: StratumRule
-    predicate: str  # SQL over `transitions`: whether a row is in it, or of `steps_of_episode`
+    predicate: str  # SQL over `transitions`: whether it holds in a row
     # The same of the state alone; None where that is the predicate, or the outcome decides.
     state_predicate: str | None
     priority: int
@@ -73,7 +73,7 @@ class ResolvedStratum:
 
     @property
     def steps_of_episode(self) -> bool:
-        """Whether its predicate counts the rows of a row's episode, which has `min_steps`."""
+        """Whether it is of the episodes in which its predicate holds in `min_steps` rows."""
         return self.rule.unit == "episode" and not self.left_over
 
     @property
@@ -144,7 +144,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         # Chosen by what the whole episode met, not by what came of this step.
         state_predicate, timing = None, "pre"
         rest = rule.name == NOMINAL and rule.where is None
-        predicate = "true" if rest else _steps_of_episode(predicate)
+        predicate = "true" if rest else predicate
     timing = rule.timing or timing
     default = mixture.correction.pre if timing == "pre" else mixture.correction.post
     return ResolvedStratum(
@@ -158,14 +158,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
     )
 
 
-def _steps_of_episode(predicate: str) -> str:
-    """In how many rows of a row's episode the predicate holds."""
-    holds = f"count(*) FILTER (WHERE ({predicate}\n)::BOOLEAN)"
-    return f"{holds} OVER (PARTITION BY episode_id)"
-
-
 def least_steps(rule: StratumRule, steps: Ints) -> int:
-    """In how many rows of an episode a condition must hold, of the rows (N,) it holds in.
+    """In how many rows of an episode a condition must hold, of those of each (E,) it holds in.
 
     `min_steps`, or the most that an episode has where none has so many: a condition that is there
     has rows of its own.

@@ -82,38 +82,34 @@ ORDER BY robot, signal, week;
 -- Steps and events (runs of steps) of each condition in an episode, by zone: those in which it never
 -- held included. The zone null is all of them together.
 CREATE OR REPLACE VIEW episode_conditions AS
-WITH steps AS (
-    SELECT
-        robot,
-        site,
-        recording_id,
-        episode_id,
-        zone,
-        logged_time,
-        conditions,
-        lag(conditions) OVER (PARTITION BY episode_id ORDER BY step_index) AS conditions_before,
-        CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) / 3600 AS step_h
-    FROM transitions
-    JOIN (SELECT DISTINCT task_hash, task_json FROM recordings) USING (task_hash)
-), driven AS (
+WITH driven AS (
     SELECT
         any_value(robot) AS robot,
         any_value(site) AS site,
         recording_id,
         episode_id,
         zone,
-        min(logged_time) AS start_time,
-        sum(step_h) AS driven_h
-    FROM steps
+        make_timestamp(min(start_ns + clock_offset_ns) // 1000) AS start_time,
+        sum(steps * step_h) AS driven_h
+    FROM zone_steps
+    JOIN (
+        SELECT
+            recording_id,
+            robot,
+            site,
+            coalesce(clock_offset_ns, 0) AS clock_offset_ns,
+            CAST(json_extract_string(task_json, '$.control_period_s') AS DOUBLE) / 3600 AS step_h
+        FROM recordings
+    ) USING (recording_id)
     GROUP BY GROUPING SETS ((recording_id, episode_id, zone), (recording_id, episode_id))
 ), held AS (
     SELECT
         episode_id,
         zone,
         condition,
-        count(*) AS steps,
-        count(*) FILTER (NOT list_contains(coalesce(conditions_before, []), condition)) AS events
-    FROM (SELECT *, unnest(conditions) AS condition FROM steps)
+        CAST(sum(steps) AS BIGINT) AS steps,
+        CAST(sum(events) AS BIGINT) AS events
+    FROM condition_steps
     GROUP BY GROUPING SETS ((episode_id, zone, condition), (episode_id, condition))
 )
 SELECT

@@ -24,6 +24,7 @@ MACROS = (
     "macros.sql",
     "flawed_rows.sql",
     "capacity.sql",
+    "shared_rows.sql",
     "repeated_rows.sql",
     "corrections.sql",
     "measured_signals.sql",
@@ -41,7 +42,7 @@ ON_DEMAND = (
     ("exposure.sql",),
     ("return_order.sql", "returns.sql"),
     ("capacity.sql",),
-    ("repeated_rows.sql",),
+    ("shared_rows.sql", "repeated_rows.sql"),
     (FRAMES,),
 )
 _LISTS = {
@@ -108,9 +109,12 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 
-def repeated_rows() -> str:
-    """The statement that makes the macro `repeated_rows`, over any `transitions`."""
-    return (files("restock.replay.store") / "repeated_rows.sql").read_text(encoding="utf-8")
+def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
+    """Create the macro `repeated_rows`, over any `transitions`."""
+    query = "SELECT view_name FROM duckdb_views() WHERE view_name = 'shared_rows'"
+    there = connection.execute(query).fetchall()  # that of a store need not scan
+    names = ["repeated_rows.sql"] if there else ["shared_rows.sql", "repeated_rows.sql"]
+    connection.execute(definitions(names=names))
 
 
 def query(

@@ -1,48 +1,18 @@
 -- Rows of a recording that are those of another one under other ids: a bag and a part of it, a copy
 -- cut otherwise, or a drive that was replayed and recorded again.
 --
--- They are found by content (task, action, observation and pose, rounded to a thousandth), not by stamp:
--- each ingest estimates its own clock. Of two recordings one constant shift between their stamps is
+-- They are found by content (shared_rows). Of two recordings one constant shift between their stamps is
 -- taken out, and matches within half a control period of it count. What looks the same more than
 -- once in a recording (a robot that stands still) proves nothing and is left aside. Each row
 -- is given with the one of the first recording, by id, that has it.
 CREATE OR REPLACE MACRO repeated_rows(min_rows) AS TABLE
-WITH places AS (
-    -- Few rows pass this, and only theirs are read whole.
-    SELECT hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) AS place
-    FROM transitions
-    GROUP BY place
-    HAVING min(hash(recording_id)) < max(hash(recording_id))
-), distinctive AS (
+WITH alike AS MATERIALIZED (
     SELECT
-        recording_id,
-        content,
-        any_value(transition_id) AS transition_id,
-        any_value(episode_id) AS episode_id,
-        any_value(stamp_ns) AS stamp_ns
-    FROM (
-        SELECT
-            recording_id,
-            transition_id,
-            episode_id,
-            stamp_ns,
-            hash(
-                task_hash,
-                action,
-                list_transform(observation::FLOAT[], lambda x: round(x, 3)),
-                round(pose_x_m, 3),
-                round(pose_y_m, 3)
-            ) AS content
-        FROM transitions
-        WHERE hash(task_hash, action, round(pose_x_m, 3), round(pose_y_m, 3)) IN (FROM places)
-    )
-    GROUP BY recording_id, content
-    HAVING count(*) = 1
-), shared AS (
-    SELECT content, min(recording_id) AS same_as
-    FROM distinctive
-    GROUP BY content
-    HAVING count(*) > 1
+        *,
+        recording_id = min(recording_id) OVER (PARTITION BY content) AS is_first
+    FROM shared_rows
+    JOIN (SELECT recording_id, transition_id, episode_id, stamp_ns FROM transitions)
+        USING (recording_id, transition_id)
 ), matches AS (
     SELECT
         other.transition_id,
@@ -51,10 +21,8 @@ WITH places AS (
         one.transition_id AS same_as_transition_id,
         one.recording_id AS same_as,
         other.stamp_ns - one.stamp_ns AS later_ns
-    FROM shared
-    JOIN distinctive AS one ON one.content = shared.content AND one.recording_id = shared.same_as
-    JOIN distinctive AS other
-        ON other.content = shared.content AND other.recording_id > shared.same_as
+    FROM (FROM alike WHERE is_first) AS one
+    JOIN (FROM alike WHERE NOT is_first) AS other USING (content)
 ), shifts AS (
     SELECT recording_id, same_as, quantile_disc(later_ns, 0.5) AS shift_ns
     FROM matches

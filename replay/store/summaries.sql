@@ -116,6 +116,40 @@ SELECT
 FROM (SELECT ingest_id, unnest(measured_signals) AS one FROM stored_summaries)
 JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
 
+CREATE OR REPLACE VIEW zone_steps AS
+SELECT
+    recording_id,
+    one.episode_id AS episode_id,
+    one.zone AS zone,
+    one.start_ns AS start_ns,
+    one.steps AS steps
+FROM (SELECT ingest_id, unnest(zone_steps) AS one FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+
+CREATE OR REPLACE VIEW condition_steps AS
+SELECT
+    recording_id,
+    one.episode_id AS episode_id,
+    one.zone AS zone,
+    one.condition AS condition,
+    one.steps AS steps,
+    one.events AS events
+FROM (SELECT ingest_id, unnest(condition_steps) AS one FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+
+-- Contents first, and alone: there are as many as rows.
+CREATE OR REPLACE VIEW shared_rows AS
+SELECT recording_id, one.transition_id AS transition_id, one.content AS content
+FROM (SELECT ingest_id, unnest(distinctive_rows) AS one FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id)
+WHERE one.content IN (
+    SELECT row.content
+    FROM (SELECT ingest_id, unnest(distinctive_rows) AS row FROM stored_summaries)
+    SEMI JOIN recordings USING (ingest_id)
+    GROUP BY row.content
+    HAVING count(*) > 1
+);
+
 CREATE OR REPLACE VIEW flawed_rows AS
 SELECT
     one.transition_id AS transition_id,

@@ -18,6 +18,7 @@ from restock.ingest.store.compaction import OPERATION, compact, fold
 from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
+from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.query import definitions
 from restock.replay.store.store import Store
 
@@ -60,6 +61,10 @@ COMMON = (
     "cells_below(5)",
     "episode_signals ORDER BY episode_id, signal",
     "flawed_rows ORDER BY transition_id",
+    "zone_steps ORDER BY ALL",
+    "condition_steps ORDER BY ALL",
+    "episode_conditions ORDER BY episode_id, zone NULLS FIRST, condition",
+    "repeated_rows(1)",
 )
 
 
@@ -112,6 +117,22 @@ def test_rows_that_no_network_survives_are_named_in_the_manifest(tmp_path):
         ids = [rows["transition_id"][n].as_py() for n in (4, 9)]
         assert flawed.fetchall() == [(one, False, True) for one in ids]
         assert "stored_transitions" not in str(store.sql("EXPLAIN FROM flawed_rows").fetchall())
+
+
+def test_compaction_is_advised_of_many_files_of_few_rows(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2), one(3)])
+    audits = [audit for audit in shipped_audits() if audit.name == "many_small_files"]
+
+    def finding(files: int) -> Finding:
+        limits = {"many_small_files": {"min_files": files, "max_rows_a_file": 50_000}}
+        with Store(tmp_path / "s") as store:
+            return run_audits(store.connection, audits, limits)[0]
+
+    assert (finding(4).status, finding(3).status) == ("pass", "info")
+    assert finding(3).sample[0]["files"] == 3
+    compact(writer)
+    assert finding(3).status == "pass"
 
 
 def test_a_compacted_store_goes_on(place):

@@ -94,6 +94,23 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
         store.write(manifest(rows), rows)
 
 
+def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or a thousand recordings would read each other's a thousand times."""
+    writer, asked = StoreWriter(tmp_path / "s"), []
+    manifests = StoreWriter.manifests
+
+    def counted(self: StoreWriter, ingests: list[Any], *args: Any, **more: Any) -> pa.Table:
+        asked.append(len(ingests))
+        return manifests(self, ingests, *args, **more)
+
+    monkeypatch.setattr(StoreWriter, "manifests", counted)
+    for index in (1, 2, 3):
+        rows = recording_transitions(index, episodes=5)
+        writer.write(manifest(rows), rows)
+        assert StoreWriter(tmp_path / "s").repeated(rows, 0.1) is None
+    assert asked == [0, 1, 1]
+
+
 def test_hashes_see_a_thousandth_and_no_less() -> None:
     rows = recording_transitions(1)
     place = rows.schema.get_field_index("observation")

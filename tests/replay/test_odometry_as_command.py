@@ -64,6 +64,9 @@ def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, ca
     code, out, _ = mixed(tmp_path, store, capsys)
     assert code == 0
     assert f'"odometry in place of a command": {second["transitions"]}' in out
+    mixture, panel = str(tmp_path / "mix.toml"), tmp_path / "panel"
+    assert main(["mix", str(store), "--mixture", mixture, "--out", str(panel)]) == 0
+    assert f"{first['transitions']:,} rows of store" in capsys.readouterr().out
     code, out, _ = mixed(tmp_path, store, capsys, "odometry_as_command = true")
     assert code == 0
     assert "odometry in place" not in out

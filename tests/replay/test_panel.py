@@ -152,7 +152,6 @@ def test_small_stretches_and_batches_pack_the_same_bytes(
     for module, name, value in (
         (scratch, "STRETCH", 64),
         (pack, "STRETCH", 64),
-        (scratch, "BATCH_ROWS", 2048),
         (pack, "BATCH_ROWS", 2048),
         (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
         (pack, "ROW_GROUP_ROWS", 1000),
@@ -164,6 +163,18 @@ def test_small_stretches_and_batches_pack_the_same_bytes(
     assert at_once.id == by_parts.id
     held = [pq.read_table(panel.path / "evaluation_split.parquet") for panel in (at_once, by_parts)]
     assert held[0].to_pylist() == held[1].to_pylist()
+
+
+def test_how_the_rows_lie_does_not_change_the_panel(transitions: pa.Table, tmp_path: Path) -> None:
+    mixture = parse_mixture(GOLDEN)
+    shuffled = transitions.take(pa.array(np.random.default_rng(0).permutation(len(transitions))))
+    first, second = (
+        build_panel(table, mixture, tmp_path / name, task=TASK, conditions=CONDITIONS)
+        for name, table in (("a", transitions), ("b", shuffled))
+    )
+    assert first.id == second.id
+    assert first.header.files[ROWS] == second.header.files[ROWS]
+    assert first.meta.to_pylist() == second.meta.to_pylist()
 
 
 def test_ids_that_no_ingest_gave_find_their_rows_too(transitions: pa.Table, tmp_path: Path) -> None:

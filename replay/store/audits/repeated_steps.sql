@@ -10,9 +10,9 @@ SELECT
     count(*) / least(any_value(one.transitions), any_value(other.transitions)) AS share,
     any_value(shift_ns) / 1e9 AS later_s
 FROM repeated_rows($min_rows) AS repeated
-JOIN (SELECT recording_id, any_value(source_file) AS source_file, count(*) AS transitions FROM transitions GROUP BY recording_id) AS one
+JOIN recordings AS one
     ON one.recording_id = repeated.same_as
-JOIN (SELECT recording_id, any_value(source_file) AS source_file, count(*) AS transitions FROM transitions GROUP BY recording_id) AS other
+JOIN recordings AS other
     ON other.recording_id = repeated.recording_id
 GROUP BY repeated.same_as, repeated.recording_id
 ORDER BY rows DESC, repeated.same_as, repeated.recording_id
