@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.stores import manifest, recording_transitions
 
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.compaction import fold_if_many
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
@@ -32,10 +33,14 @@ FIRST_DAY = datetime(2026, 1, 5, tzinfo=UTC)
 
 
 def write_fleet(path: Path, recordings: int, rows: int, *, batch: int) -> None:
-    """A store of so many recordings of about so many rows, `batch` of them a commit."""
+    """A store of so many recordings of about so many rows, `batch` of them a commit.
+
+    Manifests are folded at the end, as `restock ingest` ends.
+    """
     store, fleet = StoreWriter(path), drives(recordings, rows)
     while part := [one for _, one in zip(range(batch), fleet, strict=False)]:
         store.write_all(part)
+    fold_if_many(store)
 
 
 def drives(recordings: int, rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:

@@ -240,8 +240,9 @@ class _Table:
 
 def _give_back(rows: NDArray[np.float32]) -> None:
     """Take a memory map's pages out of this process' memory; the system writes them when it may."""
-    if isinstance(rows.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
-        rows.base.madvise(mmap.MADV_DONTNEED)
+    mapped: object = rows.base
+    if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def _compact(table: pa.Table) -> pa.Table:

@@ -136,7 +136,8 @@ def bag_and_a_part_of_it(table: pa.Table, recordings: pa.Table) -> Tables:
     part = replaced(part, "recording_id", [f"{9:016x}"] * len(part))
     part = replaced(part, "source_file", ["logs/part.mcap"] * len(part))
     part = replaced(part, "transition_id", (np.int64(9) << 25) + np.arange(len(part)))
-    return pa.concat_tables([table, part.cast(table.schema)]), recordings
+    part = replaced(part, "ingest_id", [f"{9:016x}-a"] * len(part)).cast(table.schema)
+    return pa.concat_tables([table, part]), pa.concat_tables([recordings, manifest(part)])
 
 
 def two_tasks(table: pa.Table, recordings: pa.Table) -> Tables:
