@@ -125,7 +125,7 @@ def test_compaction_is_advised_of_many_files_of_few_rows(tmp_path):
     audits = [audit for audit in shipped_audits() if audit.name == "many_small_files"]
 
     def finding(files: int) -> Finding:
-        limits = {"many_small_files": {"min_files": files, "max_rows_a_file": 50_000}}
+        limits = {"many_small_files": {"min_files": files, "max_rows_a_file": 15_000}}
         with Store(tmp_path / "s") as store:
             return run_audits(store.connection, audits, limits)[0]
 
