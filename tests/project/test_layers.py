@@ -71,7 +71,9 @@ MAY_IMPORT = {
         " replay/ring replay/store ingest/profile ingest/task"
     ),
     "train/study": "comparison dqn evaluation libraries run twin/physics ingest",
-    "train/view": ("dqn evaluation run twin/recording replay/trace ingest/decoding ingest/steps"),
+    "train/view": (
+        "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding ingest/steps"
+    ),
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",

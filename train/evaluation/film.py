@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -22,14 +22,16 @@ from restock.arrays import F32, Ints
 from restock.errors import RunError
 from restock.files import write_bytes, write_text
 from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy
-from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episodes
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
-from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.model import PEOPLE
+
+if TYPE_CHECKING:
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 FOLDER = Path("eval") / "films"  # in a run
 DOCUMENT = "films.json"
@@ -127,6 +129,34 @@ def drive_again(
 ) -> tuple[EpisodeResult, list[NDArray[np.uint8]], list[dict[str, Any]]]:
     """Drive the agent's episode once more: how it went, a picture of each step (H, W, 3), and where
     everything was (metres and radians, in the map frame)."""
+    frames: list[NDArray[np.uint8]] = []
+    states: list[dict[str, Any]] = []
+
+    def watched(env: WarehouseVectorEnv) -> Stepper:
+        def look() -> None:
+            frames.append(draw_map(env, 0))
+            states.append(everything(env, len(states) * env.task.control_period_s))
+
+        def step(_: F32, action: Ints) -> Step:
+            if not frames:
+                look()
+            made = env.step(action)
+            look()
+            return made
+
+        return step
+
+    return drive_row(plan, row, watched), frames, states
+
+
+def drive_row(
+    plan: EvaluationPlan,
+    row: dict[str, Any],
+    watched: Callable[[WarehouseVectorEnv], Stepper],
+) -> EpisodeResult:
+    """Drive the agent's episode once more, with the steps that `watched` makes of its twin."""
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
     profile = profile_of_run(plan.run)
     task = profile.task
     env = WarehouseVectorEnv(
@@ -138,20 +168,6 @@ def drive_again(
         nav_command=profile.inputs.nav_command is not None,
         autoreset_mode=AutoresetMode.DISABLED,
     )
-    frames: list[NDArray[np.uint8]] = []
-    states: list[dict[str, Any]] = []
-
-    def look() -> None:
-        frames.append(draw_map(env, 0))
-        states.append(_state(env, len(states) * task.control_period_s))
-
-    def step(_: F32, action: Ints) -> Step:
-        if not frames:
-            look()
-        made = env.step(action)
-        look()
-        return made
-
     (result,) = run_episodes(
         env,
         make_policy("agent", plan),
@@ -160,10 +176,10 @@ def drive_again(
         time_limit_steps=task.time_limit_steps,
         goal=task.goal != "none",
         discount=plan.config.loss.discount,
-        step=step,
+        step=watched(env),
     )
     env.close()
-    return result, frames, states
+    return result
 
 
 def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
@@ -174,7 +190,9 @@ def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
     return differing + (["end"] if float(np.abs(ends).max()) > 1e-3 else [])
 
 
-def _state(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
+def everything(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
+    """Where robot, people, forklifts, pallets and patches are, the plan and the goal: metres and
+    radians in the map frame, rounded to millimetres."""
     sim, navigation = env.simulation, env.navigation
     traffic = sim.traffic
     here = np.isfinite(sim.traffic.gaps_m(sim.middle(sim.pose()))[0])
@@ -239,4 +257,12 @@ def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
     return out.getvalue()
 
 
-__all__ = ["Scene", "drive_again", "film_evaluation", "scenes", "unlike"]
+__all__ = [
+    "Scene",
+    "drive_again",
+    "drive_row",
+    "everything",
+    "film_evaluation",
+    "scenes",
+    "unlike",
+]

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_EVALUATION = "/restock/evaluation/"  # an episode of an evaluation, with topics of the same names
 # What is drawn of Restock's topics, and how.
 _DRAWN: dict[str, dict[str, Any]] = {
     "/restock/scan": {"pointSize": 4, "colorMode": "flat", "flatColor": "#d0312dff"},
@@ -18,30 +19,28 @@ _DRAWN: dict[str, dict[str, Any]] = {
 }
 
 
-def foxglove_layout(topics: Mapping[str, str], *, middle_m: tuple[float, float]) -> dict[str, Any]:
+def foxglove_layout(
+    topics: Mapping[str, str], floors: Mapping[str, tuple[str, tuple[float, float]]]
+) -> dict[str, Any]:
     """A layout to import in Foxglove.
 
     Args:
         topics: those of the file -> their types; what is not among them is not shown.
-        middle_m: what the camera looks at, in the map.
+        floors: one view each, by name: the frame of its map, and what the camera looks at there,
+            in metres.
     """
-    drawn = {name: {"visible": True, **how} for name, how in _DRAWN.items() if name in topics}
+    drawn = {
+        place: {"visible": True, **how}
+        for name, how in _DRAWN.items()
+        for place in _both(name)
+        if place in topics
+    }
     maps = [name for name, kind in topics.items() if kind == "nav_msgs/msg/OccupancyGrid"]
     drawn |= {name: {"visible": True, "colorMode": "map", "drawBehind": True} for name in maps}
     markers = [n for n, k in topics.items() if k == "visualization_msgs/msg/MarkerArray"]
     drawn |= {name: {"visible": True} for name in markers}
     panels: dict[str, Any] = {
-        "3D!moment": {
-            "scene": {"transforms": {"showLabel": False, "axisSize": 0.3}},
-            "topics": drawn,
-            "followTf": "map",
-            "fixedFrame": "map",
-            "followMode": "follow-none",
-            "cameraState": {
-                **{"distance": 9, "perspective": True, "phi": 30, "thetaOffset": 0},
-                **{"targetOffset": [*middle_m, 0], "fovy": 45, "near": 0.1, "far": 500},
-            },
-        },
+        **{f"3D!{name}": _floor(drawn, *floor) for name, floor in floors.items()},
         "Plot!speed": _plot(topics, "/restock/speed/command_mps", "/restock/speed/wheels_mps"),
         "Plot!critic": _plot(
             topics, "/restock/critic/value", "/restock/critic/best_value", "/restock/reward"
@@ -49,7 +48,11 @@ def foxglove_layout(topics: Mapping[str, str], *, middle_m: tuple[float, float])
         "Plot!td": _plot(topics, "/restock/critic/td_error"),
         "StateTransitions!labels": {
             "paths": [
-                {"value": f"{name}.data", "label": label, "timestampMethod": "receiveTime"}
+                {
+                    "value": f"{place}.data",
+                    "label": f"evaluation: {label}" if place != name else label,
+                    "timestampMethod": "receiveTime",
+                }
                 for name, label in (
                     ("/restock/condition", "condition"),
                     ("/restock/true_condition", "true condition"),
@@ -57,7 +60,8 @@ def foxglove_layout(topics: Mapping[str, str], *, middle_m: tuple[float, float])
                     ("/restock/action", "action"),
                     ("/restock/critic/greedy_action", "the critic's best"),
                 )
-                if name in topics
+                for place in _both(name)
+                if place in topics
             ],
             "isSynced": True,
         },
@@ -79,8 +83,27 @@ def foxglove_layout(topics: Mapping[str, str], *, middle_m: tuple[float, float])
         "layout": {
             "direction": "row",
             "splitPercentage": 55,
-            "first": "3D!moment",
+            "first": _column([f"3D!{name}" for name in floors]),
             "second": _column(right),
+        },
+    }
+
+
+def _both(topic: str) -> tuple[str, str]:
+    """Of the logged episode, and of the evaluation's."""
+    return topic, topic.replace("/restock/", _EVALUATION)
+
+
+def _floor(drawn: dict[str, Any], frame: str, middle_m: tuple[float, float]) -> dict[str, Any]:
+    return {
+        "scene": {"transforms": {"showLabel": False, "axisSize": 0.3}},
+        "topics": drawn,
+        "followTf": frame,
+        "fixedFrame": frame,
+        "followMode": "follow-none",
+        "cameraState": {
+            **{"distance": 9, "perspective": True, "phi": 30, "thetaOffset": 0},
+            **{"targetOffset": [*middle_m, 0], "fovy": 45, "near": 0.1, "far": 500},
         },
     }
 
@@ -89,12 +112,13 @@ def _plot(topics: Collection[str], *names: str) -> dict[str, Any]:
     paths = [
         {
             "enabled": True,
-            "label": name.removeprefix("/restock/"),
-            "value": f"{name}.data",
+            "label": place.removeprefix("/restock/"),
+            "value": f"{place}.data",
             "timestampMethod": "receiveTime",
         }
         for name in names
-        if name in topics
+        for place in _both(name)
+        if place in topics
     ]
     return {"paths": paths, "showLegend": True, "isSynced": True}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,10 @@ from restock.imports import import_extra
 from restock.ingest.steps.seen_at_ticks import SeenScan
 from restock.replay.trace.moment import Moment
 from restock.train.view.critic import Critic
-from restock.train.view.told import about, numbers_of, texts_of
+from restock.train.view.told import about, about_evaluated, numbers_of, texts_of
+
+if TYPE_CHECKING:  # it needs the twin and its physics
+    from restock.train.view.evaluated import Beside, Evaluated
 
 TIMELINE = "log_time"
 _COLOURS = {"scan": (208, 49, 45), "seen": (31, 111, 178), "plan": (31, 157, 77)}
@@ -34,13 +37,29 @@ def require_rerun() -> Any:
     )
 
 
-def write_rerun(path: Path, moment: Moment, critic: Critic | None) -> dict[str, int]:
-    """Write the moment to `path`; returns how often each entity was logged."""
+def write_rerun(
+    path: Path, moment: Moment, critic: Critic | None, beside: Beside | None = None
+) -> dict[str, int]:
+    """Write the moment to `path`, and an episode of an evaluation beside it; returns how often each
+    entity was logged."""
     rr = require_rerun()
     stream = rr.RecordingStream("restock", recording_id=str(moment.at["transition_id"]))
-    stream.save(str(path), default_blueprint=_blueprint(critic))
+    stream.save(str(path), default_blueprint=_blueprint(critic, beside))
     log = _Log(rr, stream)
-    log.put("moment", rr.TextDocument(about(moment, critic)), static=True)
+    _steps(log, rr, moment, critic, about(moment, critic))
+    if beside is not None:
+        log.below = "evaluation/"
+        evaluated = beside.evaluated
+        _floor(log, rr, evaluated)
+        told = about_evaluated(evaluated, beside.critic)
+        _steps(log, rr, evaluated.moment, beside.critic, told)
+    stream.flush()
+    stream.disconnect()
+    return dict(sorted(log.counts.items()))
+
+
+def _steps(log: _Log, rr: Any, moment: Moment, critic: Critic | None, told: str) -> None:
+    log.put("moment", rr.TextDocument(told), static=True)
     body = moment.task.body
     half = (body.length_m / 2, body.width_m / 2, 0.1)
     box = rr.Boxes3D(half_sizes=[half], centers=[(0, 0, 0.1)], colors=[(240, 130, 30)])
@@ -68,9 +87,29 @@ def write_rerun(path: Path, moment: Moment, critic: Critic | None) -> dict[str, 
                 said[name] = text
                 log.put(f"labels/{name}", rr.TextLog(f"{name}: {text}"))
     _recorded(log, rr, moment)
-    stream.flush()
-    stream.disconnect()
-    return dict(sorted(log.counts.items()))
+
+
+def _floor(log: _Log, rr: Any, evaluated: Evaluated) -> None:
+    """The racks, and people, forklifts and pallets at each step."""
+    racks = np.array(evaluated.racks_m).reshape(-1, 2, 2)
+    middles = np.column_stack([racks.mean(axis=1), np.full(len(racks), 0.5)])
+    halves = np.column_stack([np.ptp(racks, axis=1) / 2, np.full(len(racks), 0.5)])
+    log.put("map/racks", rr.Boxes3D(centers=middles, half_sizes=halves), static=True)
+    for log_ns, others in zip(evaluated.moment.log_ns, evaluated.others, strict=True):
+        log.at(log_ns)
+        for name, half, colour in (
+            ("people", (0.22, 0.22, 0.85), (0, 114, 178)),
+            ("forklifts", (0.8, 0.4, 0.9), (230, 159, 0)),
+            ("pallets", (0.6, 0.4, 0.4), (132, 100, 58)),
+        ):
+            turns = [rr.RotationAxisAngle(axis=(0, 0, 1), radians=p[2]) for p in others[name]]
+            boxes = rr.Boxes3D(
+                centers=[(x, y, half[2]) for x, y, _ in others[name]],
+                half_sizes=[half] * len(turns),
+                rotation_axis_angles=turns,
+                colors=[colour],
+            )
+            log.put(f"map/{name}", boxes)
 
 
 class _Log:
@@ -78,11 +117,13 @@ class _Log:
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr, self.stream, self.counts = rr, stream, dict[str, int]()
+        self.below = ""  # the entity that all are put below
 
     def at(self, log_ns: int) -> None:
         self.stream.set_time(TIMELINE, timestamp=np.datetime64(log_ns, "ns"))
 
     def put(self, entity: str, what: Any, *, static: bool = False) -> None:
+        entity = self.below + entity
         self.stream.log(entity, what, static=static)
         self.counts[entity] = self.counts.get(entity, 0) + 1
 
@@ -135,23 +176,25 @@ def _points(rr: Any, name: str, ends: F64) -> Any:
     return rr.Points3D(ends, colors=[_COLOURS[name]], radii=[radius])
 
 
-def _blueprint(critic: Critic | None) -> Any:
+def _blueprint(critic: Critic | None, beside: Beside | None) -> Any:
     import rerun.blueprint as rrb
 
-    plots = [
-        rrb.TimeSeriesView(origin="/speed", name="speed, m/s"),
-        rrb.TimeSeriesView(origin="/", contents=["/reward"], name="reward"),
-    ]
+    def plot(name: str, *entities: str) -> Any:
+        below = [f"/evaluation{entity}" for entity in entities] if beside is not None else []
+        return rrb.TimeSeriesView(origin="/", contents=[*entities, *below], name=name)
+
+    plots = [plot("speed, m/s", "/speed/**"), plot("reward", "/reward")]
     if critic is not None:
-        values = ["/critic/value", "/critic/best_value"]
         plots += [
-            rrb.TimeSeriesView(origin="/", contents=values, name="the critic's value"),
-            rrb.TimeSeriesView(origin="/", contents=["/critic/td_error"], name="TD error"),
+            plot("the critic's value", "/critic/value", "/critic/best_value"),
+            plot("TD error", "/critic/td_error"),
         ]
-    right = rrb.Vertical(*plots, rrb.TextLogView(origin="/labels", name="labels"))
-    left = rrb.Vertical(
-        rrb.Spatial3DView(origin="/map", name="floor"),
-        rrb.TextDocumentView(origin="/moment", name="moment"),
-        row_shares=[5, 1],
-    )
+    labels = ["/labels/**", "/evaluation/labels/**"]
+    right = rrb.Vertical(*plots, rrb.TextLogView(origin="/", contents=labels, name="labels"))
+    floors, shares = [rrb.Spatial3DView(origin="/map", name="floor")], [5, 1]
+    if beside is not None:
+        floors.append(rrb.Spatial3DView(origin="/evaluation/map", name="evaluation"))
+        shares.insert(0, 5)
+    told = rrb.TextDocumentView(origin="/moment", name="moment")
+    left = rrb.Vertical(*floors, told, row_shares=shares)
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+from typing import TYPE_CHECKING
 
 from restock.replay.trace.moment import Moment
 from restock.train.view.critic import Critic
+
+if TYPE_CHECKING:  # it needs the twin and its physics
+    from restock.train.view.evaluated import Evaluated
 
 
 def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str]:
@@ -13,7 +17,7 @@ def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str
     step, names = moment.steps[index], moment.task.action_names
     texts = {
         "condition": step["condition"],
-        "conditions": ", ".join(step["conditions"]) or "nominal",
+        "conditions": _conditions(step["conditions"]),
         "true_condition": step["true_condition"],
         "behaviour_policy": step["behaviour_policy"],
         "action": names[step["action"]],
@@ -21,6 +25,11 @@ def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str
     if critic is not None:
         texts["critic/greedy_action"] = names[int(critic.greedy[index])]
     return {name: text for name, text in texts.items() if text}
+
+
+def _conditions(names: list[str] | None) -> str:
+    """All that a step is labelled as; nothing where nobody labelled it."""
+    return "" if names is None else ", ".join(names) or "nominal"
 
 
 def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, float]:
@@ -50,6 +59,15 @@ def about(moment: Moment, critic: Critic | None) -> str:
     """Which transition the moment is about, as JSON."""
     keys = ("transition_id", "episode_id", "step_index", "stamp_ns", "condition", "zone")
     told = {key: moment.at[key] for key in (*keys, "behaviour_policy", "reward", "source_file")}
+    if critic is not None:
+        told["critic"] = f"{critic.run}: {critic.weights}"
+    return json.dumps(told)
+
+
+def about_evaluated(evaluated: Evaluated, critic: Critic | None) -> str:
+    """Which episode of an evaluation it is, and how it went, as JSON."""
+    keys = ("condition", "block", "episode_seed", "layout", "version", "success", "failure")
+    told = {key: evaluated.outcome[key] for key in (*keys, "bumps", "time_s", "return")}
     if critic is not None:
         told["critic"] = f"{critic.run}: {critic.weights}"
     return json.dumps(told)

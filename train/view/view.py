@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from restock.errors import ConfigError, StoreError
 from restock.files import temporary_name, write_text
@@ -15,6 +15,9 @@ from restock.train.view.critic import Critic, critic_along
 from restock.train.view.layout import foxglove_layout
 from restock.train.view.mcap_view import write_mcap
 from restock.train.view.rerun_view import require_rerun, write_rerun
+
+if TYPE_CHECKING:  # it needs the twin and its physics
+    from restock.train.view.evaluated import Beside
 
 ENDINGS = (".mcap", ".rrd")
 
@@ -28,6 +31,8 @@ class ViewOptions:
     recording: Path | None = None  # scans, plans and all other topics are in it
     profile: str | None = None
     critic: str | None = None  # a run
+    beside: str | None = None  # CONDITION/SEED of an episode of the evaluation of `beside_run`
+    beside_run: Path | None = None
 
 
 def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> dict[str, Any]:
@@ -38,7 +43,9 @@ def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> 
         path: a new file: `.mcap` (Foxglove; its layout is put beside it) or `.rrd` (Rerun).
 
     Raises:
-        ConfigError: another ending, there is a file already, or Rerun is not installed.
+        ConfigError: another ending, there is a file already, Rerun is not installed, or the
+            evaluation has no such episode.
+        RunError: driven again that episode is not the recorded one.
         StoreError: the row is of the twin: no store has what was before and after it.
     """
     options = options or ViewOptions()
@@ -57,10 +64,11 @@ def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> 
         profile=options.profile,
     )
     critic = critic_along(options.critic, moment) if options.critic is not None else None
+    beside = _beside(options, moment)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_name(path).with_suffix(path.suffix)
     try:
-        counts, layout = _write(temporary, moment, critic)
+        counts, layout = _write(temporary, moment, critic, beside)
         if layout is not None:
             write_text(layout_of(path), json.dumps(layout, indent=1) + "\n")
         temporary.replace(path)
@@ -72,6 +80,7 @@ def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> 
         "steps": len(moment.steps),
         "seconds": (moment.window_ns[1] - moment.window_ns[0]) / 1e9,
         "critic": None if critic is None else f"{critic.run}: {critic.weights}",
+        "beside": None if beside is None else beside.evaluated.outcome,
         "topics": counts,
         "notes": moment.notes,
     }
@@ -96,14 +105,39 @@ def layout_of(path: Path) -> Path:
     return path.with_suffix(".foxglove.json")
 
 
+def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
+    """The episode of the evaluation that was asked for, from the moment's beginning on."""
+    if options.beside is None:
+        return None
+    if options.beside_run is None:
+        raise ConfigError(
+            "is an episode of an evaluation: which run's?",
+            where="--beside",
+            remedy="name the run with --critic RUN",
+        )
+    from restock.train.view.evaluated import Beside, evaluated_moment
+
+    run = options.beside_run
+    evaluated = evaluated_moment(run, options.beside, begins_ns=moment.window_ns[0])
+    along = None if options.critic is None else critic_along(options.critic, evaluated.moment)
+    return Beside(evaluated, along)
+
+
 def _write(
-    path: Path, moment: Moment, critic: Critic | None
+    path: Path, moment: Moment, critic: Critic | None, beside: Beside | None
 ) -> tuple[dict[str, int], dict[str, Any] | None]:
     if path.suffix == ".rrd":
-        return write_rerun(path, moment, critic), None
+        return write_rerun(path, moment, critic, beside), None
     with path.open("wb") as stream:
-        written = write_mcap(stream, moment, critic)
+        written = write_mcap(stream, moment, critic, beside)
     middle = float(moment.at["pose_x_m"]), float(moment.at["pose_y_m"])
     types = {topic: kind for topic, (kind, _) in written.items()}
     counts = {topic: count for topic, (_, count) in written.items()}
-    return counts, foxglove_layout(types, middle_m=middle)
+    floors = {"moment": ("map", middle)}
+    if beside is not None:
+        first = beside.evaluated.moment.at
+        floors["evaluation"] = (
+            "evaluation_map",
+            (float(first["pose_x_m"]), float(first["pose_y_m"])),
+        )
+    return counts, foxglove_layout(types, floors)

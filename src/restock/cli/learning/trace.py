@@ -53,6 +53,8 @@ class TraceCommand:
     """Seconds after it."""
     critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
     """Whose critic --view shows: a run, or none; of a RUN's row its own."""
+    beside: Annotated[str | None, tyro.conf.arg(metavar="CONDITION/SEED")] = None
+    """In --view also this episode of that run's evaluation (`restock eval`), driven again."""
     rows: int = 20
     """How many audited rows to list, where no ROW is given."""
     json: bool = False
@@ -90,6 +92,10 @@ class TraceCommand:
         from restock.errors import ConfigError
 
         if self.view is None:
+            if self.beside is not None:
+                raise ConfigError(
+                    "is shown in a file", where="--beside", remedy="name it with --view FILE"
+                )
             return
         from restock.train.view.view import check_view
 
@@ -113,7 +119,17 @@ class TraceCommand:
 
         own = self.place if trace.audit is not None else None  # of a run
         critic = None if self.critic == "none" else self.critic or own
-        options = ViewOptions(self.before, self.after, self.recording, self.profile, critic)
+        run = critic or own
+        evaluated = None if run is None else Path(run)
+        options = ViewOptions(
+            self.before,
+            self.after,
+            self.recording,
+            self.profile,
+            critic,
+            self.beside,
+            evaluated,
+        )
         return write_view(trace, self.view, options)
 
 

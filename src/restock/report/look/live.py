@@ -133,7 +133,7 @@ def _isolate(unit: Spec, series: str, *, first: bool) -> None:
 
 def _points(line: Spec) -> Spec:
     """The points of a line, wider than they are drawn, and seen where the pointer is."""
-    mark = {"type": "point", "filled": True, "size": HALO_PX2}
+    mark = {"type": "point", "filled": True, "size": HALO_PX2, "clip": True}
     pointed = {"param": "pointed", "empty": False, "value": HALO_OPACITY}
     select = {"type": "point", "on": "pointerover", "clear": "pointerout"}
     return {

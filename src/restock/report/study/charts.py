@@ -5,6 +5,7 @@ Intervals by condition, the probability of improvement, and learning curves with
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import altair as alt
@@ -107,12 +108,13 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
     shown = charts.in_words(rows)
 
     def chart(width: int) -> Any:
-        across = 1 if width < 600 else 2 if width < 900 else min(len(conditions), 4)
+        most = 1 if width < 600 else 2 if width < 900 else 4
+        across = math.ceil(len(conditions) / math.ceil(len(conditions) / most))  # even lines
         base = charts.plot(shown).encode(
             x=alt.X("env_steps:Q", title="environment steps", axis=charts.x_axis(width // across)),
             color=charts.coloured("arm", arms, colours(arms), width),
         )
-        axis, domain = alt.Axis(format="%"), alt.Scale(domain=[0, 1])
+        axis, domain = alt.Axis(format="%"), alt.Scale(domain=[0, 1], padding=4)
         band = (
             base.transform_filter("isValid(datum.low)")
             .mark_area(opacity=0.18)
