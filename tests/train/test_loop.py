@@ -44,6 +44,21 @@ def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
     assert live.learner.gradient_steps > 1000
 
 
+@pytest.mark.parametrize("with_logs", [True, False])
+def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
+    tmp_path: Path, with_logs: bool
+) -> None:
+    """There is a policy to keep and something to report, however slow the machine."""
+    settings = config(schedule={"seconds": 1e-6, "offline_updates": 1000, "env_steps": 6000})
+    live = run_to_end(tmp_path / "a", settings, **({} if with_logs else {"logs": None}))
+    least = settings.record.every_updates
+    assert least <= live.learner.gradient_steps <= least + 20
+    assert live.best is not None
+    (row, *_) = [row for row in live.run.table("progress").to_pylist() if row["updates"]]
+    assert row["loss"] is not None
+    assert (live.progress.env_steps == 0) == with_logs
+
+
 def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> None:
     """Rows of a corridor that never slips: Q of the logged actions is known in closed form."""
     shelf = logs(600)
