@@ -99,7 +99,8 @@ def trained(to: Settings) -> str:
         lines = ["Time was up before anything was driven: more --seconds fine-tune it."]
     if to.uniform.is_dir():
         lines += [
-            "Fed uniformly has the same network, settings, seed and number of steps, and every",
+            "Fed uniformly has the same network, settings and seed"
+            + (", as many steps, and every" if most else ", and every"),
             "row of the logs alike: what is compared are feeds, not methods, and so",
             f"`restock compare {to.uniform} {to.run}` refuses",
             "(--treatment mixture says that feeds are meant). One seed each is one draw:",
