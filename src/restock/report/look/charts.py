@@ -35,7 +35,7 @@ CONDITION_COLOURS = {
     "recovery": "#cc79a7",
 }
 WORDS_COLOURS = {words(name): colour for name, colour in CONDITION_COLOURS.items()}
-SPARE_COLOURS = ("#009e73", "#56b4e9", "#8b5cf6", "#84643a", "#111827")
+SPARE_COLOURS = ("#56b4e9", "#009e73", "#8b5cf6", "#84643a", "#111827")
 POLICY_COLOURS = {
     "agent": "#0f766e",
     "cloned": "#7c3aed",
