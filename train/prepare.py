@@ -122,8 +122,9 @@ class Prepared:
         if self.panel is not None:
             share = self.document["panel"].get("logs_share", 0.0)
             few = share < 0.1
-            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), {share:.{int(few)}%} of each"
-            fed += f" batch{_short(self.panel, config, share)}"
+            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), "
+            part = f"{share:.{int(few)}%} of each batch{_short(self.panel, config, share)}"
+            fed += part if config.env.twin else "all of each batch"
         steps = f"up to {schedule.env_steps:,} environment steps"
         if not config.env.twin:
             steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
@@ -146,6 +147,7 @@ class Prepared:
                     else "its stratum is of logs alone"
                 )
                 for name, signals in self.document.get("not_evaluated", {}).items()
+                if config.env.twin
             )
             + "".join(f"\n{line}" for line in self._sealed())
         )

@@ -28,6 +28,7 @@ from restock.ingest.propose.trial import Trial
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 
+GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 
 
@@ -240,6 +241,9 @@ def _actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, floa
         return _steered_actions(commands, robot)
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
+    if 0.8 * speed > GENTLE_MPS:  # over slippery floor it needs a curve, too, that is none of these
+        slow, bend = min(0.35 * speed, GENTLE_MPS), min(0.5 * turn, GENTLE_RADPS)
+        actions += [(slow, bend), (slow, -bend)]
     actions += [(-speed / 2, 0.0)] if commands.backs else []
     return actions
 

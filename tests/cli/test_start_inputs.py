@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from support.driven_robot import Drive, columns, scans, write_bag
 from support.paths import SHARED
+from support.profile_texts import WAREHOUSE
 
 from restock import cli
 from restock.cli.start import stages
-from restock.cli.start.decisions import updates_settings
+from restock.cli.start.decisions import practice_settings, updates_settings
 from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
 from restock.ingest.profile.profile import load_profile
@@ -206,3 +207,23 @@ def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
     # On the logs alone nothing is driven, and all draws are for them.
     (alone, _) = updates_settings(few, 9.0, twin=False)
     assert alone == f"schedule.offline_updates={int(allowed)}"
+
+
+def test_a_damaged_ros1_bag_is_not_asked_for_as_if_nothing_was_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes(b"#ROSBAG V2.0\n" + bytes(500))
+    assert cli.main(["start", str(cut), "--out", str(tmp_path / "mine")]) == 3
+    said = " ".join(capsys.readouterr().out.split())
+    assert "ROS 1 bag cannot be read" in said
+    assert "what can be done for each is said above" in said
+
+
+def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> None:
+    """Training of the Burgers in the twin ended with the rule "success" needs success."""
+    file = tmp_path / "p.toml"
+    for goal, settings in (("route", ["practice.rule=success"]), ("none", [])):
+        file.write_text(WAREHOUSE.replace('goal = "route"', f'goal = "{goal}"'))
+        assert load_profile(file).task.goal == goal
+        assert practice_settings(file) == settings

@@ -97,6 +97,9 @@ def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_pa
     assert "a row may be drawn 4 times" in said
     said = prepare_new(tmp_path / "a", panel, None, settings).describe()
     assert "50% of each batch;" in said
+    alone = prepare_new(tmp_path / "a", panel, None, [*settings, "env.twin=false"]).describe()
+    assert "all of each batch;" in alone
+    assert "in the twin" not in alone
 
 
 def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:

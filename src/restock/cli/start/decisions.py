@@ -85,6 +85,11 @@ def has_goal(profile: Path | str | None) -> bool:
     return load_profile(str(profile)).task.goal != "none"
 
 
+def practice_settings(profile: Path | str | None) -> list[str]:
+    """Practice of missions that go wrong, where a mission can."""
+    return ["practice.rule=success"] if has_goal(profile) else []
+
+
 def no_room(floor: Ended) -> str | None:
     """Why nothing can be driven on the floor that there is; None where something can."""
     if floor.good and floor.document.get("episodes") == []:
@@ -188,6 +193,7 @@ __all__ = [
     "mistrust",
     "no_room",
     "of_other_kinds",
+    "practice_settings",
     "robot_line",
     "several_kinds",
     "updates_settings",

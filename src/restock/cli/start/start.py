@@ -158,6 +158,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         mistrust,
         no_room,
         of_other_kinds,
+        practice_settings,
         robot_line,
         several_kinds,
         updates_settings,
@@ -187,6 +188,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     salvaging = "add --salvage to this command: it reads what is intact of damaged recordings"
     if not (found.good or readable):
         known = "name a file, a bag's folder, or a folder of bags"
+        if any("cannot be read" in why for why in found.errors):
+            known = "what can be done for each is said above; or name other recordings"
         return Stop(
             "no recording can be read",
             (salvaging if any("--salvage" in why for why in found.errors) else known,),
@@ -255,7 +258,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             ),
         )
     twin = asked.twin != "no"
-    settings = ["practice.rule=success"]
+    settings = practice_settings(to.profile)
     if twin:
         floor = work.do(stages.floor(to))
         if not floor.good and to.map is not None:
