@@ -8,6 +8,7 @@ puts against other writers; Parquet is read and written by Arrow's S3 client, wh
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -223,13 +224,13 @@ class Location:
 
     def times(self, folder: str) -> dict[str, float]:
         """The files below a folder of the store, by their paths in it, and when each was written:
-        seconds since 1970."""
+        seconds since 1970; infinity where that is not known."""
         with self.translate_errors():
             infos = self.files.get_file_info(
                 pa.fs.FileSelector(folder, recursive=True, allow_not_found=True)
             )
         return {
-            info.path.removeprefix(f"{folder}/"): info.mtime_ns * 1e-9
+            info.path.removeprefix(f"{folder}/"): (info.mtime_ns or math.inf) * 1e-9
             for info in infos
             if info.is_file
         }

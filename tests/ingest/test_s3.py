@@ -13,15 +13,18 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from support.cameras import camera_bag, picture, profile_with
 from support.paths import ROOT
 from support.s3_server import BUCKET, address
 from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import StoreError
+from restock.ingest.pipeline import ingest
 from restock.ingest.store import location
 from restock.ingest.store.location import Location
 from restock.ingest.store.writer import TRANSITIONS, StoreWriter
+from restock.replay.store.frames import camera_frames
 from restock.replay.store.store import Store, is_store
 
 boto3 = pytest.importorskip("boto3")
@@ -72,6 +75,17 @@ def test_every_verb_of_a_store_takes_the_address(place, tmp_path, run):
     assert (said["a"]["rows"], said["b"]["rows"]) == (0, count)
     code, said, err = run("gaps", place)
     assert (code, err, said["store_version"]) == (0, "", 1)
+
+
+def test_frames_of_cameras_lie_there_too(place, tmp_path):
+    bag = camera_bag(tmp_path / "bag")
+    for _ in range(2):
+        ingest(bag, profile_with(), store=StoreWriter(place), force=True)
+    assert StoreWriter(place).clean() == []  # what was replaced is kept for its window
+    with Store(place) as store:
+        frames = list(camera_frames(store, "FROM transitions WHERE step_index = 3", "rear"))
+    assert [frame.frame_index for frame in frames] == [6]
+    assert (frames[0].image() == picture(6)).all()
 
 
 def test_of_two_writers_of_one_version_the_second_is_refused(place, monkeypatch):
