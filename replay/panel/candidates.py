@@ -91,12 +91,12 @@ def read_candidates(
         with any_order(connection):
             # Text becomes codes batch by batch: whole columns of it would be most of the memory.
             reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
+            batches = [_encoded(batch) for batch in reader]
             schema = _schema(reader.schema)
-            table = pa.Table.from_batches([_encoded(batch) for batch in reader], schema)
     except duckdb.Error as error:
         _blame(connection, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
-    return _in_order(table.unify_dictionaries())
+    return _in_order(batches, schema)
 
 
 def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
@@ -116,8 +116,13 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
         connection.execute("RESET preserve_insertion_order")
 
 
-def _in_order(table: pa.Table) -> pa.Table:
-    """The rows by recording, episode and step; a column at a time, to hold one of them twice."""
+def _in_order(batches: list[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
+    """The rows by recording, episode and step; a column at a time, to hold one of them twice.
+
+    Empties `batches`, which are freed on the way.
+    """
+    table = pa.Table.from_batches(batches, schema).unify_dictionaries()
+    batches.clear()
     recording = table["recording_id"].combine_chunks()
     rank = np.empty(len(recording.dictionary), np.int64)
     rank[pc.array_sort_indices(recording.dictionary).to_numpy()] = np.arange(len(rank))
@@ -155,7 +160,10 @@ def _schema(schema: pa.Schema) -> pa.Schema:
 def _encoded(batch: pa.RecordBatch) -> pa.RecordBatch:
     schema = _schema(batch.schema)
     columns = [
-        column.cast(pa.string()).dictionary_encode() if field.name in _TEXT else column
+        column.cast(pa.string()).dictionary_encode()
+        if field.name in _TEXT
+        # A copy: any column of DuckDB's batch holds all of it, text too.
+        else pa.concat_arrays([column, column[:0]])
         for column, field in zip(batch.columns, schema, strict=True)
     ]
     return pa.RecordBatch.from_arrays(columns, schema=schema)
