@@ -309,7 +309,7 @@ def heading(html: str) -> str:
 def test_the_headline_is_a_comparison_with_its_interval(html: str) -> None:
     assert re.fullmatch(
         r"Worse than the planner in wheel slip \(−80 points \[−95, −6\d\]\);"
-        r" no difference shown in nominal",
+        r" no difference is shown in nominal",
         heading(html),
     )
     lead = html.split('<p class="lead">')[1].split("</p>")[0]
@@ -405,7 +405,25 @@ def test_figures_as_files(run: Path, tmp_path: Path) -> None:
 
 def test_a_clear_loss_to_the_planner_is_said(html: str) -> None:
     assert "Worse than the planner in wheel slip: 20% against 100%" in html
-    assert "Worse than the planner in nominal" not in html  # the intervals overlap
+    assert "Worse than the planner in nominal" not in html
+
+
+def test_headline_and_callout_tell_no_difference_of_few_episodes(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "run")
+    file = copy / "eval" / "episodes.parquet"
+    table = pq.read_table(file)
+    slips = pa.compute.equal(table["condition"], "wheel_slip")
+    late = pa.compute.greater(
+        table["episode_seed"], pa.compute.min(table["episode_seed"]).as_py() + 3
+    )
+    pq.write_table(table.filter(pa.compute.invert(pa.compute.and_(slips, late))), file)
+    html = build_report(copy).read_text(encoding="utf-8")
+    assert re.fullmatch(
+        r"No difference from the planner is shown in nominal \(.* points \[.*\]\);"
+        r" too few episodes to tell a difference in wheel slip \(−\d+ points\)",
+        heading(html),
+    )
+    assert "Worse than the planner" not in html
 
 
 def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> None:

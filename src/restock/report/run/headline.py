@@ -51,9 +51,10 @@ def baseline(facts: Facts) -> str | None:
     return next((name for name in BASELINES if facts.clean_cells(name)), None)
 
 
-def compared(facts: Facts) -> Rows:
-    """`regression`'s rows against the baseline by perturbation and condition; none without one."""
-    name = baseline(facts)
+def compared(facts: Facts, name: str | None = None) -> Rows:
+    """`regression`'s rows against the baseline, or another that drove the same episodes, by
+    perturbation and condition; none without one."""
+    name = name or baseline(facts)
     if name is None or facts.no_goal:
         return []
     try:
@@ -61,6 +62,19 @@ def compared(facts: Facts) -> Rows:
     except RunError:  # the episodes have no success that can be compared
         return []
     return [row for row in rows if row["condition"] != EVERY]
+
+
+def losses(facts: Facts) -> list[str]:
+    """Where the run's policy is worse than the planner or the clone of whoever drove the logs."""
+    return [
+        f"Worse than {BASELINES[name]} in {words(row['condition'])}"
+        + ("" if row["perturbation"] == "none" else f" under {row['perturbation']}")
+        + f": {row['candidate']:.0%} against {row['baseline']:.0%}"
+        for name in ("planner", "cloned")
+        if facts.clean_cells(name)
+        for row in compared(facts, name)
+        if row["verdict"] == "worse"
+    ]
 
 
 def _against_baseline(facts: Facts) -> str:
@@ -80,16 +94,33 @@ def _against_baseline(facts: Facts) -> str:
         for verdict in ("better", "worse")
         if by[verdict]
     ]
-    rest = [row for row in rows if row["verdict"] not in by]
-    if not parts:
-        widest = min(rows, key=lambda row: row["difference"] or 0.0)
-        names = "any condition" if len(rows) > 1 else words(rows[0]["condition"])
-        text = f"No difference from {who} is shown in {names}"
-        return f"{text}; the lowest is {_difference(widest)} in {words(widest['condition'])}"
+    same = [row for row in rows if row["verdict"] == "no difference shown"]
+    few = [row for row in rows if row["verdict"] not in (*by, "no difference shown")]
+    if same:
+        against = "" if parts else f" from {who}"
+        names = _listed([words(row["condition"]) for row in same])
+        alone = not parts and len(same) == len(rows) > 1
+        parts.append(f"no difference{against} is shown in {'any condition' if alone else names}")
+        if against and len(same) == 1:
+            parts[-1] += f" ({_difference(same[0])})"
+        elif against:
+            lowest = min(same, key=lambda row: row["difference"])
+            parts[-1] += f"; the lowest is {_difference(lowest)} in {words(lowest['condition'])}"
+    if few:
+        against = "" if parts else f" from {who}"
+        parts.append(f"too few episodes to tell a difference{against} in {_few(few)}")
     text = "; ".join(parts)
-    if rest:
-        text += "; no difference shown in " + _listed([words(row["condition"]) for row in rest])
     return text[0].upper() + text[1:]
+
+
+def _few(rows: Rows) -> str:
+    return _listed(
+        [
+            words(row["condition"])
+            + ("" if row["difference"] is None else f" ({_signed(row['difference'])} points)")
+            for row in rows
+        ]
+    )
 
 
 def _named(rows: Rows) -> str:
@@ -103,11 +134,9 @@ def _listed(names: list[str]) -> str:
 
 
 def _difference(row: dict[str, Any]) -> str:
-    """Points of success, with the interval where there is one."""
-    value = f"{_signed(row['difference'])} points"
-    if row["difference_low"] is None:
-        return f"{value}, too few episodes for an interval"
-    return f"{value} [{_signed(row['difference_low'])}, {_signed(row['difference_high'])}]"
+    """Points of success, with their interval."""
+    low, high = _signed(row["difference_low"]), _signed(row["difference_high"])
+    return f"{_signed(row['difference'])} points [{low}, {high}]"
 
 
 def _signed(value: float) -> str:
@@ -175,4 +204,4 @@ def _told(row: dict[str, Any], name: str, form: str) -> str:
     return f"{row[name]:{form}}{ends}".replace("-", "−")
 
 
-__all__ = ["BASELINES", "baseline", "compared", "headline", "lead"]
+__all__ = ["BASELINES", "baseline", "compared", "headline", "lead", "losses"]

@@ -21,6 +21,7 @@ from restock.report.look.blocks import (
 )
 from restock.report.run import shares
 from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
+from restock.report.run.headline import losses
 from restock.report.run.logs_alone import table as off_policy_table
 
 
@@ -69,7 +70,7 @@ def success(facts: Facts) -> Section | None:
         else "Success per kind of episode, on the same seeded episodes for every policy, clean and"
         f" under each perturbation. Lines are 95 % Wilson intervals. {facts.evaluation}"
         + "".join(f" {one.text}." for one in facts.clones),
-        callout="" if facts.no_goal else "; ".join(_regressions(facts)),
+        callout="" if facts.no_goal else "; ".join(losses(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=tables,
     )
@@ -124,27 +125,6 @@ def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
     low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
     ends = "" if low is None else f" [{low:{form}}, {high:{form}}]"
     return f"{row[name]:{form}}{unit}{ends}"
-
-
-_REFERENCES = {"planner": "the planner", "cloned": "the logs' drivers, cloned,"}
-
-
-def _regressions(facts: Facts) -> list[str]:
-    """Where the agent is clearly worse than planner or clone: the intervals do not overlap."""
-    agent = {
-        (row["perturbation"], row["cell"]): row for row in facts.cells if row["policy"] == "agent"
-    }
-    lines = []
-    for other in facts.cells:
-        row = agent.get((other["perturbation"], other["cell"]))
-        who = _REFERENCES.get(other["policy"])
-        if who is not None and row is not None and row["high"] < other["low"]:
-            where = "" if row["perturbation"] == "none" else f" under {row['perturbation']}"
-            lines.append(
-                f"Worse than {who} in {words(row['cell'])}{where}: {row['success']:.0%}"
-                f" against {other['success']:.0%}"
-            )
-    return lines
 
 
 def sampled(facts: Facts) -> Section:
