@@ -25,7 +25,7 @@ import pyarrow as pa
 from harness import finish, markdown, option_parser, run_restock
 
 from restock.replay import Store, measure_drift
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.report import write_drift_page
 from restock.train.twin.recording.recorder import FIRST_NS, HARDWARE
 from restock.twin import Perturbation, RecordingPlan, record

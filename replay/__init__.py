@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from restock.public import lazy
 from restock.replay.store.computed import INSTALLERS
 
-INSTALLERS.append("restock.replay.panel.mixture_tables:install_mixtures")
-INSTALLERS.append("restock.replay.fleet.gap_tables:install_gaps")
+INSTALLERS["mixture", "mixture_rows"] = "restock.replay.panel.mixture_tables:install_mixtures"
+INSTALLERS["gaps",] = "restock.replay.fleet.gap_tables:install_gaps"
 
 if TYPE_CHECKING:
     from restock.replay.export.dataset import export_dataset as export_dataset

@@ -16,7 +16,7 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store, is_store, read_parquet
 
 RUN_CONFIG = "config.json"
@@ -31,7 +31,8 @@ def open_place(
     only_store: bool = False,
     version: Version | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A connection with the views of a store, a run or a panel.
+    """A connection with the views of a store, a run or a panel: for `query` or `install_named`,
+    which make those views of a store that a text names.
 
     Args:
         path: the place: a folder, or `s3://bucket/prefix` for a store.
@@ -47,8 +48,8 @@ def open_place(
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
         with Store(place, version=version, memory_limit=memory_limit) as store:
-            _add_all(store.connection, beside)
-            yield store.connection
+            _add_all(store.bare, beside)
+            yield store.bare
         return
     path = place.folder
     if version is not None:

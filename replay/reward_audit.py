@@ -20,7 +20,8 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, run_audits
-from restock.replay.store.query import install_named, values
+from restock.replay.store.definitions import install_named
+from restock.replay.store.query import found
 
 DISCOUNT = 0.99  # of a store's rows, unless another is asked for
 NAMES = ("reward_order", "reward_undetermined")
@@ -72,7 +73,7 @@ def audit_reward(
         if of_run:
             _check_evaluated(connection, Path(place))
         else:
-            install_named(connection, "driven_episodes")
+            install_named(connection, "driven_episodes returns_of return_order")
             connection.execute(
                 "CREATE OR REPLACE VIEW driven_episodes AS"
                 f" FROM discounted_episodes({float(discount)!r})"
@@ -113,5 +114,5 @@ def _check_evaluated(connection: duckdb.DuckDBPyConnection, run: Path) -> None:
 
 
 def _rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, Any]]:
-    relation = connection.sql(query)
-    return [dict(zip(relation.columns, row, strict=True)) for row in values(relation)]
+    columns, rows = found(connection, query)
+    return [dict(zip(columns, row, strict=True)) for row in rows]

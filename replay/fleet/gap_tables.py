@@ -43,7 +43,7 @@ COLUMNS = {
 
 def install_gaps(store: Store) -> None:
     """Make the macro in a store's connection; it plans on one of its own, at the same version."""
-    limit = store.connection.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
+    limit = store.bare.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
     path, version = store.path, store.version
 
     @functools.lru_cache(maxsize=1)
@@ -64,10 +64,10 @@ def install_gaps(store: Store) -> None:
             )
         return shopping_list(yields, gaps)
 
-    install_function(store.connection, "planned_gaps", COLUMNS, gaps_table, planned)
+    install_function(store.bare, "planned_gaps", COLUMNS, gaps_table, planned)
     store.checks.append(functools.partial(check_names, ("gaps",)))
     text = files("restock.replay.fleet").joinpath("gap_tables.sql").read_text(encoding="utf-8")
-    store.connection.execute(text)
+    store.bare.execute(text)
 
 
 def gaps_table(found: ShoppingList) -> pa.Table:

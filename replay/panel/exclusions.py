@@ -16,7 +16,7 @@ from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
-from restock.replay.store.query import install_repeated_rows
+from restock.replay.store.definitions import install_repeated_rows
 
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.

@@ -62,7 +62,7 @@ _RENAMED = {"stratum": "name", "drawn_share": "share"}  # to the fields of `Stra
 
 def install_mixtures(store: Store) -> None:
     """Make both macros in a store's connection."""
-    limit = store.connection.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
+    limit = store.bare.sql("SELECT current_setting('memory_limit')").fetchall()[0][0]
 
     @functools.lru_cache(maxsize=1)
     def planned(name: str, _changed_ns: int) -> PanelPlan:
@@ -80,10 +80,10 @@ def install_mixtures(store: Store) -> None:
         ("planned_strata", STRATA, strata_table),
         ("planned_rows", ROWS, rows_table),
     ):
-        install_function(store.connection, function, columns, table_of, planned)
+        install_function(store.bare, function, columns, table_of, planned)
     store.checks.append(functools.partial(check_names, ("mixture", "mixture_rows")))
     text = (files("restock.replay.panel") / "mixture_tables.sql").read_text(encoding="utf-8")
-    store.connection.execute(text)
+    store.bare.execute(text)
 
 
 def check_names(macros: Sequence[str], text: str) -> None:

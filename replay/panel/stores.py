@@ -13,7 +13,7 @@ import msgspec
 from restock.errors import StoreError
 from restock.replay.mixture.mixture import Mixture, OtherStore
 from restock.replay.panel.candidates import STORE_COLUMN
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store, parquet_view
 
 

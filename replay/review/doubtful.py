@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
-from restock.replay.store.query import install_named
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
 LIKELY = 0.2  # from this probability on, steps without a label may be a missed event

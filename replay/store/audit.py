@@ -29,7 +29,8 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
-from restock.replay.store.query import install_named, interruptible, values
+from restock.replay.store.definitions import install_named, rows_held
+from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
 
 Severity = Literal["error", "warning", "info"]
@@ -146,12 +147,13 @@ def run_audits(
         f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
     }
     findings = []
-    for audit in audits:
-        finding = Finding(audit, "skipped", 0, [], [], {})
-        if audit.needs is None or audit.needs in available:
-            finding = _run(connection, audit, thresholds.get(audit.name, {}))
-        findings.append(finding)
-        done(audit.name)
+    with rows_held(connection):
+        for audit in audits:
+            finding = Finding(audit, "skipped", 0, [], [], {})
+            if audit.needs is None or audit.needs in available:
+                finding = _run(connection, audit, thresholds.get(audit.name, {}))
+            findings.append(finding)
+            done(audit.name)
     return sorted(findings, key=lambda one: (WORST_FIRST.index(one.status), one.audit.name))
 
 
@@ -222,8 +224,7 @@ def _run(
 
     def run() -> tuple[list[str], list[tuple[Any, ...]]]:
         install_named(connection, audit.sql)
-        relation = connection.sql(audit.sql, params=dict(thresholds) or None)
-        return relation.columns, values(relation)
+        return found(connection, audit.sql, dict(thresholds) or None)
 
     try:
         columns, rows = interruptible(connection, run)

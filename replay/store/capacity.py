@@ -10,7 +10,8 @@ import duckdb
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.replay.store.query import install_named, interruptible, values
+from restock.replay.store.definitions import install_named
+from restock.replay.store.query import found, interruptible
 
 CELLS_SHARE = 0.95
 EFFECTIVE_EPISODES = 50.0
@@ -68,11 +69,11 @@ def recommend_capacity(
     Raises StoreError where there are no transitions.
     """
 
-    install_named(connection, "capacity_curve")
+    install_named(connection, "capacity_curve capacity_needed")
 
     def ask() -> tuple[list[dict[str, Any]], tuple[Any, ...]]:
-        relation = connection.sql("FROM capacity_curve()")
-        curve = [dict(zip(relation.columns, row, strict=True)) for row in values(relation)]
+        columns, rows = found(connection, "FROM capacity_curve()")
+        curve = [dict(zip(columns, row, strict=True)) for row in rows]
         needed = connection.execute(
             "FROM capacity_needed($cells, $episodes)",
             {"cells": cells_share, "episodes": effective_episodes},

@@ -110,7 +110,7 @@ def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
 
 def markdown() -> str:
     """The tables of docs/sql.md: every view and column."""
-    from restock.replay.store.query import FRAMES, definitions
+    from restock.replay.store.definitions import FRAMES, definitions
 
     with duckdb.connect() as connection:
         connection.register("stored_transitions", transition_schema(2).empty_table())

@@ -7,7 +7,7 @@ from pathlib import Path
 import duckdb
 
 from restock.errors import StoreError
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store, parquet_view
 
 # Written by any newer DuckDB, a file of this version is read by DuckDB 1.4 and later.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from restock.errors import QueryError, StoreError
 from restock.ingest.camera.images import ImageLayout, ImageProblem, pixels
-from restock.replay.store.query import install_named
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
 BATCH_BYTES = 32 << 20  # of images that are in memory together

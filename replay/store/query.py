@@ -1,120 +1,23 @@
-"""Queries: the views and macros of a connection, read-only, with errors worth reading."""
+"""Queries: read-only, with errors worth reading."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from importlib.resources import files
+from functools import partial
 from typing import Any, TypeVar
 
 import duckdb
 
 from restock.errors import QueryError
-from restock.ingest.store.summary import with_included
-from restock.replay.store.column_docs import install_columns
+from restock.replay.store.definitions import install_every, install_named
 
 T = TypeVar("T")
 
-# In their order: a view may use those before it.
-VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
-FRAMES = "frames.sql"  # over stored_frames, which a store alone has
-MACROS = (
-    "macros.sql",
-    "flawed_rows.sql",
-    "capacity.sql",
-    "shared_rows.sql",
-    "repeated_rows.sql",
-    "corrections.sql",
-    "measured_signals.sql",
-    "episode_signals.sql",
-    "drift.sql",
-    "return_order.sql",
-    "returns.sql",
-)
-_INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
-# To bind these takes more than half of the time to open a store: only for queries that name them.
-ON_DEMAND = (
-    ("events.sql", "fleet.sql"),
-    ("measured_signals.sql", "episode_signals.sql", "drift.sql"),
-    ("flawed_rows.sql",),
-    ("exposure.sql",),
-    ("return_order.sql", "returns.sql"),
-    ("capacity.sql",),
-    ("shared_rows.sql", "repeated_rows.sql"),
-    (FRAMES,),
-)
-_LISTS = {
-    "columns",
-    "information_schema",
-    "duckdb_views",
-    "duckdb_columns",
-    "duckdb_tables",
-    "show",
-}
-
+ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
-
-
-def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
-    """Create all views and macros over `stored_transitions` and `stored_recordings`."""
-    connection.execute(definitions(observation_type))
-    install_columns(connection)
-
-
-def install_first(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
-    """Create those that are not ON_DEMAND, of a store; `install_named` makes the others.
-
-    Which ingests it holds is `stored_ingests`, from Delta's log: no need to scan rows for it.
-    """
-    later = {name for group in ON_DEMAND for name in group}
-    first = [name for name in (*VIEWS, *MACROS) if name not in later]
-    text = definitions(observation_type, first)
-    connection.execute(text.replace(_INGESTS, _INGESTS.replace("transitions", "ingests")))
-
-
-def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
-    """Create the views ON_DEMAND that a query (or another text) names, on a store's connection."""
-    words = set(re.findall(r"\w+", text.lower()))
-    every = bool(words & _LISTS)
-    named = [group for group in ON_DEMAND if every or words & _names(group)]
-    if not named:
-        return
-    query = "SELECT view_name FROM duckdb_views() WHERE schema_name = 'main'"
-    there = {name for (name,) in connection.execute(query).fetchall()}
-    if "recordings" not in there:  # a run's or a panel's
-        return
-    for group in named:
-        missing = [name for name in group if not _names((name,)) & there]
-        if missing:
-            connection.execute(definitions(names=missing))
-    if every and "columns" not in there:
-        install_columns(connection)
-
-
-@cache
-def _names(group: Sequence[str]) -> frozenset[str]:
-    """The views and macros of some SQL files."""
-    text = definitions(names=group)
-    return frozenset(re.findall(r"^CREATE OR REPLACE (?:VIEW|MACRO) (\w+)", text, re.MULTILINE))
-
-
-def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
-    """The text of these SQL files, with the type that observations are cast to."""
-    folder = files("restock.replay.store")
-    text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    whole = with_included("\n".join(text), folder)
-    return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
-
-
-def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the macro `repeated_rows`, over any `transitions`."""
-    query = "SELECT view_name FROM duckdb_views() WHERE view_name = 'shared_rows'"
-    there = connection.execute(query).fetchall()  # that of a store need not scan
-    names = ["repeated_rows.sql"] if there else ["shared_rows.sql", "repeated_rows.sql"]
-    connection.execute(definitions(names=names))
 
 
 def query(
@@ -141,8 +44,9 @@ def query(
     install_named(connection, text)
     try:
         for statement in statements[:-1]:
-            connection.execute(statement).fetchall()
-        relation = connection.sql(_counted(connection, statements[-1].query))
+            _named(connection, partial(connection.execute, statement)).fetchall()
+        last = _counted(connection, statements[-1].query)
+        relation = _named(connection, partial(connection.sql, last))
     except duckdb.Error as error:
         raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
     if relation is None:
@@ -150,6 +54,17 @@ def query(
             "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
         )
     return relation
+
+
+def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
+    """Do it again with every view of a store where one is not found: a text may put the name of
+    a view together, and of a misspelt one DuckDB says which it is like."""
+    try:
+        return job()
+    except duckdb.CatalogException:
+        if not install_every(connection):
+            raise
+        return job()
 
 
 # `SELECT count(*) FROM transitions`, alone: Delta's log has the answer.
@@ -195,11 +110,27 @@ def fetch(
     return interruptible(connection, run)
 
 
+def found(
+    connection: duckdb.DuckDBPyConnection, text: str, given: Mapping[str, Any] | None = None
+) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Column names and rows of a query with its `$name` parameters; times as `values` has them.
+
+    It is bound once: over many views that takes longer than to run it over a small store.
+    """
+    connection.execute(text, given)
+    columns = connection.description or []
+    if any(str(column[1]) == ZONED for column in columns):
+        return [column[0] for column in columns], values(connection.sql(text, params=given))
+    return [column[0] for column in columns], connection.fetchall()
+
+
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
     """The rows of a relation; times with a zone as text in UTC."""
+    if ZONED not in map(str, relation.types):
+        return relation.fetchall()
     columns = [
         f"timezone('UTC', #{place})::VARCHAR || 'Z' AS \"{name}\""
-        if str(kind) == "TIMESTAMP WITH TIME ZONE"
+        if str(kind) == ZONED
         else f"#{place}"
         for place, (name, kind) in enumerate(
             zip(relation.columns, relation.types, strict=True), start=1

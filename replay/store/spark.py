@@ -15,7 +15,7 @@ from restock.ingest.store.location import Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
 from restock.ingest.task.tags import NAMED
-from restock.replay.store.query import VIEWS, definitions
+from restock.replay.store.definitions import VIEWS, definitions
 from restock.replay.store.store import is_store
 
 

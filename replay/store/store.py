@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import duckdb
 import msgspec
 import pyarrow as pa
-import pyarrow.compute as pc
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
@@ -40,8 +39,9 @@ from restock.ingest.store.writer import (
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
-from restock.replay.store.computed import install_computed
-from restock.replay.store.query import definitions, install_first, query
+from restock.replay.store.computed import computed
+from restock.replay.store.definitions import Definitions, install_common
+from restock.replay.store.query import query
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
@@ -77,7 +77,8 @@ class Store:
             newest.
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
-    `version` is of the transitions table, `files` the Parquet files of each table.
+    `version` is of the transitions table, `files` the Parquet files of each table, `bare` the
+    connection with those views only that a query has named.
 
     Raises:
         StoreError: nothing there, not a store, no such version, or it cannot be reached.
@@ -96,7 +97,7 @@ class Store:
         recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
-        self.connection = duckdb.connect(
+        self.bare = duckdb.connect(
             config={"temp_directory": self._spill.name, "autoinstall_known_extensions": False}
         )
         if memory_limit is not None:
@@ -119,8 +120,8 @@ class Store:
         self._ingests = ingests_table(held)
         try:
             self._manifests = self._held(self._recordings)
-            self._present_all(self.connection, "main")
-            self._present(self.connection, "main", self._frames())
+            self._present_all(self.bare, "main")
+            self._present(self.bare, "main", self._frames())
         except StoreError as error:
             if version is None:
                 raise
@@ -134,9 +135,12 @@ class Store:
         self.observation_type = self._observation_type()
         # Of a query's text, before it runs: what only fails while rows are fetched is said here.
         self.checks: list[Callable[[str], None]] = []
-        install_first(self.connection, self.observation_type)
-        self._install_summaries()
-        install_computed(self)
+        self._definitions = Definitions(
+            self.bare,
+            self.observation_type,
+            summaries=self._present_summaries(),
+            computed=computed(self),
+        )
 
     def __enter__(self) -> Store:
         return self
@@ -147,9 +151,15 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {self.path} version {self.version}>"
 
+    @property
+    def connection(self) -> duckdb.DuckDBPyConnection:
+        """With the common views and macros; those that take long to bind `install_named` makes."""
+        self._definitions.make_common()
+        return self.bare
+
     def close(self) -> None:
         """Close the connection and remove its temporary files."""
-        self.connection.close()
+        self.bare.close()
         self._spill.cleanup()
 
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
@@ -158,16 +168,17 @@ class Store:
         Raises QueryError with DuckDB's message, or where the query would write; ConfigError where
         it names a mixture that there is not.
         """
+        self._definitions.make(text)
         for check in self.checks:
             check(text)
-        return query(self.connection, text, where=str(self.path))
+        return query(self.bare, text, where=str(self.path))
 
     def conditions(self) -> tuple[Condition, ...]:
         """The conditions that labelled the store's rows, of the newest ingest.
 
         Only what the table keeps of them: name, timing, priority and SQL.
         """
-        rows = self.connection.sql(
+        rows = self.sql(
             "SELECT conditions_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
         if not rows:
@@ -176,7 +187,7 @@ class Store:
 
     def exposures(self) -> tuple[Condition, ...]:
         """The exposures listed beside them, of the newest ingest; an older store has none."""
-        rows = self.connection.sql(
+        rows = self.sql(
             "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
         found = self._decode(rows[0][0] or "[]", list[Condition], "exposures") if rows else []
@@ -184,7 +195,8 @@ class Store:
 
     def profile_name(self, task_hash: str) -> str:
         """The profile that read the rows of a task, by the newest ingest; "" where none did."""
-        profiles = profiles_of(self.connection, task_hash)
+        self._definitions.make("recordings")
+        profiles = profiles_of(self.bare, task_hash)
         return profiles[0].name if profiles else ""
 
     def task_hashes(self) -> list[str]:
@@ -239,7 +251,7 @@ class Store:
             ) from error
 
     def _read_tasks(self) -> dict[str, str]:
-        rows = self.connection.sql(
+        rows = self.bare.sql(
             "SELECT DISTINCT task_hash, task_json FROM stored_recordings"
             " WHERE ingest_id IN (SELECT ingest_id FROM stored_ingests) ORDER BY ALL"
         ).fetchall()
@@ -267,17 +279,20 @@ class Store:
         connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
         try:
             self._present_all(connection, schema)
-            install_first(connection, self.observation_type)
+            install_common(connection, self.observation_type)
         finally:
             connection.execute("USE main")
 
-    def _install_summaries(self) -> None:
-        """The common views over what manifests keep, where all do; else rows are scanned."""
-        told = self._manifests.filter(pc.equal(self._manifests["summary_version"], SUMMARY_VERSION))
-        every = pc.is_in(self._ingests["ingest_id"], told["ingest_id"])
-        if len(every) and pc.all(every).as_py():
-            self._present(self.connection, "main", self._summaries)
-            self.connection.execute(definitions(names=["summaries.sql"]))
+    def _present_summaries(self) -> bool:
+        """`stored_summaries`, where every manifest has one; else rows are scanned."""
+        versions = self._manifests["summary_version"].to_pylist()
+        told = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
+        summarised = {ingest_id for ingest_id, version in told if version == SUMMARY_VERSION}
+        held = self._ingests["ingest_id"].to_pylist()
+        if not held or not summarised.issuperset(held):
+            return False
+        self._present(self.bare, "main", self._summaries)
+        return True
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """`stored_ingests`, what the files hold, and a view `stored_…` of each table.
@@ -291,10 +306,13 @@ class Store:
 
     def _frames(self) -> _Stored:
         """The frames of cameras that the manifests of its rows name."""
-        live = self._manifests.filter(
-            pc.is_in(self._manifests["ingest_id"], self._ingests["ingest_id"])
-        )
-        return _Stored("stored_frames", FRAMES, frame_schema(), frame_files(live))
+        files = frame_files(self._manifests)
+        if files:
+            import pyarrow.compute as pc  # slow to import
+
+            held = pc.is_in(self._manifests["ingest_id"], self._ingests["ingest_id"])
+            files = frame_files(self._manifests.filter(held))
+        return _Stored("stored_frames", FRAMES, frame_schema(), files)
 
     def _present(self, connection: duckdb.DuckDBPyConnection, schema: str, table: _Stored) -> None:
         if table.paths and self.path.folder is not None:
@@ -349,7 +367,7 @@ class Store:
 
     def _set_memory(self, limit: str) -> None:
         try:
-            self.connection.execute(f"SET memory_limit = '{limit}'")
+            self.bare.execute(f"SET memory_limit = '{limit}'")
         except duckdb.Error as error:
             raise StoreError(
                 f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
@@ -461,7 +479,10 @@ def read_parquet(
         StoreError: one of them is missing or damaged.
     """
     try:
-        connection.execute(parquet_view(view, files, schema=schema, absent=absent, kinds=kinds))
+        if kinds is None:
+            connection.execute(parquet_view(view, files, schema=schema, absent=absent))
+        else:
+            connection.execute(_known_parquet_view(view, files, kinds, schema=schema))
     except duckdb.Error as error:
         where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
         raise StoreError(
@@ -477,27 +498,38 @@ def parquet_view(
     *,
     schema: str | None = None,
     absent: Sequence[str] = (),
-    kinds: Mapping[str, str] | None = None,
 ) -> str:
-    """The statement that makes such a view.
-
-    `kinds` are its columns with DuckDB's types; without them every file is opened to find out,
-    each time that a query names the view.
-    """
-    quoted = ", ".join(_literal(str(file)) for file in files)
+    """The statement that makes such a view; each time that a query names it, every file is opened
+    to find out its columns."""
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
-    columns = "union_by_name = true"
-    if kinds is not None:
-        fields = ", ".join(
-            f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
-            " default_value: NULL}"
-            for column, kind in kinds.items()
-        )
-        columns = f"schema = MAP {{{fields}}}"
     return (
-        f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls} FROM read_parquet([{quoted}], {columns})"
+        f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls}"
+        f" FROM read_parquet({_list(files)}, union_by_name = true)"
     )
+
+
+def _known_parquet_view(
+    view: str, files: Sequence[str | os.PathLike[str]], kinds: Mapping[str, str], *, schema: str
+) -> str:
+    """The statements that make a view of columns of these types. The lists are variables of the
+    connection: as part of the view they would be read again wherever a query names it."""
+    fields = ", ".join(
+        f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
+        " default_value: NULL}"
+        for column, kind in kinds.items()
+    )
+    named = {f"{schema}_{view}_files": _list(files), f"{schema}_{view}_types": f"MAP {{{fields}}}"}
+    variables = [f'SET VARIABLE "{name}" = {value};' for name, value in named.items()]
+    files_name, types_name = map(_literal, named)
+    return (
+        f'{" ".join(variables)} CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM'
+        f" read_parquet(getvariable({files_name}), schema = getvariable({types_name}))"
+    )
+
+
+def _list(files: Sequence[str | os.PathLike[str]]) -> str:
+    return "[" + ", ".join(_literal(str(file)) for file in files) + "]"
 
 
 def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:

@@ -19,7 +19,7 @@ from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store
 
 

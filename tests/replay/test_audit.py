@@ -32,7 +32,7 @@ from restock.replay.store.audit import (
     run_audits,
     shipped_audits,
 )
-from restock.replay.store.query import install
+from restock.replay.store.definitions import install, install_named
 from restock.replay.store.store import Store
 
 AUDITS = {audit.name: audit for audit in shipped_audits()}
@@ -442,6 +442,7 @@ def beside_panel(store: Path, panel: Path, name: str, spoil: str = "SELECT 1") -
     """What an audit finds of a panel whose held-out list was spoilt."""
     chosen = {name: load_thresholds()[name]} if AUDITS[name].parameters else {}
     with open_place(store, beside={"panel": panel}) as connection:
+        install_named(connection, spoil)
         connection.execute(spoil).fetchall()
         return run_audits(connection, [AUDITS[name]], chosen, beside=["panel"])[0]
 

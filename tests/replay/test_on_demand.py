@@ -1,4 +1,4 @@
-"""Views that take time to bind are there as soon as a query names one of them."""
+"""A store makes the views and macros that a query names, and what they are made of."""
 
 from __future__ import annotations
 
@@ -9,31 +9,100 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock.errors import QueryError
-from restock.replay.store.query import ON_DEMAND, definitions
+from restock.replay.store.audit import load_audits, load_thresholds, run_audits
+from restock.replay.store.definitions import MACROS, VIEWS, definitions, install_named
+from restock.replay.store.query import query
 from restock.replay.store.store import Store
 
+_LISTED = "SELECT view_name FROM duckdb_views() WHERE NOT internal"
 
-def test_every_view_can_be_queried_by_its_name_alone(tmp_path: Path) -> None:
+
+def made(store: Store) -> set[str]:
+    """The views that a store's connection has."""
+    return {name for (name,) in store.bare.execute(_LISTED).fetchall()}
+
+
+def test_every_view_and_macro_can_be_named_alone(tmp_path: Path) -> None:
     path = write_store(tmp_path / "store", [recording_transitions(1)])
-    text = definitions(names=[name for group in ON_DEMAND for name in group])
+    text = definitions(names=[*VIEWS, *MACROS])
     views = re.findall(r"CREATE OR REPLACE VIEW (\w+)", text)
     assert {"events", "coverage_by_week", "drift", "signal_weeks"} <= set(views)
     for view in views:
         with Store(path) as store:
             store.sql(f'FROM "{view.upper()}" LIMIT 1').fetchall()
+    for macro in re.findall(r"CREATE OR REPLACE MACRO (\w+)", text):
+        with Store(path) as store:
+            install_named(store.bare, macro)  # bound when it is made
     with Store(path) as store:
         store.sql("FROM drift_by('month')").fetchall()
 
 
+def test_a_query_has_made_what_it_names_and_no_more(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    with Store(path) as store:
+        assert not made(store) & {"transitions", "recordings", "coverage"}
+        store.sql("SELECT count(*) FROM Transitions").fetchall()
+        assert "transitions" in made(store)
+        assert not made(store) & {"coverage", "coverage_by_condition", "held_conditions"}
+        store.sql("FROM missing_cells").fetchall()
+        assert {"held_conditions", "conditions", "actions"} <= made(store)
+    with Store(path) as store:
+        common = {"transitions", "episodes", "coverage", "label_scores", "corrections"}
+        assert common <= {name for (name,) in store.connection.execute(_LISTED).fetchall()}
+
+
+def test_a_name_that_is_put_together_is_found_and_a_misspelt_one_corrected(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    with Store(path) as store:
+        rows = store.sql("FROM query_table('cover' || 'age')").fetchall()
+        assert rows == store.sql("FROM coverage").fetchall()
+    with Store(path) as store, pytest.raises(QueryError, match='mean "reward_mix"'):
+        store.sql("FROM rewardmix")
+
+
+def test_what_a_query_makes_itself_is_left_as_it_is(tmp_path: Path) -> None:
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    with Store(path) as store:
+        store.sql("CREATE OR REPLACE VIEW drops AS SELECT 'mine' AS reason; FROM drops")
+        assert store.sql("SELECT reason FROM drops").fetchall() == [("mine",)]
+        assert query(store.connection, "FROM drops", where="").fetchall() == [("mine",)]
+
+
+def test_audits_leave_views_as_they_found_them(tmp_path: Path) -> None:
+    """Few rows are held in memory while they run."""
+    path = write_store(tmp_path / "store", [recording_transitions(1)])
+    names = "SELECT table_name FROM duckdb_tables()"
+    plan = "EXPLAIN SELECT sum(reward) FROM transitions"
+    with Store(path) as store:
+        audits = load_audits()
+        during = []
+
+        def done(_: str) -> None:
+            during.append(str(store.bare.execute(plan).fetchall()))
+
+        first = run_audits(store.connection, audits, load_thresholds(), done=done)
+        assert not any("PARQUET" in one for one in during)
+        assert store.bare.execute(names).fetchall() == []
+        after = store.connection.execute(plan).fetchall()
+        assert "PARQUET" in str(after)
+        assert store.sql("SELECT count(reward) FROM transitions").fetchall() == [
+            (len(recording_transitions(1)),)
+        ]
+        again = run_audits(store.bare, audits, load_thresholds())
+        assert [(one.audit.name, one.rows) for one in first] == [
+            (one.audit.name, one.rows) for one in again
+        ]
+
+
 def test_lists_of_views_have_all_of_them(tmp_path: Path) -> None:
     path = write_store(tmp_path / "store", [recording_transitions(1)])
-    for query in (
+    for text in (
         "SELECT DISTINCT view FROM columns",
         "SELECT table_name FROM information_schema.tables",
         "SELECT name FROM (SHOW ALL TABLES)",
     ):
         with Store(path) as store:
-            names = {name for (name,) in store.sql(query).fetchall()}
-        assert {"transitions", "events", "drift", "columns"} <= names, query
+            names = {name for (name,) in store.sql(text).fetchall()}
+        assert {"transitions", "events", "drift", "columns"} <= names, text
     with Store(path) as store, pytest.raises(QueryError, match="no_such_view"):
         store.sql("FROM no_such_view")

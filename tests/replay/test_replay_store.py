@@ -272,7 +272,7 @@ def test_a_memory_limit_is_kept(store_path: Path) -> None:
 
 def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
     """views.sql asks for two relations and nothing else."""
-    from restock.replay.store.query import definitions
+    from restock.replay.store.definitions import definitions
 
     with duckdb.connect() as connection:
         connection.register("stored_transitions", transitions)

@@ -21,7 +21,7 @@ from restock import cli
 from restock.errors import RunError
 from restock.replay.reward_audit import audit_reward
 from restock.replay.store.audit import load_audits, load_thresholds
-from restock.replay.store.query import definitions
+from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store
 from restock.stats import wilson
 from restock.train.run.kept_evaluations import add_evaluation

@@ -17,7 +17,7 @@ from restock.errors import StoreError
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.column_docs import view_docs
-from restock.replay.store.query import MACROS, definitions
+from restock.replay.store.definitions import MACROS, definitions
 from restock.replay.store.spark import install_views, statements
 from restock.replay.store.store import Store
 

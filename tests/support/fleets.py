@@ -15,7 +15,7 @@ import pyarrow as pa
 from deltalake import write_deltalake
 from scipy.signal import lfilter
 
-from restock.replay.store.query import install
+from restock.replay.store.definitions import install
 from support.stores import TASK, manifest, recording_transitions
 
 MONDAY_NS = 1_772_409_600 * 10**9  # 2026-03-02

@@ -1,0 +1,243 @@
+"""The views and macros of a store: their SQL, and which of them a query needs.
+
+DuckDB binds a view when it is made, with all that it is made of: to make all of them takes longer
+than most queries over a small store. So a store's connection gets those that a text names, and
+those that they name in turn.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from importlib.resources import files
+from weakref import WeakKeyDictionary
+
+import duckdb
+
+from restock.ingest.store.summary import with_included
+from restock.replay.store.column_docs import install_columns
+
+# In their order: a view may use those before it.
+VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
+FRAMES = "frames.sql"  # over stored_frames, which a store alone has
+MACROS = (
+    "macros.sql",
+    "flawed_rows.sql",
+    "capacity.sql",
+    "shared_rows.sql",
+    "repeated_rows.sql",
+    "corrections.sql",
+    "measured_signals.sql",
+    "episode_signals.sql",
+    "drift.sql",
+    "return_order.sql",
+    "returns.sql",
+)
+SUMMARIES = "summaries.sql"  # in place of others of the same name, where manifests have summaries
+# What `Store.connection` has from the start, for those who ask it without `install_named`.
+COMMON = ("rows.sql", "views.sql", "labels.sql", "macros.sql", "corrections.sql")
+# Views that others are made of. Of FEW_ROWS they are held in memory where many queries follow: to
+# bind a table takes a tenth of the time, and its columns are read once.
+HELD = (
+    "recordings",
+    "transitions",
+    "episodes",
+    "conditions",
+    "actions",
+    "untold_conditions",
+    "held_conditions",
+)
+FEW_ROWS = 50_000  # of about 1 kB
+_INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
+# A text with one of these words lists what there is.
+_LISTS = {
+    "columns",
+    "information_schema",
+    "duckdb_views",
+    "duckdb_columns",
+    "duckdb_functions",
+    "duckdb_tables",
+    "pg_catalog",
+    "pg_views",
+    "show",
+    "show_tables",
+    "sqlite_master",
+}
+_BEGINS = re.compile(r"^CREATE OR REPLACE (?:VIEW|MACRO) (\w+)", re.MULTILINE)
+
+
+class Definitions:
+    """The views and macros of one connection over `stored_transitions`, `stored_recordings` and
+    `stored_ingests`: which ingests there are, so that no row is scanned for it.
+
+    Args:
+        connection: that of a store.
+        observation_type: what observations are cast to.
+        summaries: take the common views from `stored_summaries`.
+        computed: names of macros -> what makes them, where a text names one.
+    """
+
+    def __init__(
+        self,
+        connection: duckdb.DuckDBPyConnection,
+        observation_type: str,
+        *,
+        summaries: bool = False,
+        computed: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
+    ) -> None:
+        self._connection = connection
+        self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
+        if summaries:
+            self._statements |= _statements(definitions(names=[SUMMARIES]))
+        self._computed = dict(computed or {})
+        self._made: set[str] = set()
+        self._held: list[str] = []
+        _OF[connection] = self
+
+    def make(self, text: str) -> None:
+        """Those that a text names, or all of them where it asks what there is."""
+        words = set(re.findall(r"\w+", text.lower()))
+        if words & _LISTS:
+            self.make_all()
+            return
+        self._make(words)
+        for names in [names for names in self._computed if words & set(names)]:
+            self._computed.pop(names)()
+
+    def make_common(self) -> None:
+        """Those of COMMON."""
+        self._make(_statements(definitions(names=COMMON)))
+
+    def make_all(self) -> None:
+        """Every one, and the view `columns` of them."""
+        self._make(self._statements)
+        for names in list(self._computed):
+            self._computed.pop(names)()
+        if "columns" not in self._made:
+            install_columns(self._connection)
+            self._made.add("columns")
+
+    def _make(self, names: Iterable[str]) -> None:
+        order: dict[str, None] = {}
+        seen: set[str] = set()
+        for name in sorted(names):
+            self._follow(name, order, seen)
+        missing = [name for name in order if name not in self._made]
+        if missing:
+            self._connection.execute("\n".join(self._statements[name] for name in missing))
+            self._made.update(missing)
+
+    def _follow(self, name: str, order: dict[str, None], seen: set[str]) -> None:
+        """Put one after all that it names."""
+        if name in seen or name not in self._statements:
+            return
+        seen.add(name)
+        for other in sorted(_named_in(self._statements[name])):
+            self._follow(other, order, seen)
+        order[name] = None
+
+    def hold(self) -> None:
+        """Have the rows of HELD in memory, as tables of these names."""
+        self._make(HELD)
+        for view in HELD:
+            self._connection.execute(
+                f"CREATE TABLE held_rows AS FROM {view}; DROP VIEW {view};"
+                f" ALTER TABLE held_rows RENAME TO {view}"
+            )
+            self._held.append(view)
+
+    def release(self) -> None:
+        """Forget the rows that are held: who names these views again gets views."""
+        while self._held:
+            view = self._held.pop()
+            self._connection.execute(f"DROP TABLE {view}")
+            self._made.remove(view)
+
+
+_OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, Definitions] = WeakKeyDictionary()
+
+
+def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
+    """Make what a text names, on a store's connection; a run's or a panel's has all it has."""
+    if (made := _OF.get(connection)) is not None:
+        made.make(text)
+
+
+@contextmanager
+def rows_held(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
+    """The views of a store of FEW_ROWS as tables in memory, for as long as many queries follow."""
+    made = _OF.get(connection)
+    if made is None or not _few(connection):
+        yield
+        return
+    try:
+        try:
+            made.hold()
+        except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
+            made.release()
+        yield
+    finally:
+        made.release()
+
+
+def _few(connection: duckdb.DuckDBPyConnection) -> bool:
+    rows = connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0]
+    return rows is not None and rows <= FEW_ROWS
+
+
+def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
+    """Make all there are; False for a connection that is not a store's."""
+    made = _OF.get(connection)
+    if made is not None:
+        made.make_all()
+    return made is not None
+
+
+def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
+    """Create all views and macros over `stored_transitions` and `stored_recordings`."""
+    connection.execute(definitions(observation_type))
+    install_columns(connection)
+
+
+def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
+    """Create those of COMMON, in the schema in use, over that of one store."""
+    connection.execute(_of_store(observation_type, COMMON))
+
+
+def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
+    """The text of these SQL files, with the type that observations are cast to."""
+    folder = files("restock.replay.store")
+    text = [(folder / name).read_text(encoding="utf-8") for name in names]
+    whole = with_included("\n".join(text), folder)
+    return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
+
+
+def install_repeated_rows(connection: duckdb.DuckDBPyConnection) -> None:
+    """Create the macro `repeated_rows`, over any `transitions`; that of a store need not scan."""
+    if connection in _OF:
+        install_named(connection, "repeated_rows")
+    else:
+        connection.execute(definitions(names=["shared_rows.sql", "repeated_rows.sql"]))
+
+
+def _of_store(observation_type: str, names: Sequence[str]) -> str:
+    text = definitions(observation_type, names)
+    return text.replace(_INGESTS, _INGESTS.replace("transitions", "ingests"))
+
+
+@cache
+def _statements(text: str) -> Mapping[str, str]:
+    """Each view and macro that a text makes, by its name."""
+    begins = [*_BEGINS.finditer(text)]
+    ends = [*(one.start() for one in begins[1:]), len(text)]
+    return {one[1]: text[one.start() : end] for one, end in zip(begins, ends, strict=True)}
+
+
+@cache
+def _named_in(statement: str) -> frozenset[str]:
+    """What a statement reads, calls, or has in quotes: there are macros of a view's name."""
+    sql = re.sub(r"--.*", "", statement)
+    found = re.findall(r"\b(?:FROM|JOIN)\s+(\w+)|\b(\w+)\(|'(\w+)'", sql)
+    return frozenset(name for names in found for name in names)
