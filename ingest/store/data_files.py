@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from deltalake.transaction import AddAction
 
@@ -110,6 +109,8 @@ def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:
 def _parts(
     place: Location, name: str, files: Sequence[StoredFile], wanted: pa.Array, schema: pa.Schema
 ) -> Iterator[pa.Table]:
+    import pyarrow.compute as pc  # slow to import
+
     for file in files:
         with place.reading(f"{name}/{file.path}") as source:
             for batch in pq.ParquetFile(source).iter_batches(READ_ROWS):

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.fs
 import pyarrow.parquet as pq
 from deltalake import DeltaTable
@@ -30,6 +29,9 @@ from deltalake.fs import DeltaStorageHandler
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.version import Version, version_at
+
+if TYPE_CHECKING:
+    import pyarrow.compute as pc
 
 # An endpoint that is down or silent is given up after a minute at most.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from deltalake import CommitProperties, DeltaTable, Schema, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError
@@ -112,6 +111,8 @@ class StoreWriter:
 
             with ThreadPoolExecutor(READERS) as pool:
                 parts += pool.map(read, paths)
+        import pyarrow.compute as pc  # slow to import
+
         wanted = pa.array([one.ingest_id for one in ingests], pa.string())
         found = pa.concat_tables(
             [part.replace_schema_metadata(None) for part in parts], promote_options="default"
@@ -122,6 +123,8 @@ class StoreWriter:
         """One recording's transitions, as they were written."""
         with suppress(FileNotFoundError):
             return self.path.read(f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}")
+        import pyarrow.compute as pc  # slow to import
+
         parts = [
             self.path.read(f"{TRANSITIONS}/{file.path}", where=pc.field("ingest_id") == ingest_id)
             for file in self.files(TRANSITIONS)

@@ -40,7 +40,6 @@ import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Meta
 
 from restock.arrays import F32, F64, Bools
@@ -396,6 +395,8 @@ def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[s
 
 def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
     """Which rows (N,) of a column of lists name each of these; a null names none."""
+    import pyarrow.compute as pc  # slow to import
+
     lists = column.combine_chunks()
     lengths = np.asarray(pc.list_value_length(lists).fill_null(0))
     row, named = np.repeat(np.arange(len(lists)), lengths), np.asarray(lists.flatten(), object)

@@ -149,11 +149,12 @@ class Definitions:
             self._held.append(view)
 
     def release(self) -> None:
-        """Forget the rows that are held: who names these views again gets views."""
-        while self._held:
-            view = self._held.pop()
+        """Forget the rows that are held: the tables are views again."""
+        held, self._held = self._held, []
+        for view in held:
             self._connection.execute(f"DROP TABLE {view}")
             self._made.remove(view)
+        self._make(held)
 
 
 _OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, Definitions] = WeakKeyDictionary()

@@ -359,10 +359,12 @@ class Store:
             for path in table.paths
         ]
         wanted = {field.name: field for field in table.schema}
-        # Other tools write text as views or large strings.
-        bare = [
-            part.cast(pa.schema([wanted[name] for name in part.column_names])) for part in parts
-        ]
+        bare = []
+        for part in parts:
+            kinds = pa.schema([wanted[name] for name in part.column_names])
+            if part.schema.types != kinds.types:  # other tools write text as views or large strings
+                part = part.cast(kinds)
+            bare.append(part.replace_schema_metadata(None))
         return pa.concat_tables([table.schema.empty_table(), *bare], promote_options="default")
 
     def _set_memory(self, limit: str) -> None:
