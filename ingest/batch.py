@@ -201,6 +201,9 @@ def warm_up() -> None:
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
     """A worker: one recording after the other, until there are no more, or the parent is gone."""
+    from restock.ingest.containers.mcap_group import ChunkReader
+
+    ChunkReader.ahead = False  # the other workers have the other cores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
     signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()

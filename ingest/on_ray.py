@@ -99,6 +99,9 @@ def _expect(address: str | None) -> None:
 
 def _task(job: IngestJob, path: Path, folder: str, environment: dict[str, str]) -> Result:
     """One recording, on whatever machine."""
+    from restock.ingest.containers.mcap_group import ChunkReader
+
+    ChunkReader.ahead = False  # the task was given one core
     os.environ.update(environment)
     try:
         os.chdir(folder)

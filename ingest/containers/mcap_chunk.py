@@ -107,30 +107,30 @@ def refuse_implausible(chunk: Chunk) -> None:
         raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
 
 
-def inflate(chunk: Chunk, file: Buffer) -> bytes:
-    """The chunk's records, uncompressed and checked against its CRC.
+def inflate(chunk: Chunk, stored: bytes) -> bytes:
+    """The records of a chunk that is stored so, uncompressed and checked against its CRC.
 
     Raises:
         BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
     """
     refuse_implausible(chunk)
-    data = _decompress(chunk.compression, file[chunk.start : chunk.stop], chunk.size)
+    data = _decompress(chunk.compression, stored, chunk.size)
     if len(data) != chunk.size:
         raise BadChunk(f"{len(data):,} bytes uncompressed, where it claims {chunk.size:,}")
     _check(chunk, data)
     return data
 
 
-def inflate_into(chunk: Chunk, file: Buffer, room: NDArray[np.uint8]) -> None:
+def inflate_into(chunk: Chunk, stored: bytes, room: NDArray[np.uint8]) -> None:
     """The same into `room`, which has the chunk's size: memory that is used again costs less.
 
     Raises:
         BadChunk: as `inflate`.
     """
-    if chunk.compression == "zstd" and _unpack(file[chunk.start : chunk.stop], room):
+    if chunk.compression == "zstd" and _unpack(stored, room):
         _check(chunk, room.data)
     else:  # which names what is wrong with it
-        room[:] = np.frombuffer(inflate(chunk, file), np.uint8)
+        room[:] = np.frombuffer(inflate(chunk, stored), np.uint8)
 
 
 def _unpack(stored: bytes, room: NDArray[np.uint8]) -> bool:

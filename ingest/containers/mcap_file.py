@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import RecordingError
+from restock.files import cores
 from restock.ingest.containers import mcap_chunk
 from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
 from restock.ingest.containers.mcap_contents import ROSBAG2, survey
@@ -24,6 +25,7 @@ from restock.ingest.containers.storage import (
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
+LEAST_GROUPS = 4  # to decompress ahead
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
 
@@ -174,8 +176,20 @@ class McapFile:
             self._check_loose()
         for channel, buffer, messages in self._loose(loose):
             yield channel, batch_of(buffer, [messages])
-        for group in self._groups(wanted):
-            yield from self._chunks.read(group, wanted)
+        yield from self._chunks.read(self._groups(wanted), wanted, ahead=self._ahead(wanted))
+
+    def _ahead(self, wanted: set[int]) -> bool:
+        """Whether to decompress on other threads: where there is enough to do and a core for it.
+
+        Of chunks far larger than a group, several at once would take too much memory.
+        """
+        sizes = [sum(chunk.size for chunk in group) for group in self._groups(wanted)]
+        return (
+            ChunkReader.ahead
+            and cores() > 1
+            and len(sizes) >= LEAST_GROUPS
+            and max(sizes) <= 2 * GROUP_BYTES
+        )
 
     def _loose(
         self, channels: Collection[int]

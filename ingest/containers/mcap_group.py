@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from functools import partial
+from itertools import cycle
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +20,10 @@ from restock.ingest.containers.storage import Damage, Integrity
 from restock.ingest.decoding.messages import MessageBatch
 
 _Part: TypeAlias = tuple[Chunk, int, int]  # a chunk, and where it lies: first byte, bytes
+_Room: TypeAlias = tuple[Chunk, int, bytes | None]  # its bytes; of the cut one, what it still holds
+_Outcome: TypeAlias = tuple[Chunk, BadChunk | None]  # what is wrong with it
+
+AHEAD = 1  # groups that are decompressed, each on a thread, while the one before is decoded
 
 
 @dataclass
@@ -49,20 +57,33 @@ class Checks:
         self.unchecked += not chunk.crc
 
 
+class _Inflated(NamedTuple):
+    """What some chunks hold, where each lies in it, and what became of each."""
+
+    buffer: NDArray[np.uint8]
+    parts: list[_Part]
+    outcomes: list[_Outcome]
+
+
 class ChunkReader:
-    """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so."""
+    """Reads the chunks of one file. `cut` is the one in which the file ends, if it ends so.
+
+    `ahead` is of the process: one that reads recordings beside others of its kind sets it False.
+    """
+
+    ahead: ClassVar[bool] = True
 
     def __init__(self, file: FileBytes, checks: Checks, cut: Chunk | None) -> None:
         self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
         self._file, self._checks, self._cut = file, checks, cut
-        self._scratch = np.zeros(0, np.uint8)
+        self._scratch = [np.zeros(0, np.uint8) for _ in range(AHEAD + 1)]
 
     def inflate(self, chunk: Chunk) -> bytes:
         """One chunk's records; nothing where they cannot be read."""
         if chunk is self._cut:
             return mcap_chunk.inflate_partly(chunk, self._file)
         try:
-            data = mcap_chunk.inflate(chunk, self._file)
+            data = mcap_chunk.inflate(chunk, self._file[chunk.start : chunk.stop])
         except BadChunk as bad:
             self._checks.lost(chunk, bad)
             return b""
@@ -75,9 +96,26 @@ class ChunkReader:
             self.walked[chunk.at] = self._walk_part(chunk, self.inflate(chunk))
         return self.walked[chunk.at]
 
-    def read(self, group: list[Chunk], wanted: set[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """The messages of these channels in some chunks; a batch is valid until the next."""
-        buffer, parts = self._inflate_group(group)
+    def read(
+        self, groups: Iterable[list[Chunk]], wanted: set[int], *, ahead: bool = False
+    ) -> Iterator[tuple[int, MessageBatch]]:
+        """The messages of these channels, group by group; a batch is valid until the next.
+
+        With `ahead`, another thread reads and decompresses the next group meanwhile; what is wrong
+        with it is noted, or raised, in its turn.
+        """
+        works = (partial(self._inflate_group, *self._plausible(group)) for group in groups)
+        for inflated in _ahead(works) if ahead else (work(0) for work in works):
+            for chunk, bad in inflated.outcomes:
+                if bad is None:
+                    self._checks.read(chunk)
+                else:
+                    self._checks.lost(chunk, bad)
+            yield from self._messages(inflated.buffer, inflated.parts, wanted)
+
+    def _messages(
+        self, buffer: NDArray[np.uint8], parts: list[_Part], wanted: set[int]
+    ) -> Iterator[tuple[int, MessageBatch]]:
         whole = self._by_index(parts, buffer, wanted)
         located = [whole] if whole is not None else [self._locate(p, buffer, wanted) for p in parts]
         for channel in sorted(set().union(*located)):
@@ -107,49 +145,47 @@ class ChunkReader:
                 located[channel] = messages
         return located
 
-    def _inflate_group(self, group: list[Chunk]) -> tuple[NDArray[np.uint8], list[_Part]]:
-        """What these chunks hold, in memory that is used again, and where; without bad ones."""
-        cut, torn = self._cut, b""
-        if cut is not None and cut in group:
-            torn = mcap_chunk.inflate_partly(cut, self._file)
-        rooms = [
-            (chunk, len(torn) if chunk is cut else chunk.size)
-            for chunk in group
-            if chunk is cut or self._plausible(chunk)
-        ]
-        size = sum(size for _, size in rooms)
-        if len(self._scratch) < size:
-            self._scratch = np.empty(size, np.uint8)
-        parts = []
-        at = 0
-        for chunk, size in rooms:
-            room = self._scratch[at : at + size]
-            if chunk is cut:
-                room[:] = np.frombuffer(torn, np.uint8)
-            elif not self._inflate_into(chunk, room):
+    def _plausible(self, group: list[Chunk]) -> tuple[list[_Room], list[_Outcome]]:
+        """The room that these chunks need, and which are refused."""
+        rooms: list[_Room] = []
+        refused: list[_Outcome] = []
+        for chunk in group:
+            if chunk is self._cut:
+                torn = mcap_chunk.inflate_partly(chunk, self._file)
+                rooms.append((chunk, len(torn), torn))
                 continue
+            try:
+                mcap_chunk.refuse_implausible(chunk)
+            except BadChunk as bad:
+                refused.append((chunk, bad))
+            else:
+                rooms.append((chunk, chunk.size, None))
+        return rooms, refused
+
+    def _inflate_group(self, rooms: list[_Room], refused: list[_Outcome], place: int) -> _Inflated:
+        """What these chunks hold, in one of the memories that are used again; without bad ones."""
+        needed = sum(size for _, size, _ in rooms)
+        if len(self._scratch[place]) < needed:
+            self._scratch[place] = np.empty(needed, np.uint8)
+        scratch, outcomes = self._scratch[place], [*refused]
+        parts: list[_Part] = []
+        at = 0
+        for chunk, size, torn in rooms:
+            room = scratch[at : at + size]
+            if torn is not None:
+                room[:] = np.frombuffer(torn, np.uint8)
+            else:
+                try:
+                    stored = self._file.large(chunk.start, chunk.stop)
+                    mcap_chunk.inflate_into(chunk, stored, room)
+                except BadChunk as bad:
+                    outcomes.append((chunk, bad))
+                    continue
+                outcomes.append((chunk, None))
             if size:
                 parts.append((chunk, at, size))
                 at += size
-        return self._scratch[:at], parts
-
-    def _plausible(self, chunk: Chunk) -> bool:
-        try:
-            mcap_chunk.refuse_implausible(chunk)
-        except BadChunk as bad:
-            self._checks.lost(chunk, bad)
-            return False
-        return True
-
-    def _inflate_into(self, chunk: Chunk, room: NDArray[np.uint8]) -> bool:
-        """Fill the room with the chunk's records, if they can be read."""
-        try:
-            mcap_chunk.inflate_into(chunk, self._file, room)
-        except BadChunk as bad:
-            self._checks.lost(chunk, bad)
-            return False
-        self._checks.read(chunk)
-        return True
+        return _Inflated(scratch[:at], parts, outcomes)
 
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
@@ -177,6 +213,22 @@ class ChunkReader:
         if cut and chunk is not self._cut:
             self._checks.damaged(f"chunk at byte {chunk.at:,}: {cut}", {})
         return positions
+
+
+def _ahead(works: Iterable[Callable[[int], _Inflated]]) -> Iterator[_Inflated]:
+    """What these works give, in their order: the next AHEAD are done while one is used. Each gets
+    the number of a memory that no other of them has."""
+    pool = ThreadPoolExecutor(AHEAD, thread_name_prefix="inflate")
+    waiting: deque[Future[_Inflated]] = deque()
+    try:
+        for place, work in zip(cycle(range(AHEAD + 1)), works):
+            waiting.append(pool.submit(work, place))
+            if len(waiting) > AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:

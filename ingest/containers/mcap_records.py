@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -74,11 +75,18 @@ class FileBytes:
         self._from = start
         return self._window[: max(stop - start, 0)]
 
+    def large(self, start: int, stop: int) -> bytes:
+        """As a slice, of what is read once and is not small; several threads may.
+
+        Raises:
+            RecordingError: the file is shorter than it was when it was opened.
+        """
+        return self._read_file(start, min(stop, self._size))
+
     def _read_file(self, start: int, stop: int) -> bytes:
-        self._file.seek(start)
         parts, left = list[bytes](), stop - start
         while left > 0:
-            part = self._file.read(left)
+            part = os.pread(self._file.fileno(), left, stop - left)
             if not part:
                 raise RecordingError(
                     f"it shrank while it was read: {self._size:,} bytes when it was opened, and"

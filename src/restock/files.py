@@ -132,6 +132,13 @@ def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
     return removed
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def is_running(process: int) -> bool:
     """Whether this machine has a process of that id."""
     try:

@@ -35,7 +35,7 @@ def written(content: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
             span = record["message_start_time"], record["message_end_time"]
             size, crc = record["uncompressed_size"], record["uncompressed_crc"]
             chunk = Chunk(start, low, high, size, crc, record["compression"], span)
-            data = inflate(chunk, content)
+            data = inflate(chunk, content[chunk.start : chunk.stop])
             for inner, at, end in walk(data, 0, len(data)):
                 yield KINDS[Op(inner)], plain(parse(Op(inner), data, at, end), data)
         elif opcode != Op.MESSAGE_INDEX:  # which the JSON leaves out

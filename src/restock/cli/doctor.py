@@ -17,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from restock.errors import ExitCode, RestockError
+from restock.files import cores
 
 EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 FOR_DEVELOPERS = {"dev", "test", "site", "fuzz", "bench"}
@@ -77,11 +78,10 @@ class DoctorCommand:
 def _machine() -> list[Finding]:
     from restock import __version__
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return [
         Finding("restock", "version", "ok", __version__),
         Finding("machine", "python", "ok", platform.python_version()),
-        Finding("machine", "system", "ok", f"{platform.platform()}, {cores} cores"),
+        Finding("machine", "system", "ok", f"{platform.platform()}, {cores()} cores"),
     ]
 
 
