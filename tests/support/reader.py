@@ -217,6 +217,8 @@ def cut_short() -> None:
     """Make what takes minutes take a second; nothing else is changed."""
     import msgspec
 
+    from restock import cli
+    from restock.cli.start import demo
     from restock.train import prepare
     from restock.train.evaluation import eval_run, ope
     from restock.train.study import study_run
@@ -272,6 +274,13 @@ def cut_short() -> None:
     def one_process(*args: Any, **options: Any) -> Any:
         return study(*args, **{**options, "workers": 1})
 
+    @contextmanager
+    def before_it(stage: Any, say: Any) -> Iterator[Any]:
+        """What the demo runs in a process of its own would not be cut short there."""
+        code = cli.main(list(stage.beside)) if stage.beside else 0
+        yield lambda: code
+
+    demo._beside = before_it
     prepare.resolve_config = short_config
     vector_env.WarehouseVectorEnv = short_episodes  # what is recorded drives whole missions
     study_run.run_study = one_process
