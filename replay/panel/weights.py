@@ -23,19 +23,20 @@ boosted, and not the outcomes that the critic sees in each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import duckdb
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.store.store import passed_in
+from restock.replay.panel.candidates import any_order, as_stored
 
+BATCH_ROWS = 4_096  # of observations in memory at a time
+COLUMNS = 16  # of features in memory at a time
 FIT_ROWS = 20_000  # of each outcome, chosen by id
 PENALTY = 1e-3  # L2, on standardised features
 
@@ -242,13 +243,11 @@ class OutcomeModel:
         from scipy.optimize import minimize  # here: no query needs it, and it is slow to import
         from scipy.special import log_softmax
 
-        given = np.asarray(features, np.float64)
-        weight = np.ones(len(given)) if weight is None else weight / weight.mean()
-        self.mean = np.average(given, axis=0, weights=weight)
-        spread = np.sqrt(np.average((given - self.mean) ** 2, axis=0, weights=weight))
+        weight = np.ones(len(features)) if weight is None else weight / weight.mean()
+        self.mean, spread = _moments(features, weight)
         self.scale = np.where(spread > 1e-9, spread, 1.0)
         self.outcomes = outcomes
-        x = self._design(given)
+        x = self._design(features)
         chosen = np.eye(outcomes)[outcome]
 
         def loss(flat: F64) -> tuple[float, F64]:
@@ -276,9 +275,25 @@ class OutcomeModel:
         return np.asarray(softmax(self._design(features) @ self.theta, axis=1), np.float64)
 
     def _design(self, features: NDArray[Any]) -> F64:
+        design = np.ones((len(features), features.shape[1] + 1))
+        scaled = design[:, 1:]
+        np.subtract(features, self.mean, out=scaled)
+        scaled /= self.scale
         # Clipped: an observation unlike any seen is no reason for certainty.
-        scaled = np.clip((np.asarray(features, np.float64) - self.mean) / self.scale, -5.0, 5.0)
-        return np.concatenate([np.ones((len(scaled), 1)), scaled], axis=1)
+        np.clip(scaled, -5.0, 5.0, out=scaled)
+        return design
+
+
+def _moments(features: NDArray[Any], weight: F64) -> tuple[F64, F64]:
+    """Weighted mean and standard deviation of each column (D,), some columns at a time: a copy of
+    all would be the most memory that a panel needs."""
+    mean, spread = np.zeros(features.shape[1]), np.zeros(features.shape[1])
+    for begin in range(0, len(mean), COLUMNS):
+        some = np.asarray(features[:, begin : begin + COLUMNS], np.float64)
+        at = slice(begin, begin + some.shape[1])
+        mean[at] = np.average(some, axis=0, weights=weight)
+        spread[at] = np.sqrt(np.average((some - mean[at]) ** 2, axis=0, weights=weight))
+    return mean, spread
 
 
 @dataclass(frozen=True)
@@ -321,33 +336,30 @@ def estimate_outcomes(
         state = (rows.state_code[at][:, None] == states[None, :]).astype(np.float64)
         return np.concatenate([observation, acted, state], axis=1)
 
-    x = np.empty((len(chosen), 0))
+    held_out = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to validate the fit
+    if held_out.all() or not held_out.any():
+        held_out = np.zeros(len(chosen), np.bool_)
+    last = np.argsort(held_out, kind="stable")  # those held out: both parts are views of x
+    chosen, weight = chosen[last], weight[last]
+    split = len(chosen) - int(held_out.sum())
+    x, y = np.empty((len(chosen), 0), np.float32), label[chosen]
     place_of = {int(row): place for place, row in enumerate(chosen.tolist())}
     for observation, at in _observations(connection, rows.transition_id, chosen):
         made = features(observation, at)
         if not x.shape[1]:
-            x = np.zeros((len(chosen), made.shape[1]))
+            x = np.zeros((len(chosen), made.shape[1]), np.float32)  # exact: as rows are stored
         x[[place_of[int(row)] for row in at]] = made
-    held_out = rows.order[chosen] % np.uint64(5) == 0  # a fifth, to validate the fit
-    if held_out.all() or not held_out.any():
-        held_out = np.zeros(len(chosen), np.bool_)
-    y = label[chosen]
-    model = OutcomeModel(x[~held_out], y[~held_out], len(estimated) + 1, weight[~held_out])
-    validation = held_out if held_out.any() else ~held_out
+    model = OutcomeModel(x[:split], y[:split], len(estimated) + 1, weight[:split])
+    validation = slice(split if split < len(x) else 0, None)
+    base = np.bincount(label, rows.stands_for, len(estimated) + 1) / rows.stands_for.sum()
     fit = RatioFit(
         source,
         names,
-        int((~held_out).sum()),
+        split,
         _log_loss(model.probability(x[validation]), y[validation], weight[validation]),
-        _log_loss(
-            np.tile(
-                np.bincount(label, rows.stands_for, len(estimated) + 1) / rows.stands_for.sum(),
-                (validation.sum(), 1),
-            ),
-            y[validation],
-            weight[validation],
-        ),
+        _log_loss(np.tile(base, (len(y[validation]), 1)), y[validation], weight[validation]),
     )
+    del x
     outcome_of = np.zeros((len(rows.code), len(estimated)), np.float32)
     everything = np.arange(len(rows.code))
     for observation, at in _observations(connection, rows.transition_id, everything):
@@ -364,16 +376,17 @@ def _observations(
     connection: duckdb.DuckDBPyConnection, ids: Ints, at: Ints
 ) -> Iterator[tuple[NDArray[np.float32], Ints]]:
     """Batches of observations (m, D) of the rows `at`, with the rows they are of."""
-    wanted = ids[at]
-    order = np.argsort(wanted)
-    ordered = wanted[order]
-    find: Callable[[Ints], Ints] = lambda these: order[np.searchsorted(ordered, these)]  # noqa: E731
-    with passed_in(connection, ratio_ids=pa.table({"transition_id": wanted})):
-        reader = connection.sql(
-            "SELECT transition_id, observation FROM transitions"
-            " WHERE transition_id IN (SELECT transition_id FROM ratio_ids)"
-        ).to_arrow_reader(16_384)
-        for batch in reader:
+    order = np.argsort(ids[at])
+    wanted = ids[at][order]
+    query = f"SELECT transition_id, observation FROM {as_stored(connection)}"
+    with any_order(connection):
+        # Found here and not by a join, which would hold what it waits for.
+        for batch in connection.sql(query).to_arrow_reader(BATCH_ROWS):
+            these = batch.column("transition_id").to_numpy()
+            place = np.minimum(np.searchsorted(wanted, these), len(wanted) - 1)
+            found = np.flatnonzero(wanted[place] == these)
+            if not len(found):
+                continue
             flat = batch.column("observation").flatten().to_numpy(zero_copy_only=False)
-            size = len(flat) // max(batch.num_rows, 1)
-            yield flat.reshape(-1, size), at[find(batch.column("transition_id").to_numpy())]
+            observation = flat.reshape(-1, len(flat) // batch.num_rows)
+            yield observation[found], at[order[place[found]]]
