@@ -509,7 +509,7 @@ with Store(sys.argv[1], memory_limit="110MB") as store:
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
 def test_a_store_several_times_the_memory_is_packed(tmp_path: Path) -> None:
     task = Task(body=TASK.body, actions=TASK.actions, sectors=76)
-    limit = 440 << 20  # bytes more than the process has once its store is open
+    limit = 480 << 20  # bytes more than the process has once its store is open
     first = recording_transitions(1, episodes=1500, task=task)
     recordings = []
     for number in range(1, 17):
