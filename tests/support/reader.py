@@ -240,6 +240,8 @@ def cut_short() -> None:
             name: msgspec.structs.replace(getattr(config, name), **values)
             for name, values in SHORT.items()
         }
+        if not config.env.twin:  # it drives nothing
+            parts["schedule"] = msgspec.structs.replace(parts["schedule"], env_steps=0)
         return resolve(msgspec.structs.replace(config, **parts), panel)
 
     def one_episode(*args: Any, **options: Any) -> Any:
