@@ -56,7 +56,9 @@ def column_docs() -> dict[tuple[str, str], str]:
     }
     meanings |= {("transitions", column.name): column.meaning for column in COLUMNS}
     meanings |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
-    meanings |= {("frames", column.name): column.meaning for column in FRAME_COLUMNS}
+    meanings |= {
+        ("frames", column.name): column.meaning for column in FRAME_COLUMNS if column.name != "data"
+    }
     return meanings
 
 

@@ -228,6 +228,11 @@ def _of_store(observation_type: str, names: Sequence[str]) -> str:
     return text.replace(_INGESTS, _INGESTS.replace("transitions", "ingests"))
 
 
+def made_by(name: str) -> list[str]:
+    """The views and macros of one of these files."""
+    return list(_statements(definitions(names=[name])))
+
+
 @cache
 def _statements(text: str) -> Mapping[str, str]:
     """Each view and macro that a text makes, by its name."""

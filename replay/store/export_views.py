@@ -7,7 +7,7 @@ from pathlib import Path
 import duckdb
 
 from restock.errors import StoreError
-from restock.replay.store.definitions import definitions
+from restock.replay.store.definitions import FRAMES, definitions, made_by
 from restock.replay.store.store import Store, parquet_view
 
 # Written by any newer DuckDB, a file of this version is read by DuckDB 1.4 and later.
@@ -19,9 +19,11 @@ def init_script(store: Store) -> str:
 
     Paths are absolute, and of the version that is open: write it again after an ingest.
     """
+    beside = set(made_by(FRAMES))  # their files are none of the tables
     columns = ", ".join(
         "(" + ", ".join(_literal(value) for value in row) + ")"
         for row in store.sql("FROM columns").fetchall()
+        if row[0] not in beside
     )
     return "\n".join(
         [

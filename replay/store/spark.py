@@ -116,6 +116,8 @@ if TYPE_CHECKING:
 def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str = "s3") -> None:
     """Give a session the views of a store: transitions, episodes, coverage, missing_cells, …
 
+    Those of camera frames are DuckDB's alone: their files are no Delta table.
+
     They are temporary views over the store's newest version, and stay at it where the session
     plans a query again; call it again after an ingest.
 

@@ -222,7 +222,7 @@ def test_every_column_of_every_view_is_documented(store: Store) -> None:
         for (name,) in store.sql(
             "SELECT view_name FROM duckdb_views() WHERE NOT internal"
         ).fetchall()
-    } - {"stored_transitions", "stored_recordings", "stored_ingests"}
+    } - {f"stored_{name}" for name in ("transitions", "recordings", "ingests", "frames")}
     assert views == set(view_docs())
     there = {(row["view"], row["column_name"]) for row in rows(store, "FROM columns")}
     assert {key for key in column_docs() if key[0] != "shared"} <= there  # no doc of nothing

@@ -17,12 +17,12 @@ from restock.errors import StoreError
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.column_docs import view_docs
-from restock.replay.store.definitions import MACROS, definitions
+from restock.replay.store.definitions import FRAMES, MACROS, definitions
 from restock.replay.store.spark import install_views, statements
 from restock.replay.store.store import Store
 
-# DuckDB's own, and those that lie beside its macros.
-DUCKDBS = {"columns", *re.findall(r"VIEW (\w+) AS", definitions(names=MACROS))}
+# DuckDB's own, those that lie beside its macros, and those of files that are no Delta table.
+DUCKDBS = {"columns", *re.findall(r"VIEW (\w+) AS", definitions(names=(*MACROS, FRAMES)))}
 VIEWS = sorted(set(view_docs()) - DUCKDBS)
 
 

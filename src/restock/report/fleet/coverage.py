@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from restock import __version__
 from restock.replay.fleet.drift import Drift
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 from restock.report.fleet.drift import findings_section
 from restock.report.fleet.drift import headline as drift_headline
@@ -38,6 +39,7 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     """The rows behind every figure of the page."""
     sql = statements("restock.report.fleet", "coverage.sql")
     names = ("shelves", "weeks", "robots", "totals", "bounds")
+    install_named(store.connection, " ".join(sql.values()))
     found = {name: ask(store.connection, sql[name]) for name in names}
     (bounds,) = found["bounds"]
     across = max((bounds["x1"] or 0.0) - (bounds["x0"] or 0.0), 1.0)
