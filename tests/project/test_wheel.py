@@ -10,14 +10,17 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from importlib.metadata import packages_distributions
+from importlib.metadata import packages_distributions, requires
+from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from support.paths import ROOT
 
 NOT_RUNTIME = {"test", "dev", "bench", "fuzz"}
 OPTIONAL = {"h5py"}  # a file format that `restock export` asks for by name
-SHIPPED = {".py", ".sql", ".toml", ".json", ".jinja", ".typed"}
+SHIPPED = {".py", ".sql", ".toml", ".json", ".jinja", ".css", ".js", ".typed"}
 
 
 @pytest.fixture(scope="module")
@@ -84,3 +87,55 @@ def test_every_package_that_is_imported_is_declared() -> None:
                 if owners and not owners & (declared | {"restock"}):
                     undeclared[package] = path.relative_to(ROOT).as_posix()
     assert not undeclared
+
+
+def installed_with(name: str) -> set[str]:
+    """A distribution, all that it needs, and what these need in turn."""
+    found: set[tuple[str, frozenset[str]]] = set()
+    waiting = [Requirement(name)]
+    while waiting:
+        asked = waiting.pop()
+        key = canonicalize_name(asked.name), frozenset(asked.extras)
+        if key in found:
+            continue
+        found.add(key)
+        for needed in map(Requirement, requires(asked.name) or ()):
+            markers = [{"extra": extra} for extra in ("", *asked.extras)]
+            if needed.marker is None or any(map(needed.marker.evaluate, markers)):
+                waiting.append(needed)
+    return {name for name, _ in found}
+
+
+WITHOUT = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in absent:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+absent = set(sys.argv[2].split(","))
+sys.meta_path.insert(0, Absent())
+from restock import open
+from restock.cli import main
+
+with open(sys.argv[1]) as store:
+    assert store.sql("SELECT ingested_at FROM recordings").fetchall()
+    ((row,),) = store.sql("SELECT min(transition_id) FROM transitions").fetchall()
+for words in (["sql", sys.argv[1], "FROM recordings"], ["trace", sys.argv[1], str(row)]):
+    assert main(words) == 0, words
+"""
+
+
+def test_a_store_is_read_with_what_an_installation_brings(store_path: Path) -> None:
+    """Without what the tests' own environment has besides: DuckDB, say, imports by itself."""
+    there = installed_with("restock")
+    absent = [
+        package
+        for package, owners in packages_distributions().items()
+        if not there & set(map(canonicalize_name, owners))
+    ]
+    assert "pytest" in absent
+    command = [sys.executable, "-c", WITHOUT, str(store_path), ",".join(absent)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
