@@ -5,7 +5,7 @@
 Synthetic fleets are written by the project's own writer, some recordings a commit: few rows in
 many files, and as many rows as a fleet has. Each question is asked in a process of its own; wall
 and CPU seconds are of the question alone, what imports cost is paid before. `--keep` keeps the
-stores, and takes those that are there.
+stores, and takes those that are there; one that was cut off is written again.
 """
 
 from __future__ import annotations
@@ -107,8 +107,11 @@ def measure(name: str, folder: Path, *, rounds: int) -> dict[str, Any]:
     figures: dict[str, Any] = {"files": size.files, "rows": size.files * size.rows}
     print(f"{name}: {size.files:,} files of {size.rows:,} rows", file=sys.stderr)
     if not store.exists():
+        partial = store.with_name(f"{store.name}.partial")  # a whole fleet only is given its name
+        shutil.rmtree(partial, ignore_errors=True)
         began, cpu = time.perf_counter(), time.process_time()
-        write_fleet(store, size.files, size.rows, batch=BATCH)
+        write_fleet(partial, size.files, size.rows, batch=BATCH)
+        partial.rename(store)
         figures["write_wall_s"] = time.perf_counter() - began
         figures["write_cpu_s"] = time.process_time() - cpu
     figures["disk_bytes"] = disk_bytes(store)
