@@ -12,9 +12,10 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
-from restock.errors import ConfigError, MixtureError, StoreError
+from restock.errors import ConfigError, MixtureError, PanelError, StoreError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.strata import ResolvedStratum
 
@@ -219,6 +220,19 @@ def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
         " HAVING count(DISTINCT recording_id) = (SELECT count(*) FROM recordings)"
     ).fetchall()
     return dict(rows)
+
+
+def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
+    """A list column (n lists of `size` floats) as (n, size).
+
+    Raises:
+        PanelError: a list of another size.
+    """
+    flat = column.flatten().to_numpy(zero_copy_only=False)
+    if flat.size != len(column) * size:
+        raise PanelError(f"observations are not all of {size} entries; `restock audit` names them")
+    rows: NDArray[np.float32] = flat.reshape(len(column), size)
+    return rows
 
 
 def one_task(table: pa.Table) -> str:

@@ -24,7 +24,7 @@ from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import row_columns, row_width
-from restock.replay.panel.candidates import any_order, as_stored
+from restock.replay.panel.candidates import any_order, as_stored, matrix
 from restock.replay.panel.plan import PanelPlan
 from restock.replay.panel.scratch import STRETCH, SourceSteps
 from restock.replay.panel.strata import NO_STRATUM
@@ -136,8 +136,8 @@ class Packer:
         target = np.searchsorted(self.chosen, place)
         packed = np.flatnonzero(_at(self.chosen, target) == place)
         target = target[packed]
-        observation = _chosen(_matrix(batch.column("observation"), size), packed)
-        next_observation = _matrix(batch.column("next_observation"), size)
+        observation = _chosen(matrix(batch.column("observation"), size), packed)
+        next_observation = matrix(batch.column("next_observation"), size)
         horizon = self.last[target] - place[packed] + 1
         returns = np.zeros(len(packed))
         for ahead in range(int(horizon.max(initial=0))):
@@ -252,15 +252,6 @@ def _compact(table: pa.Table) -> pa.Table:
             column = table.column(place).cast(pa.string()).cast(_TEXT)
             table = table.set_column(place, field, column)
     return table
-
-
-def _matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
-    """A list column (n lists of `size` floats) as (n, size)."""
-    flat = column.flatten().to_numpy(zero_copy_only=False)
-    if flat.size != len(column) * size:
-        raise PanelError(f"observations are not all of {size} entries; `restock audit` names them")
-    matrix: NDArray[np.float32] = flat.reshape(len(column), size)
-    return matrix
 
 
 def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:

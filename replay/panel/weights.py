@@ -29,11 +29,12 @@ from typing import Any, Protocol
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.panel.candidates import any_order, as_stored
+from restock.replay.panel.candidates import any_order, as_stored, matrix
 
 BATCH_ROWS = 4_096  # of observations in memory at a time
 COLUMNS = 16  # of features in memory at a time
@@ -387,6 +388,7 @@ def _observations(
             found = np.flatnonzero(wanted[place] == these)
             if not len(found):
                 continue
-            flat = batch.column("observation").flatten().to_numpy(zero_copy_only=False)
-            observation = flat.reshape(-1, len(flat) // batch.num_rows)
-            yield observation[found], at[order[place[found]]]
+            column = batch.column("observation")
+            if len(found) < len(column):  # the others may be of another task, and another size
+                column = column.take(pa.array(found))
+            yield matrix(column, len(column[0])), at[order[place[found]]]

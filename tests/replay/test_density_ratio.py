@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
-from support.stores import CONDITIONS, TASK
+from support.stores import CONDITIONS, TASK, recording_transitions, write_store
 
+from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.plan import plan_panel
@@ -18,6 +21,7 @@ from restock.replay.panel.weights import (
     effective_count,
     importance_weights,
 )
+from restock.replay.store.store import Store
 
 COUNT = 30_000
 
@@ -149,3 +153,20 @@ def test_a_plan_estimates_the_ratio_and_the_panel_keeps_what_new_shares_need(
             (panel.meta["stratum"].to_pylist()).count(name) / len(panel), abs=0.02
         )
     assert panel.header.ratios == [fit]
+
+
+def test_rows_of_another_task_beside_those_of_the_plan_change_no_estimate(tmp_path: Path) -> None:
+    """Their observations are of another size, and may lie in the same batch."""
+    other = Task(body=TASK.body, actions=TASK.actions, sectors=6)
+    mine = recording_transitions(2)
+    alone = write_store(tmp_path / "alone", [mine])
+    beside = write_store(tmp_path / "beside", [recording_transitions(1, task=other)], task=other)
+    write_store(beside, [mine])
+    split = '[evaluation_split]\nby = "none"'  # which is of all episodes of a store
+    mixture = parse_mixture(f"where = \"task_hash = '{TASK.hash}'\"\n{TEXT}\n{split}")
+    panels = [
+        build_panel(Store(path), mixture, tmp_path / f"of-{path.name}") for path in (alone, beside)
+    ]
+    assert panels[0].header.ratios
+    assert panels[1].header.ratios == panels[0].header.ratios
+    assert panels[1].id == panels[0].id
