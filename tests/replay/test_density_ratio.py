@@ -169,4 +169,4 @@ def test_rows_of_another_task_beside_those_of_the_plan_change_no_estimate(tmp_pa
     ]
     assert panels[0].header.ratios
     assert panels[1].header.ratios == panels[0].header.ratios
-    assert panels[1].id == panels[0].id
+    assert panels[1].meta["weight"].equals(panels[0].meta["weight"])
