@@ -18,6 +18,8 @@ T = TypeVar("T")
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
+# A PIVOT whose columns are the data's is several statements to DuckDB; so is a COPY of one.
+_PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 
 
 def query(
@@ -35,9 +37,12 @@ def query(
     if not statements:
         raise QueryError("the query is empty", where=where, remedy='try "FROM coverage"')
     for statement in statements:
-        if statement.type.name not in _ALLOWED:
+        if statement.type.name not in _ALLOWED and not _pivots(statement):
+            kind = statement.type.name
+            if kind == "MULTI":
+                kind = statement.query.split(maxsplit=1)[0].upper()
             raise QueryError(
-                f"{statement.type.name} is refused: queries are read-only",
+                f"{kind} is refused: queries are read-only",
                 where=where,
                 remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
             )
@@ -54,6 +59,10 @@ def query(
             "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
         )
     return relation
+
+
+def _pivots(statement: duckdb.Statement) -> bool:
+    return statement.type.name == "MULTI" and _PIVOT.match(statement.query) is not None
 
 
 def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:

@@ -234,10 +234,22 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
         f"ATTACH '{tmp_path}/other.db'",
         f"EXPORT DATABASE '{tmp_path}/out'",
         "INSTALL httpfs",
+        f"COPY (PIVOT transitions ON condition) TO '{tmp_path}/out.csv'",
     ):
         with pytest.raises(QueryError, match="read-only"):
             store.sql(text)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pivot_takes_its_columns_from_the_data(store: Store) -> None:
+    found = store.sql("PIVOT (SELECT zone, condition FROM transitions) ON condition")
+    held = store.sql("SELECT DISTINCT condition FROM transitions ORDER BY ALL").fetchall()
+    assert found.columns == ["zone", *(name for (name,) in held)]
+    total = store.sql(f"SELECT sum(nominal) FROM ({found.sql_query()})").fetchall()
+    assert (
+        total
+        == store.sql("SELECT count(*) FROM transitions WHERE condition = 'nominal'").fetchall()
+    )
 
 
 @pytest.mark.parametrize(
