@@ -236,13 +236,12 @@ class AlignedInputs:
         smoothed command is no source's: it is looked for at the last one of what it follows.
         """
         topics, keys = self.inputs.topics, ("speed_mps", "yaw_rate_radps")
-        through, topic = self.profile.command_through, self.profile.inputs.command.topic
+        through = self.profile.command_through
         chosen = "command" if through is None else COMMAND_THROUGH
-        if through is not None:
-            topic = through.topic
-        by = np.full(len(topics[topic]), None, object)
-        if chosen not in self.inputs.by_name or not len(by):
+        if chosen not in self.inputs.by_name:  # nothing of the middle of the chain was recorded
             return [None] * len(self.latest("command").row)
+        topic = self.inputs.by_name[chosen].topic
+        by = np.full(len(topics[topic]), None, object)
         command = np.stack([self.inputs.numbers(chosen, key) for key in keys])
         sources = [
             (name.removeprefix(f"{COMMAND_SOURCES}."), name, source)

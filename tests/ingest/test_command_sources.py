@@ -214,6 +214,23 @@ def test_a_source_is_unknown_where_the_multiplexer_was_silent(tmp_path, capsys):
     assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
 
 
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_recording_without_the_multiplexers_output_is_of_unknown_drivers(silent, tmp_path):
+    """The topic is there without a message, or is not there."""
+    file, topics = tmp_path / "p.toml", smoothed()
+    assert (
+        main(["profile", "new", str(write_topics(topics, tmp_path / "a")), "--out", str(file)]) == 0
+    )
+    if silent:
+        chosen = topics[MUX][1]
+        topics[MUX] = (TWIST, without(chosen, np.zeros(len(chosen), np.bool_)))
+    else:
+        del topics[MUX]
+    rows = policies(write_topics(topics, tmp_path / "b"), file, tmp_path / "s")
+    assert len(rows) > 50
+    assert {policy for _, policy in rows} == {"unknown"}
+
+
 def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
     text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
     chain = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\n"
