@@ -64,17 +64,13 @@ class CameraFrames:
         }
 
 
-def usable_frames(columns: TopicColumns, stamp_ns: Ints, max_hz: float | None) -> Bools:
-    """(N,) which messages are frames to keep: with `max_hz`, the first in each 1 / max_hz seconds
-    of the alignment clock."""
-    fine = (np.asarray(columns.fields[PROBLEM], object) == "") & (stamp_ns >= 0)
-    if max_hz is None:
-        return np.asarray(fine, np.bool_)
-    rows = np.flatnonzero(fine)
-    rows = rows[np.argsort(stamp_ns[rows], kind="stable")]
-    bins = stamp_ns[rows] // max(round(NS / max_hz), 1)
-    first = np.ones(len(rows), np.bool_)
-    first[1:] = bins[1:] != bins[:-1]
-    usable = np.zeros(len(columns), np.bool_)
-    usable[rows[first]] = True
+def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: float | None) -> Bools:
+    """(S,) which of these messages, in the order of their stamps, are frames to keep: with
+    `max_hz`, the first in each 1 / max_hz seconds of the alignment clock."""
+    problem = np.asarray(columns.fields[PROBLEM], object)[row]
+    usable = np.asarray((problem == "") & (stamp_ns >= 0), np.bool_)
+    if max_hz is not None:
+        fine = np.flatnonzero(usable)
+        bins = stamp_ns[fine] // max(round(NS / max_hz), 1)
+        usable[fine[1:]] = bins[1:] != bins[:-1]
     return usable

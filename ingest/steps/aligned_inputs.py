@@ -219,10 +219,13 @@ class AlignedInputs:
             if columns is None:
                 continue
             stamp_ns = np.full(len(columns), -1)
-            for segment in self.segments:
+            usable = np.zeros(len(columns), np.bool_)
+            for segment in self.segments:  # each by itself: a clock set back repeats its times
                 samples = segment.topics[camera.topic]
                 stamp_ns[samples.row] = samples.stamp_ns
-            usable = usable_frames(columns, stamp_ns, camera.max_hz)
+                usable[samples.row] = usable_frames(
+                    columns, samples.row, samples.stamp_ns, camera.max_hz
+                )
             latest = self.latest_of(camera.topic, camera.max_age_s, keep=usable)
             at_tick = np.where(latest.fresh, latest.row, -1).astype(np.int64)
             found[name] = CameraFrames(camera, columns, stamp_ns, usable, at_tick)

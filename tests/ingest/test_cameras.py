@@ -26,6 +26,7 @@ from support.cameras import (
     profile_with,
     raw,
 )
+from support.driven_robot import START_NS, Drive, typed_topics, write_topics
 
 from restock import cli
 from restock.errors import ConfigError, ExitCode, RecordingError, StoreError
@@ -108,6 +109,20 @@ def test_thinned_frames_are_counted_and_the_last_one_kept_holds(bag: Path, tmp_p
     spans = [one["last_transition_id"] - one["first_transition_id"] + 1 for one in frames]
     assert sum(spans) == 30
     assert set(spans) == {2, 3}
+
+
+def test_frames_are_thinned_by_themselves_where_the_clock_was_set_back(tmp_path: Path) -> None:
+    """A simulation that is started again repeats its times."""
+    files = [file_of(picture(number)) for number in range(120)]
+    topics = typed_topics(Drive(duration_s=12.0)) | {FRONT: compressed(files)}
+    for _, columns in topics.values():
+        if (stamp := columns.fields.get("header.stamp")) is not None:
+            stamp[columns.log_time_ns >= START_NS + 6 * 10**9] -= 6 * 10**9  # type: ignore[index]
+    bag = write_topics(topics, tmp_path / "bag")
+    result, _ = written(bag, tmp_path / "store", FRONT_ONLY + "max_hz = 2\nmax_age_s = 2.0\n")
+    assert result.manifest["clock_jumps"] == 1
+    row = counts(result)
+    assert (row["kept"], row["steps"]) == (24, result.manifest["steps"])
 
 
 def test_a_frame_that_is_too_old_is_in_force_no_more(tmp_path: Path) -> None:

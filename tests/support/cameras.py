@@ -13,7 +13,7 @@ from PIL import Image
 from restock.ingest.camera.images import COMPRESSED, RAW
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile, parse_profile
-from support.driven_robot import Drive, columns, write_topics
+from support.driven_robot import Drive, columns, typed_topics, write_topics
 from support.profile_texts import WAREHOUSE
 
 FRONT, REAR = "/front/image/compressed", "/rear/image"
@@ -91,17 +91,5 @@ def camera_bag(
     duration_s: float = 6.0,
 ) -> Path:
     """A drive with these topics beside it."""
-    names = {
-        "/cmd_vel": "geometry_msgs/msg/Twist",
-        "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "/odom": "nav_msgs/msg/Odometry",
-        "/imu": "sensor_msgs/msg/Imu",
-        "/scan": "sensor_msgs/msg/LaserScan",
-        "/goal_pose": "geometry_msgs/msg/PoseStamped",
-        "/plan": "nav_msgs/msg/Path",
-        "/bumper": "std_msgs/msg/Bool",
-        "/behaviour_policy": "std_msgs/msg/String",
-    }
-    drive = Drive(duration_s=duration_s).topics()
-    topics = {name: (names[name], columns) for name, columns in drive.items()}
-    return write_topics(topics | dict(cameras or front_and_rear()), folder, storage=storage)
+    topics = typed_topics(Drive(duration_s=duration_s)) | dict(cameras or front_and_rear())
+    return write_topics(topics, folder, storage=storage)

@@ -151,6 +151,11 @@ def without(topic: TopicColumns, keep: NDArray[np.bool_]) -> TopicColumns:
 
 def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
     """The drive as a rosbag2 folder, `sqlite3` or `mcap`, written by rosbags."""
+    return write_topics(typed_topics(drive), folder, storage=storage)
+
+
+def typed_topics(drive: Drive) -> dict[str, tuple[str, TopicColumns]]:
+    """The drive's topics with the types of their messages, as `write_topics` takes them."""
     names = {
         "/cmd_vel": "geometry_msgs/msg/Twist",
         "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -167,8 +172,7 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
     }
     if drive.proposals is not None:
         names[drive.proposals] = names["/cmd_vel"]
-    topics = {name: (names[name], columns) for name, columns in drive.topics().items()}
-    return write_topics(topics, folder, storage=storage)
+    return {name: (names[name], columns) for name, columns in drive.topics().items()}
 
 
 def write_topics(
