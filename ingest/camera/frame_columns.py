@@ -7,7 +7,7 @@ and the hash of its bytes; those that steps need are read again when they are wr
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from restock.ingest.camera.images import (
 )
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
+from restock.ingest.decoding.field_paths import DTYPES, Leaf
 
 # Names of fields hold no space.
 ENCODING, PROBLEM, SHA256 = "frame encoding", "frame problem", "frame sha256"
@@ -34,6 +35,25 @@ _RAW_FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
 def image_fields(kind: str) -> tuple[str, ...]:
     """The field paths of a message of one of the two types."""
     return _COMPRESSED_FIELDS if kind == COMPRESSED else _RAW_FIELDS
+
+
+def other_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
+    """The first field that a message of this type does not have as ROS defines it, by the
+    definition that its file brings; None where it has all."""
+    found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
+    fields = image_fields(kind)
+    return next((name for name in fields if not _is_field(name, found.get(name))), None)
+
+
+def _is_field(name: str, leaf: Leaf | None) -> bool:
+    if leaf is None:
+        return False
+    if name in ("format", "encoding"):
+        return leaf.kind == "string" and not leaf.dims
+    number = DTYPES.get(leaf.kind)
+    if number is None or number.kind not in "biu":
+        return False
+    return leaf.dims == (None,) and number.itemsize == 1 if name == "data" else not leaf.dims
 
 
 def frame_reduction(kind: str) -> Reduction:

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import RecordingError
-from restock.ingest.camera.frame_columns import frame_reduction
+from restock.ingest.camera.frame_columns import frame_reduction, other_field
 from restock.ingest.camera.images import TYPES
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
@@ -175,10 +175,14 @@ def input_problems(
         elif topic is not None and leaves is not None:
             fields += _field_problems(name, source, leaves[source.topic])
     for name, camera in profile.cameras.items():
-        topic = available.get(camera.topic)
-        if topic is not None and topic.type not in TYPES:
+        if (topic := available.get(camera.topic)) is None:
+            continue
+        if topic.type not in TYPES:
             what = f"{camera.topic} holds {topic.type}, which is no image"
             wrong.setdefault(what, []).append(f"cameras.{name}")
+        elif leaves is not None and (field := other_field(topic.type, leaves[camera.topic])):
+            has = f"its {topic.type} has no {field!r} as ROS defines it"
+            fields.append(f"`cameras.{name}`: {camera.topic}: {has}")
     hints = {what: near(what.split()[-1], available) for what in needed}
     lacking = [
         f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")

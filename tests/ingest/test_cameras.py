@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from support.cameras import (
     CAMERAS,
     FRONT,
@@ -31,6 +32,7 @@ from support.driven_robot import START_NS, Drive, typed_topics, write_topics
 from restock import cli
 from restock.errors import ConfigError, ExitCode, RecordingError, StoreError
 from restock.ingest.camera.images import (
+    COMPRESSED,
     ENCODINGS,
     ImageLayout,
     ImageProblem,
@@ -201,6 +203,31 @@ def test_a_topic_that_is_no_image_is_refused_and_one_that_is_missing_said(bag: P
         profile_with('[cameras.Front]\ntopic = "/x"\n')
     with pytest.raises(ConfigError, match="max_hz"):
         profile_with('[cameras.front]\ntopic = "/x"\nmax_hz = 0\n')
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ("string format\nstring data", "data"),
+        ("string format\nuint8[4] data", "data"),
+        ("string format\nfloat32[] data", "data"),
+        ("uint32[] format\nuint8[] data", "format"),
+        ("string format", "data"),
+    ],
+)
+def test_a_message_that_only_bears_the_name_of_an_image_is_refused(
+    tmp_path: Path, fields: str, named: str
+) -> None:
+    """What it holds is as the file defines it, which anybody may write."""
+    file = tmp_path / "run.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(COMPRESSED, "ros2msg", fields.encode())
+        writer.add_message(writer.register_channel(FRONT, "cdr", schema), 1, b"\0\1\0\0", 1)
+        writer.finish()
+    with pytest.raises(RecordingError, match=rf"`cameras\.front`: .* has no '{named}' as ROS de"):
+        ingest(file, profile_with(FRONT_ONLY), store=None)
 
 
 def test_frames_go_and_stay_with_their_recording(bag: Path, tmp_path: Path) -> None:
