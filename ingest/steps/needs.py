@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from restock.errors import RecordingError
 from restock.ingest.camera.frame_columns import frame_reduction, other_field
 from restock.ingest.camera.images import TYPES
@@ -40,13 +42,15 @@ def read_topics(
     Raises:
         RecordingError: as `wanted_fields`.
     """
+    if not reduced:
+        profile = msgspec.structs.replace(profile, cameras={})  # images do not fit into memory
     readable = {name: info for name, info in recording.topics.items() if info.skipped is None}
     leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in readable}
     wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable)
     if not reduced:
         wanted = {
             topic: [*paths, *(made[topic].fields if topic in made else ())]
-            for topic, paths in without_cameras(profile, wanted).items()
+            for topic, paths in wanted.items()
         }
     columns = recording.read(wanted, made if reduced else {})
     by_stamp = profile.clock.alignment == STAMP and CLOCK_TOPIC not in columns

@@ -40,8 +40,10 @@ from restock.ingest.camera.images import (
     pixels,
     raw_layout,
 )
+from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.pipeline import IngestResult, ingest
 from restock.ingest.relabel import relabel_store
+from restock.ingest.steps.needs import read_topics
 from restock.ingest.store.writer import StoreWriter
 
 FRONT_ONLY = CAMERAS.split("[cameras.rear]")[0]
@@ -264,6 +266,22 @@ def test_nothing_is_left_of_frames_where_the_commit_fails(
     with pytest.raises(StoreError):
         ingest(bag, profile_with(), store=StoreWriter(tmp_path / "store"))
     assert list((tmp_path / "store").rglob("*.parquet")) == []
+
+
+def test_what_looks_at_single_messages_reads_no_images(bag: Path) -> None:
+    """Not those of a topic that a signal is of, either."""
+    signal = f"""
+[signals.lens]
+topic = "{FRONT}"
+type = "{COMPRESSED}"
+path = "header.frame_id"
+values = {{ wide = 1.0 }}
+unit = "1"
+"""
+    with open_recording(bag) as recording:
+        topics = read_topics(recording, profile_with(CAMERAS + signal), reduced=False)
+    assert REAR not in topics
+    assert set(topics[FRONT].fields) == {"header.stamp", "header.frame_id"}
 
 
 def test_a_dry_run_writes_no_frames(bag: Path) -> None:
