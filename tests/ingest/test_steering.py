@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -82,6 +83,24 @@ def test_a_robot_that_was_never_asked_to_turn_on_the_spot_is_no_car(name: str, s
     assert not found.steers or name == "ackermann"
     if not found.steers:
         assert "never turned on the spot, nor was it told to" in found.why
+
+
+def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
+    """One message that was logged before the clock was set; 0.1 s at a time it is a long way."""
+    at_s, years_s = np.arange(0, 60, PERIOD_S), 50 * 365 * 86_400.0
+    told, turn_radps = at_s[:-1], np.where(at_s[:-1] % 20 < 10, 0.5, 0.0)
+    yaw = np.concatenate([[0.0], np.cumsum(turn_radps * PERIOD_S)])
+
+    def evidence(stray: bool) -> DriveEvidence:
+        shift_s = years_s if stray else 0.0
+        stamps = np.concatenate([[0] * stray, ((at_s + shift_s) * 1e9)]).astype(np.int64)
+        still = np.zeros(len(stamps))
+        poses = PoseSeries(stamps, still, still, np.concatenate([[0.0] * stray, yaw]))
+        return drive_evidence(told + shift_s, np.zeros(len(told)), turn_radps, poses)
+
+    assert evidence(stray=False).pivots
+    for field, value in dataclasses.asdict(evidence(stray=True)).items():
+        assert value == pytest.approx(getattr(evidence(stray=False), field), abs=0.01), field
 
 
 def test_drives_of_one_robot_are_judged_together() -> None:

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from restock.arrays import F64, Bools
+from restock.arrays import F64, Bools, Ints
 from restock.ingest.steps.motion import PoseSeries, motion_at
 from restock.ingest.task.robot import USUAL_STEERING_RAD
 from restock.ingest.task.signals import wrap_angle
 
 TICK_NS = 100_000_000  # between two looks at the motion
+KNOWN_S, UNKNOWN_NS = 1.0, 2_000_000_000  # after a pose: its motion is; it is surely not any more
 DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # from a command to the motion
 SETTLED_S = 1.0  # a command is no older
 ANSWERED_S = 0.5  # after its end in which a turn still answers it
@@ -123,8 +124,8 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     changes = np.flatnonzero((np.diff(poses.x_m) != 0) | (np.diff(poses.yaw_rad) != 0))
     pace_s = float(np.median(np.diff(poses.stamp_ns[changes]))) * 1e-9 if len(changes) > 2 else 0.1
     window_s = float(np.clip(3 * pace_s, 0.3, 2.0))  # a pose that is held is no standing still
-    ticks = np.arange(poses.stamp_ns[0], poses.stamp_ns[-1], TICK_NS, dtype=np.int64)
-    motion = motion_at(poses, ticks, window_s, 1.0)
+    ticks = _looks(poses.stamp_ns)
+    motion = motion_at(poses, ticks, window_s, KNOWN_S)
     known = motion.problem == ""
     speed, turn = (np.where(known, c, 0.0) for c in (motion.forward_mps, motion.yaw_rate_radps))
     sideways = np.where(known, motion.lateral_mps, 0.0)
@@ -139,7 +140,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     moves = (way >= STANDS_MPS) & ~spot
     curves = drives & (np.abs(turn) >= TURNS_RADPS)
     circles = np.abs(speed[curves] / turn[curves])
-    middle_s = ticks * 1e-9 - window_s / 2
+    middle_s: F64 = ticks * 1e-9 - window_s / 2
     return DriveEvidence(
         driven_m=float(way[moves].sum() * tick_s),
         pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
@@ -150,6 +151,18 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
         tightest_m=float(np.percentile(circles, 5)) if len(circles) >= LEAST_TURNS else None,
         stops_at_m=_stops_at(told_s, told_mps, told_radps, middle_s, speed, turn, drives),
     )
+
+
+def _looks(stamp_ns: Ints) -> Ints:
+    """Moments TICK_NS apart from the first pose to the last, but those long after one: a single
+    message that is logged at the wrong time may lie years before the others."""
+    gaps = np.flatnonzero(np.diff(stamp_ns) > UNKNOWN_NS)
+    begins = np.concatenate([stamp_ns[:1], stamp_ns[gaps + 1]]) - stamp_ns[0]
+    ends = np.concatenate([stamp_ns[gaps] + UNKNOWN_NS, stamp_ns[-1:]]) - stamp_ns[0]
+    spans = zip(-(-begins // TICK_NS), -(-ends // TICK_NS), strict=True)
+    numbers = np.concatenate([np.arange(*span) for span in spans])
+    looks: Ints = stamp_ns[0] + numbers * TICK_NS
+    return looks
 
 
 def _spells_of(flags: Bools, least: int) -> Bools:
@@ -239,10 +252,9 @@ def turn_reading(
             wheelbase that is None is the one by which the angles explain best how it turned.
         least_m: its tightest circle, where there is no wheelbase.
     """
-    first_ns, last_ns = int(poses.stamp_ns[0]), int(poses.stamp_ns[-1])
-    ticks = np.arange(first_ns, last_ns, TICK_NS, dtype=np.int64)
+    ticks = _looks(poses.stamp_ns)
     window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
-    motion = motion_at(poses, ticks, window_s, 1.0)
+    motion = motion_at(poses, ticks, window_s, KNOWN_S)
     middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps
     most = steering_rad or USUAL_STEERING_RAD
     best, seen, fitted_m = [np.inf, np.inf], 0, wheelbase_m
