@@ -92,6 +92,7 @@ def propose_for_drives(
     advice = [*proposal.advice, *_left_out(others)]
     return replace(
         proposal,
+        problems=[*proposal.problems, *_in_another(proposal.missing, drives)],
         toml="\n".join([*_lines(drives, trials, others), proposal.toml]),
         advice=advice,
         kinds=[
@@ -240,6 +241,19 @@ def _lines(
 def _name(recording: Recording) -> str:
     """Two parts of its path: bags of several robots often have the same names."""
     return "/".join(recording.path.parts[-2:])
+
+
+def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
+    """Of what the profile's own drive lacks, which other one has it, without the rest."""
+    found = []
+    for role, lacks in (("pose", "command"), ("command", "pose")):
+        for one in drives if role in missing else ():
+            if (topics := one.roles[role]) and not one.roles[lacks]:
+                found.append(
+                    f"{_name(one.recording)} has a {role} ({topics[0][0].name}) and no {lacks}:"
+                    " one recording must hold both"
+                )
+    return found
 
 
 def _left_out(others: Sequence[tuple[Recording, RobotTraits]]) -> list[Advice]:

@@ -61,7 +61,7 @@ from restock.ingest.propose.roles import (
     usable_topics,
 )
 from restock.ingest.propose.scanned_outline import lidar_place, scanned_outline, with_lidar
-from restock.ingest.propose.trial import GAIN, Advice, Trial, try_profile
+from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.steps.needs import as_recorded, read_topics
@@ -184,7 +184,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
 def _by_rate(
     recording: Recording, seen: Evidence, name: str, trial: Trial
 ) -> tuple[Evidence, Trial]:
-    """A tick every period instead of one a command, where that makes rows of much more time."""
+    """A tick every period instead of one a command, where that makes rows of much more time, or
+    where commands come too unevenly for the twin to follow."""
     clock = seen.clock
     if clock.steps != "command":
         return seen, trial
@@ -194,10 +195,21 @@ def _by_rate(
         tried(recording, "\n".join(profile_lines(one, name, [])))
         for one in (goalless, replace(goalless, clock=rate.clock))
     )
-    if other.problem or other.seconds <= GAIN * now.seconds:
+    if other.problem:
         return seen, trial
-    why = f"a tick a command makes rows of {now.seconds:.0f} s, one a period of {other.seconds:.0f}"
-    comments = (*clock.comments, f"{why} s: commands pause, and hold.")
+    if other.seconds > GAIN * now.seconds:
+        why = (
+            f"a tick a command makes rows of {now.seconds:.0f} s, one a period of"
+            f" {other.seconds:.0f} s: commands pause, and hold."
+        )
+    elif other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds:
+        why = (
+            f"a tick a command leaves {now.even_s:.0f} s that the twin can follow, one a period"
+            f" {other.even_s:.0f} s: commands come unevenly."
+        )
+    else:
+        return seen, trial
+    comments = (*clock.comments, why)
     rate = replace(rate, clock=replace(rate.clock, comments=comments))
     return rate, tried(recording, "\n".join(profile_lines(rate, name, [])))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
+from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
@@ -26,6 +27,9 @@ GAIN = 1.1  # times the transitions: what gives so many is worth a try
 NEAR_M = 0.14  # as of the shipped conditions near_collision and recovery
 OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
 OFTEN_INSIDE = 0.02
+EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
+EVEN = 0.25  # of a control period
+UNEVEN = 4.0  # times the time that can be followed: worth a tick a period
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Trial:
     ticks: int = 0
     transitions: int = 0
     seconds: float = 0.0  # that the transitions span
+    even_s: float = 0.0  # of them, in stretches that a simulator can follow tick by tick
     dropped: dict[str, int] = field(default_factory=dict)  # ticks in no episode, by reason
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     advice: list[Advice] = field(default_factory=list)
@@ -72,11 +77,27 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         len(steps),
         episodes.transitions,
         sum(int(stamps[one.last] - stamps[one.first]) for one in episodes.episodes) / NS,
+        sum(
+            _even_s(stamps[one.first : one.last + 1], profile.task.control_period_s)
+            for one in episodes.episodes
+        ),
         dict(worst),
         dict(endings.most_common()),
         advice,
         problem,
     )
+
+
+def _even_s(stamp_ns: Ints, period_s: float) -> float:
+    """Of an episode's ticks (N,), the time in stretches of some 3 s with each tick where it is due,
+    within a quarter of a period: as the twin's fit and gap take them."""
+    ticks, even_s, at = max(round(EVEN_S / period_s), 1), 0.0, 0
+    off_s = (stamp_ns - stamp_ns[0]) / NS - np.arange(len(stamp_ns)) * period_s
+    while at + ticks < len(off_s):
+        late = np.abs(off_s[at : at + ticks + 1] - off_s[at]) > EVEN * period_s
+        even_s += 0.0 if late.any() else ticks * period_s
+        at += int(late.argmax()) if late.any() else ticks
+    return even_s
 
 
 class _Advisor:

@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 from support.driven_robot import Drive, write_bag
+from support.profile_texts import WAREHOUSE
 
 from restock import cli
-from restock.cli.start.decisions import no_room
+from restock.cli.start import outcomes
+from restock.cli.start.decisions import no_room, robot_line
 from restock.cli.start.stage import Stage
 from restock.cli.start.start import StartCommand, _way
 from restock.cli.start.work import Ended, Work
@@ -188,6 +190,27 @@ def test_a_bag_without_commands_stops_at_the_proposal(
     assert document["report"] is None
 
 
+class Lost(Drive):
+    """A bag with commands and no pose."""
+
+    def topics(self) -> dict[str, Any]:
+        topics = super().topics()
+        return {name: topics[name] for name in ("/cmd_vel", "/scan")}
+
+
+def test_commands_in_one_recording_and_poses_in_another_are_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a Nav2 cart only the one was told as missing, though the other recording has it."""
+    write_bag(Lost(), tmp_path / "bags" / "commands")
+    write_bag(Parked(), tmp_path / "bags" / "poses")
+    code, document = start(capsys, str(tmp_path / "bags"), "--out", str(tmp_path / "out"))
+    assert code == 3
+    why = "bags/commands has a command (/cmd_vel) and no pose: one recording must hold both"
+    assert why in document["stopped"]["why"]
+    assert "name recordings that hold it" in document["stopped"]["remedies"][0]
+
+
 def test_an_edited_profile_is_taken_and_never_replaced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,6 +249,29 @@ def test_where_nothing_says_that_the_twin_is_right_a_policy_comes_from_the_logs_
     again = start(capsys, *argv)[1]["stages"]
     failed = {name for name, stage in stages.items() if stage["status"] == "failed"}
     assert {stage["name"] for stage in again if stage["status"] != "kept"} == failed
+
+
+def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
+    """Of a stranger's Neato "fqe 4.18" stood beside "logged -1.05", as if it were a gain."""
+    few = "1 episode, and weights take at least 5"
+    rows = [
+        {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
+        | {"estimator": name, "value": value, "refused": None if value else few}
+        for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None), ("wdr", None))
+    ]
+    told, refused = outcomes.on_logs({"results": rows, "notes": []})
+    assert told.startswith("return of 1 held-out episode: as it was driven -1.05 (no interval), ")
+    assert refused.startswith(f"refused: {few}. So nothing says whether the policy is better")
+
+
+def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> None:
+    """Wheels and mass that follow from the outline were called the stand-in's, from the logs."""
+    profile = tmp_path / "profile.toml"
+    robot = '[robot]\ndrive = "differential"\ntrack_m = 0.4\n[robot.origin]\ntrack_m = "urdf"\n'
+    profile.write_text(f"{WAREHOUSE}\n{robot}")
+    told = robot_line(profile)
+    assert "track 0.4 m (from urdf)" in told
+    assert "wheel radius, mass guessed by its outline" in told
 
 
 def test_several_topics_of_commands_are_for_a_person_to_choose_from(

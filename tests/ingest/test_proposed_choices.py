@@ -193,7 +193,7 @@ def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
         ("sim-time-mobrob", 41, ("--odometry-as-command",)),
         ("sim-time-robot-kf", 520, ("--odometry-as-command",)),
         ("robots/turtlebot3-sim/rosbag_test", 113, ()),
-        ("robots/turtlebot3-sim-clock/ros2bag", 14, ()),
+        ("robots/turtlebot3-sim-clock/ros2bag", 17, ()),
     ],
 )
 def test_of_simulations(bag, transitions, options, capsys):
@@ -223,3 +223,14 @@ def test_every_proposed_period_is_one_that_the_twin_can_drive() -> None:
         assert _block_s(task, 0.01, blocks) * blocks == pytest.approx(proposed)
     for kept in (0.08, 0.1, 0.12, 0.2, 0.3, 0.5):
         assert drivable(kept) == kept
+    # Of commands a fifth of a second apart .21 s were proposed, which no log of theirs can follow.
+    assert [drivable(near) for near in (0.1015, 0.2003, 0.3012)] == [0.1, 0.2, 0.3]
+
+
+def test_uneven_commands_get_a_tick_every_period(tmp_path, capsys):
+    """Else nothing of the drive can be compared with the twin, which decides evenly."""
+    rng = np.random.default_rng(0)
+    uneven = np.cumsum(rng.choice([0.06, 0.1, 0.1, 0.1, 0.17], 200))
+    for times, steps in ((uneven, "rate"), (np.arange(0, 20, 0.1), "command")):
+        drive = Commanded(float(times[-1]), times_s=tuple(times))
+        assert f'steps = "{steps}"' in propose(drive, tmp_path / steps, capsys)[1]["toml"]

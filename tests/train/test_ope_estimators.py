@@ -178,6 +178,14 @@ def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> Non
     assert again["pdwis"].value is not None
 
 
+def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
+    """A single episode is worth one, whatever the policy: that says nothing of agreement."""
+    alone = logged(1, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
+    answers = {e.estimator: e.refused for e in _estimates(alone)}
+    assert answers["pdwis"] == answers["wdr"] == "1 episode, and weights take at least 5"
+    assert answers["fqe"] is None
+
+
 def test_a_deterministic_policy_that_no_episode_followed_is_refused_and_not_divided_by() -> None:
     stay = np.tile([1.0, 0.0], (STATES, 1))
     away = logged(30, 5, NO_MODEL, stay)

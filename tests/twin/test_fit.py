@@ -102,6 +102,26 @@ def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: 
     assert np.abs(lasts * 1e-9 - 2.0).max() < 0.05
 
 
+def test_a_late_pose_or_tick_moves_segments_on_and_does_not_lose_them(known: Path) -> None:
+    """A Neato's poses come in bursts: 2 of the 12 stretches of its drive began on a fresh one."""
+    with Store(known) as store:
+        steps = logged_steps(store)
+    usual = log_segments(steps, 2.0)
+    late = {name: column.copy() for name, column in steps.now.items()}
+    late["pose_stamp_ns"][usual.row[::2]] -= 10**9
+    found = log_segments(replace(steps, now=late), 2.0)
+    assert len(found) >= len(usual) - len(np.unique(usual.episode_id))
+    assert not set(found.row) & set(usual.row[::2])
+    assert found.left_out["no fresh pose to begin with"] >= 1
+    covered = found.row[:, None] + np.arange(found.horizon_steps)
+    assert len(np.unique(covered)) == covered.size  # none overlap
+    assert covered.size + sum(found.left_out.values()) == len(steps)
+    jittered = {name: column.copy() for name, column in steps.now.items()}
+    jittered["stamp_ns"][usual.row[0] + 3] += 10**8  # half a control period
+    moved = log_segments(replace(steps, now=jittered), 2.0)
+    assert moved.left_out["ticks not a control period apart"] == usual.row[0] + 4 - usual.row[0]
+
+
 def test_segments_are_the_rows_of_the_store(known: Path) -> None:
     with Store(known) as store:
         found = log_segments(logged_steps(store), 1.0, stride_s=3.0)

@@ -144,6 +144,9 @@ class EssGate:
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
             return None
+        if len(logged) < self.episodes:  # refused even where policy and logs agree to the end
+            noun = "episode" if len(logged) == 1 else "episodes"
+            return f"{len(logged)} {noun}, and weights take at least {self.episodes:g}"
         return (
             f"the weights are worth {least:.1f} of {len(logged)} episodes, less than"
             f" {max(self.episodes, self.share * len(logged)):.1f}: policy and logs agree for"

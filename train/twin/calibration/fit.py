@@ -176,10 +176,12 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
     steps = logged_steps(store, config.task_hash, config.recordings, config.robot)
     segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
+        why = ", ".join(f"{steps} {reason}" for reason, steps in segments.left_out.items())
         raise StoreError(
-            f"no stretch of {config.horizon_s:g} s: {segments.left_out}", where=str(store.path),
+            f"no stretch of {config.horizon_s:g} s, of {len(steps)} steps: {why}",
+            where=str(store.path),
             remedy="give a shorter horizon, or ingest more driving",
-        )  # fmt: skip
+        )
     stamps = held_out_from(segments, config.held_out, config.seed)
     ordinary, left_out = ordinary_driving(segments)
     chosen = np.flatnonzero(split_at(ordinary, stamps)[0])

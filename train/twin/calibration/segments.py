@@ -88,11 +88,11 @@ def log_segments(
 ) -> LoggedSegments:
     """Cut logged episodes into segments of `horizon_s`.
 
-    A segment begins every `stride_s` (default: the horizon, so that none overlap) where its steps
-    and those of the warm-up (rounded up to whole steps) are all there, evenly in time, and its
-    first pose is fresh. At an episode's start the steps before are not needed if the robot stood
-    still. A pose is fresh if its age is the recording's usual one, within a quarter of a control
-    period.
+    A segment begins `stride_s` (default: the horizon, so that none overlap) after the one before
+    or at the first tick from there on where its steps and those of the warm-up (rounded up to whole
+    steps) are all there, evenly in time, and its first pose is fresh. At an episode's start the
+    steps before are not needed if the robot stood still. A pose is fresh if its age is the
+    recording's usual one, within a quarter of a control period.
 
     Raises:
         ConfigError: a horizon or stride that is not some control periods.
@@ -107,27 +107,26 @@ def log_segments(
     first = np.flatnonzero(steps.begins)
     ends = np.append(first[1:], len(steps))
     left: Counter[str] = Counter()
-    starts = [np.zeros(0, np.int64)]
-    for begin, end in zip(first, ends, strict=True):
+    starts: list[int] = []
+    for begin, end in zip(first.tolist(), ends.tolist(), strict=True):
         wheels = np.hypot(rows["wheel_speed_mps"][begin], rows["wheel_yaw_rate_radps"][begin])
         lead = 0 if steps.step_index[begin] == 0 and wheels < STILL_MPS else warmup
-        at = np.arange(begin + lead, end - horizon, stride)
-        if not len(at):
-            left["too short a stretch"] += int(end - begin)
+        base = place = begin + lead
+        if place >= end - horizon:
+            left["too short a stretch"] += end - begin
             continue
         left["warm-up"] += lead
-        left["end of a stretch"] += max(int(end - begin) - lead - len(at) * stride, 0)
-        starts.append(at)
-    at = np.concatenate(starts)
-
+        even = _evenly(rows["stamp_ns"][base:end], horizon, period_ns)
+        good = base + np.flatnonzero(even & fresh[base : end - horizon])
+        while (following := int(np.searchsorted(good, place))) < len(good):
+            start = int(good[following])
+            left += _passed_over(even[place - base : start - base])
+            starts.append(start)
+            place = start + stride
+        left += _passed_over(even[place - base :])
+        left["end of a stretch"] += max(end - max(place, end - horizon), 0)
+    at = np.array(starts, np.int64)
     index = at[:, None] + np.arange(horizon + 1)
-    due = rows["stamp_ns"][at][:, None] + np.arange(horizon + 1) * period_ns
-    even = (np.abs(rows["stamp_ns"][index] - due) <= EVEN * period_ns).all(axis=1)
-    left["ticks not a control period apart"] += int((~even).sum()) * stride
-    stale = even & ~fresh[at]
-    left["no fresh pose to begin with"] += int(stale.sum()) * stride
-    keep = even & ~stale
-    at, index = at[keep], index[keep]
 
     lead_row = np.maximum(at - warmup, steps.first[at])
     return LoggedSegments(
@@ -147,6 +146,26 @@ def log_segments(
         signals={name: rows[name][index] for name in LOGGED},
         pose_fresh=fresh[index],
         left_out={reason: count for reason, count in left.items() if count},
+    )
+
+
+def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
+    """Of the ticks (N,) of a stretch, which of the first N - horizon have `horizon` more, each
+    where it is due."""
+    off = stamp_ns - np.arange(len(stamp_ns)) * period_ns
+    windows = np.lib.stride_tricks.sliding_window_view(off, horizon + 1)
+    most, begin = EVEN * period_ns, off[: len(windows)]
+    even = (windows.max(axis=1) - begin <= most) & (begin - windows.min(axis=1) <= most)
+    return np.asarray(even, np.bool_)
+
+
+def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
+    """Why no segment begins at these ticks (N,)."""
+    return Counter(
+        {
+            "ticks not a control period apart": int((~even).sum()),
+            "no fresh pose to begin with": int(even.sum()),
+        }
     )
 
 

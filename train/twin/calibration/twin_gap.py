@@ -131,11 +131,16 @@ def trust_verdict(
             open_.append(reason)
     verdict = UNTRUSTED if beyond else UNDECIDED if open_ else TRUSTED
     reasons = beyond or open_
-    if segments < limits.segments or episodes < limits.episodes:
-        verdict, reasons = UNKNOWN, [
-            f"too few: segments of {limits.horizon_s:g} s {segments} (at least {limits.segments}),"
-            f" from episodes {episodes} (at least {limits.episodes})"
-        ]  # fmt: skip
+    few = [
+        f"{there} {what} (at least {least})"
+        for there, least, what in (
+            (segments, limits.segments, f"segments of {limits.horizon_s:g} s"),
+            (episodes, limits.episodes, "episodes with one"),
+        )
+        if there < least
+    ]
+    if few:
+        verdict, reasons = UNKNOWN, [f"too few: {', '.join(few)}"]
     return Verdict(
         condition, verdict, tuple(reasons), segments, episodes, position_p90, reward_ratio
     )

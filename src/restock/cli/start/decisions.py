@@ -171,16 +171,21 @@ def robot_line(profile: Path | str | None) -> str:
 
     robot = None if profile is None else load_profile(str(profile)).robot
     if robot is None:
-        return "the stand-in's wheels and mass, as nothing says this one's; --urdf FILE would"
-    values = {
-        "wheels of": (robot.wheel_radius_m, "m radius"),
-        "track": (robot.track_m, "m"),
-        "mass": (robot.mass_kg, "kg"),
-    }
-    told = [f"{name} {value:g} {unit}" for name, (value, unit) in values.items() if value]
-    origins = sorted(set(robot.origin.values()))
-    own = ", ".join(told) or "the stand-in's wheels and mass"
-    return f"{robot.drive}, {own} (from {', '.join(origins) or 'the profile'})"
+        return "the twin's own, as nothing describes this one: --urdf FILE would"
+    told = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
+    untold = []
+    for key, name, unit in (
+        ("wheel_radius_m", "wheel radius", "m"),
+        ("track_m", "track", "m"),
+        ("mass_kg", "mass", "kg"),
+    ):
+        if (value := getattr(robot, key)) is None:
+            untold.append(name)
+        else:
+            told.append(f"{name} {value:g} {unit} (from {robot.origin.get(key, 'the profile')})")
+    if untold:
+        told.append(f"{', '.join(untold)} guessed by its outline: --urdf FILE would tell")
+    return ", ".join(told)
 
 
 __all__ = [

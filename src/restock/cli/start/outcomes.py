@@ -8,7 +8,12 @@ from typing import Any
 from restock.cli.start.stage import Document
 from restock.stats import interval_text
 
-ESTIMATORS = ("logged", "fqe", "pdwis", "wdr")
+ESTIMATORS = (
+    ("logged", "as it was driven"),
+    ("fqe", "the policy by a fitted model (fqe)"),
+    ("pdwis", "by importance weights (pdwis)"),
+    ("wdr", "by both (wdr)"),
+)
 
 
 def count(number: int, noun: str) -> str:
@@ -102,18 +107,24 @@ def audit(document: Document) -> list[str]:
     """Which audits failed or warned."""
     lines = []
     for status, word in (("fail", "failed"), ("warn", "warned")):
-        names = [item["audit"] for item in document["audits"] if item["status"] == status]
-        if names:
-            lines.append(f"{len(names)} {word}: {', '.join(names)}")
-    return lines or ["all passed"]
+        found = [item for item in document["audits"] if item["status"] == status]
+        if found:
+            lines.append(f"{len(found)} {word}: {', '.join(item['audit'] for item in found)}")
+        if status == "fail":
+            lines += [f"{item['audit']}: {item['doc']}" for item in found]
+    return [*lines, "`restock audit STORE` says what each means"] if lines else ["all passed"]
 
 
 def mix(document: Document) -> list[str]:
     """Rows and what is short."""
     short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
-    lines = [f"panel {document['id']}: {document['rows']:,} rows"]
+    lines = [f"panel {document['id']}: {count(document['rows'], 'row')} to learn from"]
+    if held := document["evaluation_split"]["rows"]:
+        lines[0] += f", {held:,} held out to judge by"
+    if note := document["evaluation_split"]["note"]:
+        lines.append(f"held out: {note}")
     if short:
-        lines.append(f"too few rows of {', '.join(short)}: the twin or more logs must show them")
+        lines.append(f"fewer rows than asked for of {', '.join(short)}: more logs or the twin help")
     return lines
 
 
@@ -212,12 +223,15 @@ def on_logs(document: Document) -> list[str]:
     lines = []
     for measure in dict.fromkeys(row["measure"] for row in rows):
         own = {row["estimator"]: row for row in rows if row["measure"] == measure}
-        known = [f"{name} {_estimate(own[name])}" for name in ESTIMATORS if name in own]
+        known = [f"{said} {_estimate(own[name])}" for name, said in ESTIMATORS if name in own]
         episodes = count(next(iter(own.values()))["episodes"], "held-out episode")
-        lines.append(f"{measure} ({episodes}): {', '.join(known)}")
+        lines.append(f"{measure} of {episodes}: {', '.join(known)}")
         why = next((row["refused"] for row in own.values() if row["refused"]), None)
         if why:
-            lines.append(f"refused: {why}")
+            lines.append(
+                f"refused: {why}. So nothing says whether the policy is better than how these logs"
+                " were driven: a fitted model's word alone is no evidence"
+            )
     return lines + list(document["notes"])
 
 

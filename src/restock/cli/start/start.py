@@ -113,7 +113,9 @@ class StartCommand:
             )
         if stopped is None:
             if not self.dry_run:
-                say(f"\nThe report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
+                onnx = f"restock export {self.out / 'run'} --to onnx --out policy.onnx"
+                say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
+                say(f"The report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
             return int(ExitCode.OK)
         say(f"\n[bold yellow]Stopped: {escape(stopped.why)}[/bold yellow]")
         for remedy in stopped.remedies:
@@ -209,6 +211,12 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             return Stop("no profile can be proposed", (f"write {to.profile}: docs/profile.md",))
         if problems := proposed.document.get("problems"):
             told = (f"edit {to.profile}: its first lines say what is missing", again)
+            if proposed.document.get("missing"):
+                told = (
+                    "name recordings that hold it; or, where a topic in these does,"
+                    f" edit {to.profile}, whose first lines list their topics",
+                    again,
+                )
             if any(ODOMETRY in problem for problem in problems):
                 told = (f"add {ODOMETRY} to this command, or {told[0]}", again)
             return Stop("; ".join(problems), told)
