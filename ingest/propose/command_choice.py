@@ -61,6 +61,7 @@ class _Told:
         same = (self.values[np.maximum(at, 0)] == output.values[changed]).all(axis=1)
         return int((same & (at >= 0) & (age_s <= WITHIN_S)).sum())
 
+    @np.errstate(invalid="ignore", over="ignore")  # what is no number follows nothing
     def followed_by(self, output: _Told) -> float:
         """The share of the commands of `output` that lie towards what this topic said, or are a
         part of that; 0 where too few tell."""

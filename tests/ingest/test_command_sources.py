@@ -194,6 +194,17 @@ def test_the_source_is_followed_through_a_smoother(limit, tmp_path):
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_commands_that_are_no_numbers_follow_nothing(tmp_path, capsys):
+    topics = smoothed()
+    for name in (OUT, NAV):
+        topics[name][1].fields["linear.x"][::7] = np.nan
+        topics[name][1].fields["angular.z"][::5] = 1e300
+    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert load_profile(file).command_through is None
+
+
 def test_without_the_multiplexers_output_nobody_is_named(tmp_path):
     bag, file = write_topics(smoothed(mux=False), tmp_path / "bag"), tmp_path / "p.toml"
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0

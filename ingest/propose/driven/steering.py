@@ -140,7 +140,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     moves = (way >= STANDS_MPS) & ~spot
     curves = drives & (np.abs(turn) >= TURNS_RADPS)
     circles = np.abs(speed[curves] / turn[curves])
-    middle_s: F64 = ticks * 1e-9 - window_s / 2
+    middle_s = np.asarray(ticks, np.float64) * 1e-9 - window_s / 2
     return DriveEvidence(
         driven_m=float(way[moves].sum() * tick_s),
         pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
