@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import tomllib
 from pathlib import Path
@@ -152,7 +153,11 @@ def test_mixtures_of_one_name_in_two_folders_have_panels_of_their_own(tmp_path: 
     assert {panel.parent for panel in panels if panel is not None} == {plan.out / "panels"}
 
 
-def test_ctrl_c_reaches_the_training_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_the_search_reaches_the_training_once(
+    ended_by: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C, a kill, or a terminal that is closed: nothing trains on alone."""
     signals: list[int] = []
 
     class Process:
@@ -160,7 +165,7 @@ def test_ctrl_c_reaches_the_training_once(tmp_path: Path, monkeypatch: pytest.Mo
             assert start_new_session  # else the terminal sends it another: "end at once"
 
         def poll(self) -> None:
-            raise KeyboardInterrupt
+            os.kill(os.getpid(), ended_by)
 
         def send_signal(self, number: int) -> None:
             signals.append(number)
@@ -169,8 +174,14 @@ def test_ctrl_c_reaches_the_training_once(tmp_path: Path, monkeypatch: pytest.Mo
             return 130
 
     monkeypatch.setattr(tuning.subprocess, "Popen", Process)
-    with pytest.raises(KeyboardInterrupt):
-        tuning._train(tmp_path / "run", [], None, tmp_path / "log", None, 0)
+    usual = signal.default_int_handler if ended_by == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(ended_by, usual)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            tuning._train(tmp_path / "run", [], None, tmp_path / "log", None, 0)
+        assert signal.getsignal(ended_by) == usual
+    finally:
+        signal.signal(ended_by, before)
     assert signals == [signal.SIGINT]
 
 

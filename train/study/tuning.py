@@ -16,7 +16,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -221,7 +222,7 @@ def _train(
     log.parent.mkdir(parents=True, exist_ok=True)
     told: set[int] = set()
     stopped = False
-    with log.open("a", encoding="utf-8") as file:
+    with _ended_with_us(), log.open("a", encoding="utf-8") as file:
         file.write(f"$ restock {' '.join(words)}\n")
         file.flush()
         process = subprocess.Popen(
@@ -254,6 +255,21 @@ def _train(
     if trial is not None and not stopped:  # what it evaluated since it was last looked at
         _falls_behind(trial, path, told, index)
     return not stopped
+
+
+@contextmanager
+def _ended_with_us() -> Iterator[None]:
+    """A kill and the end of the terminal as Ctrl-C: a training in a session of its own hears of
+    none, and would go on alone. What is ignored (`nohup`) stays so."""
+    named = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ours = [number for number in named if signal.getsignal(number) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:
