@@ -91,11 +91,14 @@ def write_text(path: Path, text: str, *, exclusive: bool = False) -> None:
 
 
 def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
-    """Replace a file in one step.
+    """Replace a file in one step; what goes to a pipe or a device is written into it.
 
     Raises:
         FileExistsError: `exclusive`, and there is something at `path` already.
     """
+    if _takes_a_stream(path) and not exclusive:
+        path.write_bytes(content)
+        return
     temporary = _temporary(path)
     try:
         temporary.write_bytes(content)
@@ -105,6 +108,13 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
             temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _takes_a_stream(path: Path) -> bool:
+    """Whether it is no file that can be replaced: /dev/stdout, /dev/null, a named pipe."""
+    if path.is_symlink() and str(path.readlink()).startswith("/proc/self/fd"):
+        return True
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _temporary(path: Path) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 
 import pytest
@@ -24,3 +26,26 @@ def test_an_exclusive_file_is_never_replaced(tmp_path: Path) -> None:
         write_bytes(path, b"second", exclusive=True)
     assert path.read_bytes() == b"first"
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_pipe_is_written_into_and_not_replaced(tmp_path: Path) -> None:
+    """Nor /dev/null, by whoever may replace it."""
+    pipe, heard = tmp_path / "pipe", list[str]()
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: heard.append(pipe.read_text()), daemon=True)
+    reader.start()
+    write_text(pipe, "told")
+    reader.join(10)
+    assert heard == ["told"]
+    assert pipe.is_fifo()
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="no /proc")
+def test_a_stream_of_this_process_is_written_into(tmp_path: Path) -> None:
+    """As /dev/stdout is, where a shell has put it into a file."""
+    with (tmp_path / "out").open("w+") as out:
+        link = tmp_path / "stdout"
+        link.symlink_to(f"/proc/self/fd/{out.fileno()}")
+        write_text(link, "told")
+        assert link.is_symlink()
+        assert out.read() == "told"
