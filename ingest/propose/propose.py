@@ -101,6 +101,7 @@ class Proposal:
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
     kinds: list[RobotKind] = field(default_factory=list)  # where there are several: its own first
+    wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
 def propose_profile(
@@ -178,6 +179,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
         several_commands(usable_topics(recording)),
+        wheeled=other is None,
     )
 
 

@@ -75,6 +75,17 @@ def test_a_robot_on_a_ramp_is_on_wheels(tmp_path, capsys):
     assert main(["profile", "new", str(bag), "--json"]) == 0
 
 
+def test_start_says_so_and_leaves_no_profile_to_edit(tmp_path, capsys):
+    out = tmp_path / "out"
+    for number, topics in enumerate((flight("/mavros/setpoint_velocity/cmd_vel"), arm())):
+        bag = write_topics(topics, tmp_path / f"bag{number}")
+        assert main(["start", str(bag), "--out", str(out), "--json"]) == 3
+        stopped = json.loads(capsys.readouterr().out)["stopped"]
+        assert stopped["why"].startswith("taken for a")
+        assert stopped["remedies"] == ["name recordings of a robot on wheels"]
+        assert not (out / "profile.toml").exists()
+
+
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 def test_a_base_with_an_arm_is_on_wheels(capsys):
     assert main(["profile", "new", str(SHARED / "sim-time-husky"), "--json"]) == 0

@@ -66,7 +66,7 @@ class ProfileCommand:
     """Read what is intact of truncated or damaged files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands", "kinds"}; `check`: {"inputs", "problems", "advice",
+    "problems", "advice", "commands", "kinds", "wheeled"}; `check`: {"inputs", "problems", "advice",
     "outcome", …}."""
 
     @property
@@ -124,6 +124,7 @@ class ProfileCommand:
                     "advice": [{"key": each.key, "text": each.text} for each in proposal.advice],
                     "commands": proposal.commands,
                     "kinds": [asdict(kind) for kind in proposal.kinds],
+                    "wheeled": proposal.wheeled,
                 }
             )
         elif self.out is None:

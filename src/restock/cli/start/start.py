@@ -209,6 +209,12 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         proposed = work.do(stages.propose(to, sources, flags, asked.urdf))
         if not proposed.good:
             return Stop("no profile can be proposed", (f"write {to.profile}: docs/profile.md",))
+        if not proposed.document.get("wheeled", True):
+            Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
+            return Stop(
+                "; ".join(proposed.document["problems"]),
+                ("name recordings of a robot on wheels",),
+            )
         if problems := proposed.document.get("problems"):
             told = (f"edit {to.profile}: its first lines say what is missing", again)
             if proposed.document.get("missing"):
