@@ -41,6 +41,7 @@ from restock.stats import interval_text
 
 LISTED = "fleets.json"
 TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # of inputs that may be missing
+DROVE = ("agent", "cloned", "planner")  # what came out, how the logs were driven, and a script
 BY_YEAR = (
     "SELECT robot, site, year(logged_time) AS year, count(*) AS rows,"
     " count(DISTINCT episode_id) AS episodes, count(DISTINCT condition) AS conditions"
@@ -227,7 +228,8 @@ def twin_of(stages: Documents, documents: Documents) -> dict[str, Any]:
 
 
 def policy_of(stages: Documents, documents: Documents) -> dict[str, Any]:
-    """Success in the twin by policy, and what held-out logs say."""
+    """Success in the twin by policy (`cloned` is how the logs were driven) with how good the clone
+    is, and what held-out logs say."""
     driven: dict[str, dict[str, str]] = {}
     for one in documents.get("eval", {}).get("results", []):
         if one["perturbation"] == "none" and one["success"] is not None:
@@ -235,7 +237,11 @@ def policy_of(stages: Documents, documents: Documents) -> dict[str, Any]:
             driven.setdefault(one["policy"], {})[one["condition"]] = interval_text(
                 one["success"], *ends
             )
-    return {"driven": driven, "on_logs": stages.get("judge", {}).get("outcome", [])}
+    return {
+        "driven": driven,
+        "clones": [one["text"] for one in documents.get("eval", {}).get("clones", [])],
+        "on_logs": stages.get("judge", {}).get("outcome", []),
+    }
 
 
 def contacts_against_labels(kind: Kind, store: Path, definitions: Path | None) -> dict[str, Any]:
@@ -256,8 +262,8 @@ def lines_of(robots: Sequence[Mapping[str, Any]]) -> list[str]:
     """The tables."""
     header = [
         *("robot, by its own words", "recordings", "rows", "conditions", "stood in"),
-        *("fitted", "gap after 3 s, m", "twin in nominal driving", "agent", "planner"),
-        *("on held-out logs", "min"),
+        *("fitted", "gap after 3 s, m", "twin in nominal driving", *DROVE),
+        *("how good the clone is", "on held-out logs", "min"),
     ]
     table = []
     for one in robots:
@@ -273,7 +279,8 @@ def lines_of(robots: Sequence[Mapping[str, Any]]) -> list[str]:
                 _pairs(one["fitted"], "{0} {1}") or "nothing",
                 " -> ".join(gap[name] for name in ("nominal", "calibrated") if name in gap),
                 one["verdicts"].get("nominal", "not measured"),
-                *(_pairs(one["driven"].get(who, {}), "{0} {1}") for who in ("agent", "planner")),
+                *(_pairs(one["driven"].get(who, {}), "{0} {1}") for who in DROVE),
+                "; ".join(one["clones"]),
                 "; ".join(one["on_logs"]),
                 one["minutes_it_took"],
             ]

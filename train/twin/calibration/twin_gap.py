@@ -132,7 +132,7 @@ def trust_verdict(
     verdict = UNTRUSTED if beyond else UNDECIDED if open_ else TRUSTED
     reasons = beyond or open_
     few = [
-        f"{there} {what} (at least {least})"
+        f"{there} of at least {least} {what}"
         for there, least, what in (
             (segments, limits.segments, f"segments of {limits.horizon_s:g} s"),
             (episodes, limits.episodes, "episodes with one"),
