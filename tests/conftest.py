@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -22,6 +23,18 @@ def store_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the same three recordings."""
     path = tmp_path_factory.mktemp("replay") / "store"
     return write_store(path, [recording_transitions(index) for index in (1, 2, 3)])
+
+
+@pytest.fixture
+def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What off-policy evaluation fits does not matter to the verbs: two updates will do."""
+    from support.kept_run import QUICK
+
+    from restock.train import loop
+    from restock.train.evaluation import ope
+
+    for module in (ope, loop):
+        monkeypatch.setattr(module, "OpeConfig", partial(ope.OpeConfig, model=QUICK))
 
 
 @pytest.fixture(scope="module")

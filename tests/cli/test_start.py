@@ -232,11 +232,11 @@ def test_an_edited_profile_is_taken_and_never_replaced(
 
 
 def test_where_nothing_says_that_the_twin_is_right_a_policy_comes_from_the_logs_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = write_bag(Drive(12.0), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), "--minutes", "0.1")
+    argv = (str(recording), "--out", str(out), "--minutes", "0.02")
     code, document = start(capsys, *argv)
     assert code == 0
     stages = {stage["name"]: stage for stage in document["stages"]}

@@ -11,12 +11,14 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import NetworkConfig, TrainConfig
+from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.network import Network, make_network
 from restock.train.run import checkpoint
 from restock.train.run.run import Run, panel_document
 
 TASK = load_profile("warehouse_amr").task
 NETWORK = NetworkConfig()
+QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
 
 
 def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> Network:

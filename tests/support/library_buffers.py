@@ -85,7 +85,7 @@ def sb3_envs(count: int, **arguments: Any) -> Any:
     return DummyVecEnv([lambda: gymnasium.make("restock/Warehouse-v0", **arguments)] * count)
 
 
-def trained_sb3(folder: Path) -> TrainedBuffer:
+def trained_sb3(folder: Path, steps: int = 520) -> TrainedBuffer:
     """A DQN after 40 updates on logs and some hundred environment steps."""
     sb3 = pytest.importorskip("stable_baselines3")
     from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
@@ -116,7 +116,7 @@ def trained_sb3(folder: Path) -> TrainedBuffer:
     buffer.critic = dqn_critic(model)
     model.learn(0)  # sets up the logger; then the logs alone
     model.train(40, batch_size=64)
-    model.learn(520, reset_num_timesteps=False)
+    model.learn(steps, reset_num_timesteps=False)
     buffer.close()
     counts = model.num_timesteps, model._n_updates
     return TrainedBuffer(

@@ -45,7 +45,7 @@ def test_a_network_that_is_not_finite_stops_the_loop_and_names_the_rows(
     tmp_path: Path,
 ) -> None:
     """Where the buffer is told of TD errors; what was recorded before stays whole."""
-    trained = trained_sb3(tmp_path)
+    trained = trained_sb3(tmp_path, 80)
     updates = trained.feed.batches
     with torch.no_grad():
         next(iter(trained.algorithm.q_net.parameters()))[0, 0] = float("nan")

@@ -37,6 +37,7 @@ def test_nothing_drives_and_what_was_learnt_last_is_kept(
     panel: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    quick_models: None,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def refuse(*given: object, **named: object) -> None:

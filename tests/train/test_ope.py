@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -13,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from support.kept_run import kept_network, kept_run
+from support.kept_run import QUICK, kept_network, kept_run
 from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
@@ -23,18 +22,15 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.train import loop
 from restock.train.dqn.config import NetworkConfig
-from restock.train.dqn.fitted_q import FittedQConfig, soft_greedy
+from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.network import make_network
-from restock.train.evaluation import ope
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
 from restock.train.evaluation.ope_dataset import OpeSteps, load_ope_dataset, read_steps
 
 TASK = load_profile("warehouse_amr").task
 MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.3\n")
 NETWORK = NetworkConfig(hidden=(16,))
-QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
 CONFIG = OpeConfig(model=QUICK)
 
 
@@ -55,13 +51,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def panel(store: Path) -> Panel:
     return panel_of(store, MIXTURE, store.parent / "panel")
-
-
-@pytest.fixture
-def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is fitted does not matter to the verbs: two updates will do."""
-    for module in (ope, loop):
-        monkeypatch.setattr(module, "OpeConfig", partial(OpeConfig, model=QUICK))
 
 
 def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel) -> None:
