@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo site test test-docs test-slow neighbours lint notebook sample-logs clean
+.PHONY: demo site test test-long test-docs test-slow neighbours lint notebook sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo         recordings in, a fine-tuned policy and a report out (build/demo/report.html)"
 	@echo "make test         the tests (make test-slow: the slow ones and the documentation's too)"
+	@echo "make test-long    the tests that take longer, or show in full what a shorter one shows"
 	@echo "make site         the documentation as a site, build/site/index.html; a broken link fails"
 	@echo "make test-docs    run every block of the documentation as it is printed"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
@@ -30,9 +31,15 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/restock demo --out build/demo
 
-# A process a core, each with whole files: fixtures of a module are made once.
+# A process a core, each with whole files: fixtures of a module are made once. Each computes on one
+# thread: threads of several processes on the same cores wait for each other at full load.
+test test-long test-docs: export OMP_NUM_THREADS = 1
+
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+test-long: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m 'long and not slow and not docs'
 
 test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m 'docs and not slow'

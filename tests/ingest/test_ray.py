@@ -56,6 +56,7 @@ def table(store: Path):
         ).to_arrow_table()
 
 
+@pytest.mark.long
 def test_the_store_and_the_answers_are_those_of_one_process(bags, tmp_path, cluster, monkeypatch):
     monkeypatch.chdir(bags)
     paths = [Path("drive0"), Path("cut.mcap"), Path("drive1"), Path("drive2")]

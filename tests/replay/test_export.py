@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from ruamel.yaml import YAML
+from support.long import one_in
 from support.neighbours import read_with
 from support.panels import panel_of
 from support.stores import TASK, recording_transitions, write_store
@@ -289,7 +290,7 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path: Path) -> Non
     assert gymnasium.spec("restock/Warehouse-v0").kwargs == registered
 
 
-@pytest.mark.parametrize("continuous", [False, True])
+@pytest.mark.parametrize("continuous", one_in(2, [False, True]))
 def test_d3rlpy_reads_its_data_set_and_trains_on_it(
     store_path: Path, tmp_path: Path, continuous: bool
 ) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from support.long import one_in
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -72,28 +73,31 @@ def test_an_arm_whose_network_is_not_finite_ends_with_an_error(
     assert not Run.open(tmp_path / "run").best.exists()
 
 
-def test_what_is_kept_acts_as_the_library_does(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("library", "name", "own"),
+    one_in(
+        2,
+        [
+            ("sb3-dqn", "DQN", {}),
+            ("sb3-ppo", "PPO", {"n_steps": 40, "batch_size": 20, "n_epochs": 2}),
+        ],
+    ),
+)
+def test_what_is_kept_acts_as_the_library_does(
+    tmp_path: Path, monkeypatch, library: str, name: str, own: dict
+) -> None:
     pytest.importorskip("stable_baselines3")
     from restock.train.libraries import sb3_drive
 
     models: dict[str, object] = {}
-    for name in ("DQN", "PPO"):
-        made = getattr(sb3_drive, name)
-        monkeypatch.setattr(
-            sb3_drive,
-            name,
-            lambda *a, _made=made, _n=name, **k: models.setdefault(_n, _made(*a, **k)),
-        )
+    made = getattr(sb3_drive, name)
+    monkeypatch.setattr(sb3_drive, name, lambda *a, **k: models.setdefault(name, made(*a, **k)))
     observations = np.random.default_rng(0).normal(size=(64, TASK.observation_size))
     observations = observations.astype(np.float32)
-    for library, name, own in (
-        ("sb3-dqn", "DQN", {}),
-        ("sb3-ppo", "PPO", {"n_steps": 40, "batch_size": 20, "n_epochs": 2}),
-    ):
-        run = trained(tmp_path / name, library, **own)
-        theirs, _ = models[name].predict(observations, deterministic=True)  # type: ignore[attr-defined]
-        ours, _ = load_agent(run).act(None, observations)
-        assert ours.tolist() == theirs.tolist()
+    run = trained(tmp_path / name, library, **own)
+    theirs, _ = models[name].predict(observations, deterministic=True)  # type: ignore[attr-defined]
+    ours, _ = load_agent(run).act(None, observations)
+    assert ours.tolist() == theirs.tolist()
 
 
 def test_ppo_was_fed_every_step_of_its_rollouts_some_epochs_long(tmp_path: Path) -> None:

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 from support.library_buffers import TrainedBuffer, trained_sb3, trained_tianshou
+from support.long import one_in
 
 from restock import cli
 from restock.replay.store.store import Store
 from restock.train.finite import STOPPED, NotFinite
 
 
-@pytest.fixture(scope="module", params=[trained_sb3, trained_tianshou], ids=["sb3", "tianshou"])
+@pytest.fixture(
+    scope="module", params=one_in(2, [trained_sb3, trained_tianshou]), ids=["sb3", "tianshou"]
+)
 def trained(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> TrainedBuffer:

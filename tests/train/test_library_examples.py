@@ -75,7 +75,8 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
     assert (tmp_path / "run" / "strata.parquet").is_file()
 
 
-@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.long  # its import alone takes seconds; test_tianshou_buffer has the shorter ones
+@pytest.mark.parametrize("mixed", [True, False])
 def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) -> None:
     given = {"panel": str(panel), "run": str(tmp_path / "run")} if mixed else {}
     done = example("tianshou_dqn").main(steps=96, num_envs=2, **given)

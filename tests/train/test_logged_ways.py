@@ -127,6 +127,7 @@ def test_eval_drives_the_ways_of_the_logs(
     assert "learnt from no logs" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
     panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

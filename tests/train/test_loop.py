@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from support.long import one_in
 from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
+from restock.train import jump_start
+from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
@@ -59,6 +63,7 @@ def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
     assert (live.progress.env_steps == 0) == with_logs
 
 
+@pytest.mark.long  # test_algorithms has the shorter ones
 def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> None:
     """Rows of a corridor that never slips: Q of the logged actions is known in closed form."""
     shelf = logs(600)
@@ -94,7 +99,7 @@ def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
 
 
-@pytest.mark.parametrize("calls", [20, 61, 150, 333])
+@pytest.mark.parametrize("calls", one_in(3, [20, 61, 150, 333]))
 def test_interrupted_and_resumed_is_bit_exact(
     undisturbed: Session, tmp_path: Path, calls: int
 ) -> None:
@@ -157,23 +162,32 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
 
 
 def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
-    first = run_to_end(tmp_path / "run", config())
+    settings = config(schedule={"env_steps": 400})
+    first = run_to_end(tmp_path / "run", settings)
     probe = pq.read_table(first.run.path / "probe.parquet")["probe_hash"].unique().to_pylist()
     other = dataclasses.replace(logs(), rows=logs().rows.flip(0))
     with pytest.raises(RunError, match=rf"other logged rows: its probe is {probe[0]}") as refused:
-        session(first.run.path, config(), logs=other, resume=True)
+        session(first.run.path, settings, logs=other, resume=True)
     assert "the panel that the run began with" in str(refused.value)
 
 
 def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
-    live = run_to_end(tmp_path / "run", config(record={"keep_checkpoints": 1}))
+    live = run_to_end(
+        tmp_path / "run", config(record={"keep_checkpoints": 1}, schedule={"env_steps": 900})
+    )
     assert earlier(live.run.latest) == {}
 
 
 JUMP_START = {"jump_start": {"env_steps": 1000, "horizon_steps": 5}}
 
 
-def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path) -> None:
+@pytest.fixture
+def quick_clone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the logs did in the corridor is soon learnt."""
+    monkeypatch.setattr(jump_start, "FittedQConfig", partial(FittedQConfig, cloning_updates=200))
+
+
+def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path, quick_clone: None) -> None:
     live = run_to_end(tmp_path / "run", config(**JUMP_START))
     meta = {name: values[: len(live.ring)] for name, values in live.ring.meta.items()}
     cloned = meta["behaviour_policy"] == live.ring.behaviour_policies.index("cloned")
@@ -189,7 +203,7 @@ def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path) -> None:
     assert {"dqn", "cloned"} <= {r["behaviour_policy"] for r in fed if r["source"] == "fresh"}
 
 
-def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path) -> None:
+def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path, quick_clone: None) -> None:
     whole = run_to_end(tmp_path / "whole", config(**JUMP_START))
     path = Path(shutil.copytree(whole.run.path, tmp_path / "cut"))
     latest = path / "checkpoints" / "latest.safetensors"
@@ -437,7 +451,7 @@ def spoilt(live: Session, at: int) -> Any:
     return stop
 
 
-@pytest.mark.parametrize("action", ["stop", "rollback"])
+@pytest.mark.parametrize("action", one_in(2, ["stop", "rollback"]))
 def test_the_guard_does_not_let_a_condition_be_unlearnt(tmp_path: Path, action: str) -> None:
     settings = config(
         guard={"margin": 0.5, "action": action, "conditions": ["nominal"]},

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from support.kept_run import TASK
+from support.long import one_in
 from support.stores import recording_transitions
 from support.toy_run import assert_same_run, config, logs, run_to_end, session
 
@@ -149,7 +150,7 @@ def test_a_network_that_is_not_finite_is_neither_recorded_nor_kept(tmp_path: Pat
     assert_same_run(run_to_end(tmp_path / "whole", settings), again)
 
 
-@pytest.mark.parametrize("at", [0.3, 0.7])
+@pytest.mark.parametrize("at", one_in(2, [0.3, 0.7]))
 def test_a_damaged_checkpoint_is_refused_by_name(
     panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at: float
 ) -> None:

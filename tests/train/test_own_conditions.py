@@ -36,8 +36,8 @@ path = "status[name=battery].values[key=voltage].value"
 unit = "V"
 """
 SMALL = [
-    *("schedule.env_steps=1000", "schedule.offline_updates=10", "schedule.warmup_env_steps=100"),
-    *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=1000"),
+    *("schedule.env_steps=500", "schedule.offline_updates=10", "schedule.warmup_env_steps=100"),
+    *("env.num_envs=4", "evaluation.episodes=1", "evaluation.every_env_steps=500"),
     *("record.tensorboard=false", "network.hidden=[16]"),
 ]
 
@@ -62,15 +62,21 @@ def train(folder: Path, run: str, *more: str) -> int:
     return main(["train", *given, *profile, *settings, *more])
 
 
+def test_a_dry_run_says_which_conditions_its_twin_cannot_evaluate(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    assert train(folder, "dry", "--dry-run") == 0
+    document: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert document["not_evaluated"] == {"sagging": ["battery_v"]}
+    assert not (folder / "dry").exists()
+
+
+@pytest.mark.long
 def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
-    assert train(folder, "run", "--dry-run") == 0
-    document: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert document["not_evaluated"] == {"sagging": ["battery_v"]}
-    assert not (folder / "run").exists()
-
     assert train(folder, "run", "--flush-fresh", str(folder / "store")) == 0
     said = capsys.readouterr().err
     assert said.count("condition 'sagging' is not evaluated in the twin") == 1
@@ -85,7 +91,7 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     assert "sagging" in {row["condition"] for row in met if row["source"] == "logs"}
     assert "sagging" not in {row["condition"] for row in met if row["source"] == "fresh"}
 
-    few = ["--episodes", "1", "--policies", "agent", "--perturbations", "none"]
+    few = ["--episodes", "nominal=1", "--policies", "agent", "--perturbations", "none"]
     assert main(["eval", str(folder / "run"), *few]) == 0
     assert main(["report", str(folder / "run")]) == 0
     page = (folder / "run" / "report.html").read_text()

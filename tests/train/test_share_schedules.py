@@ -291,6 +291,7 @@ def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Se
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built
 
 
+@pytest.mark.long
 def test_a_run_on_everything_at_once_resumes_bit_for_bit(
     whole: tuple[Session, Panel], tmp_path: Path
 ) -> None:

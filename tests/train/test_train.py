@@ -269,9 +269,12 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     with pytest.raises(RestockError, match="already exists"):
         restock.train.train(config, out=str(tmp_path / "a"))
 
-    rows = restock.train.evaluate(tmp_path / "a", policies=["agent", "planner"], episodes=1)
-    argv = ["eval", str(tmp_path / "a"), "--policies", "agent,planner", "--episodes", "1"]
-    assert main([*argv, "--perturbations", "none", "--json"]) == 0
+    rows = restock.train.evaluate(
+        tmp_path / "a", policies=["agent", "planner"], episodes="nominal=1"
+    )
+    argv = ["eval", str(tmp_path / "a"), "--policies", "agent,planner"]
+    argv += ["--episodes", "nominal=1", "--perturbations", "none", "--json"]
+    assert main(argv) == 0
     assert json.loads(capsys.readouterr().out)["results"] == json.loads(json.dumps(rows))
 
     compared = restock.train.compare_with_baseline(tmp_path / "a", str(tmp_path / "a"))

@@ -1,0 +1,16 @@
+"""Parameters of which some run with every `make test`, and the others with `make test-long`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+
+def one_in(every: int, values: Iterable[Any]) -> list[Any]:
+    """The first of each `every` values as it is, the others marked `long`."""
+    return [
+        value if number % every == 0 else pytest.param(value, marks=pytest.mark.long)
+        for number, value in enumerate(values)
+    ]
