@@ -9,8 +9,13 @@ import pytest
 
 
 def one_in(every: int, values: Iterable[Any]) -> list[Any]:
-    """The first of each `every` values as it is, the others marked `long`."""
+    """The first of each `every` values as it is, the others marked `long`; a tuple is of several
+    parameters."""
     return [
-        value if number % every == 0 else pytest.param(value, marks=pytest.mark.long)
+        value
+        if number % every == 0
+        else pytest.param(
+            *(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.long
+        )
         for number, value in enumerate(values)
     ]
