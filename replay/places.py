@@ -17,7 +17,8 @@ from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.store.definitions import definitions
-from restock.replay.store.store import Store, is_store, read_parquet
+from restock.replay.store.parquet_views import read_parquet
+from restock.replay.store.store import Store, is_store
 
 RUN_CONFIG = "config.json"
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from restock.errors import ConfigError
-from restock.replay.store.store import Store, passed_in
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
 
 PERIODS = ("day", "week", "month", "year", "decade")
 OWN, OTHERS = "own reference", "other robots"

@@ -14,7 +14,8 @@ from restock.errors import StoreError
 from restock.replay.mixture.mixture import Mixture, OtherStore
 from restock.replay.panel.candidates import STORE_COLUMN
 from restock.replay.store.definitions import definitions
-from restock.replay.store.store import Store, parquet_view
+from restock.replay.store.parquet_views import parquet_view
+from restock.replay.store.store import Store
 
 
 class PinnedStore(msgspec.Struct, frozen=True):

@@ -8,7 +8,8 @@ import duckdb
 
 from restock.errors import StoreError
 from restock.replay.store.definitions import FRAMES, definitions, made_by
-from restock.replay.store.store import Store, parquet_view
+from restock.replay.store.parquet_views import parquet_view
+from restock.replay.store.store import Store
 
 # Written by any newer DuckDB, a file of this version is read by DuckDB 1.4 and later.
 STORAGE_VERSION = "v1.4.0"

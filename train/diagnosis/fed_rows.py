@@ -19,7 +19,8 @@ from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import StoreError
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.replay.store.store import Store, passed_in
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
 
 _COLUMNS = (
     *("transition_id", "episode_id", "step_index", "recording_id", "condition", "action", "reward"),

@@ -21,7 +21,7 @@ from restock.arrays import F64, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.replay.store.store import passed_in
+from restock.replay.store.parquet_views import passed_in
 from restock.train.evaluation.ope_dataset import held_out_of, panel_store
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame

@@ -23,7 +23,8 @@ from restock.files import read_table
 from restock.ingest.store.location import Location
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, Panel
-from restock.replay.store.store import Store, passed_in
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
 from restock.train.dqn.fitted_q import Transitions
 
 Measure = Literal["return", "success"]

@@ -25,7 +25,8 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
-from restock.replay.store.store import Store, passed_in
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_robot import robot_of_store
 from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.robot_trial import robot_model

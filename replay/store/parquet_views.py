@@ -1,0 +1,105 @@
+"""Views over Parquet files, and Arrow tables under a name, on a DuckDB connection."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import duckdb
+import pyarrow as pa
+
+from restock.errors import StoreError
+from restock.files import first_line
+
+
+@contextmanager
+def passed_in(connection: duckdb.DuckDBPyConnection, **tables: pa.Table) -> Iterator[None]:
+    """Tables that the connection's SQL sees by their names, for as long as the block runs."""
+    for name, table in tables.items():
+        connection.register(name, table)
+    try:
+        yield
+    finally:
+        for name in tables:
+            connection.unregister(name)
+
+
+def read_parquet(
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    schema: str = "main",
+    absent: Sequence[str] = (),
+    kinds: Mapping[str, str] | None = None,
+) -> None:
+    """A view over Parquet files; columns that only some have are null in the others, and so are
+    text columns that are `absent` from all. With `kinds` of columns, no file is looked at.
+
+    Raises:
+        StoreError: one of them is missing or damaged.
+    """
+    try:
+        if kinds is None:
+            connection.execute(parquet_view(view, files, schema=schema, absent=absent))
+        else:
+            connection.execute(_known_parquet_view(view, files, kinds, schema=schema))
+    except duckdb.Error as error:
+        where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
+        raise StoreError(
+            f"cannot be read: {first_line(error)}",
+            where=where,
+            remedy="restore the file from a copy, or make it again with the verb that wrote it",
+        ) from error
+
+
+def parquet_view(
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    *,
+    schema: str | None = None,
+    absent: Sequence[str] = (),
+) -> str:
+    """The statement that makes such a view; each time that a query names it, every file is opened
+    to find out its columns."""
+    name = f'"{schema}"."{view}"' if schema else f'"{view}"'
+    nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
+    return (
+        f"CREATE OR REPLACE VIEW {name} AS SELECT *{nulls}"
+        f" FROM read_parquet({_list(files)}, union_by_name = true)"
+    )
+
+
+def _known_parquet_view(
+    view: str, files: Sequence[str | os.PathLike[str]], kinds: Mapping[str, str], *, schema: str
+) -> str:
+    """The statements that make a view of columns of these types. The lists are variables of the
+    connection: as part of the view they would be read again wherever a query names it."""
+    fields = ", ".join(
+        f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
+        " default_value: NULL}"
+        for column, kind in kinds.items()
+    )
+    named = {f"{schema}_{view}_files": _list(files), f"{schema}_{view}_types": f"MAP {{{fields}}}"}
+    variables = [f'SET VARIABLE "{name}" = {value};' for name, value in named.items()]
+    files_name, types_name = map(_literal, named)
+    return (
+        f'{" ".join(variables)} CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM'
+        f" read_parquet(getvariable({files_name}), schema = getvariable({types_name}))"
+    )
+
+
+def _list(files: Sequence[str | os.PathLike[str]]) -> str:
+    return "[" + ", ".join(_literal(str(file)) for file in files) + "]"
+
+
+def column_types(connection: duckdb.DuckDBPyConnection, schema: pa.Schema) -> dict[str, str]:
+    """Columns of an Arrow schema with DuckDB's types."""
+    with passed_in(connection, columns_of_schema=schema.empty_table()):
+        rows = connection.sql("DESCRIBE columns_of_schema").fetchall()
+    return {str(row[0]): str(row[1]) for row in rows}
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
