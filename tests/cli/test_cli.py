@@ -152,6 +152,7 @@ def sample_rows(tmp_path):
         ["eval", "run", "--horizon", "5"],
         ["label", "store", "--all"],
         ["export", "run", "--to", "onnx", "--out", "p.onnx", "--license", "apache-2.0"],
+        ["export", "run", "--to", "onnx", "--out", "p.onnx", "--cameras", "front"],
         ["audit", "store", "--capacity", "--strict"],
         ["audit", "store", "--capacity", "--run", "runs/a"],
         ["audit", "runs/a", "--reward", "--panel", "panel"],

@@ -49,7 +49,7 @@ class ExportCommand:
         from restock.ingest.store.version import given_version
 
         if self.to == "onnx":
-            of_rows = ("query", "panel", "version", "action", "license")
+            of_rows = ("query", "panel", "version", "action", "license", "cameras")
             refuse(self, of_rows, "is of a data set", remedy="leave it out: a policy has no rows")
             from restock.train.evaluation.onnx_policy import export_onnx
 
