@@ -220,13 +220,15 @@ def _scores(tables: Iterable[pa.Table]) -> dict[Cell, dict[int, F64]]:
 
 def last_evaluation(run: Run) -> pa.Table:
     """The last periodic evaluation in training. Raises RunError where there was none."""
+    import pyarrow.compute as pc  # slow to import
+
     table = run.table("evaluations")
     if not len(table):
         raise RunError(
             "has no evaluation", where=str(run.path), remedy=f"run `restock eval {run.path}`"
         )
-    last = pa.compute.max(table["gradient_steps"])
-    return table.filter(pa.compute.equal(table["gradient_steps"], last))
+    last = pc.max(table["gradient_steps"])
+    return table.filter(pc.equal(table["gradient_steps"], last))
 
 
 __all__ = ["LEAST_EPISODES", "Comparison", "compare", "last_evaluation"]

@@ -225,8 +225,10 @@ def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict
 
 def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
     """What `restock eval` wrote of the run's own policy, or of another; None: none drove."""
+    import pyarrow.compute as pc  # slow to import
+
     table, _ = shown_evaluation(run.path)
-    driven = table.filter(pa.compute.equal(table["policy"], policy))
+    driven = table.filter(pc.equal(table["policy"], policy))
     return driven if len(driven) else None
 
 

@@ -277,10 +277,12 @@ def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:
     file = path / "evaluations.parquet"
     if not file.exists():
         return False
+    import pyarrow.compute as pc  # slow to import
+
     table = pq.read_table(file, columns=["env_steps", "condition", "success"])
     for steps in sorted(set(table["env_steps"].to_pylist()) - told):
         told.add(steps)
-        bound, _ = worst_condition([table.filter(pa.compute.equal(table["env_steps"], steps))])
+        bound, _ = worst_condition([table.filter(pc.equal(table["env_steps"], steps))])
         # Seeds follow each other: each has its own stretch of steps.
         trial.report(bound, index * 1_000_000_000 + steps)
         if trial.should_prune():
