@@ -426,6 +426,24 @@ def test_headline_and_callout_tell_no_difference_of_few_episodes(run: Path, tmp_
     assert "Worse than the planner" not in html
 
 
+def test_headline_says_where_the_episodes_are_not_the_same(run: Path, tmp_path: Path) -> None:
+    """As where the baseline drove more of them than the run's policy did."""
+    copy = shutil.copytree(run, tmp_path / "run")
+    file = copy / "eval" / "episodes.parquet"
+    table = pq.read_table(file)
+    (first, *_) = [r["episode_seed"] for r in table.to_pylist() if r["condition"] == "wheel_slip"]
+    kept = [
+        (row["policy"], row["condition"], row["episode_seed"]) != ("agent", "wheel_slip", first)
+        for row in table.to_pylist()
+    ]
+    pq.write_table(table.filter(pa.array(kept)), file)
+    assert re.fullmatch(
+        r"No difference from the planner is shown in nominal \(.* points \[.*\]\);"
+        r" not on the same episodes in wheel slip",
+        headline(gather(copy)),
+    )
+
+
 def test_each_perturbation_has_a_table_and_the_clean_one_is_open(run: Path) -> None:
     facts = gather(run)
     facts.cells += [{**row, "perturbation": "friction"} for row in facts.cells]

@@ -95,7 +95,8 @@ def _against_baseline(facts: Facts) -> str:
         if by[verdict]
     ]
     same = [row for row in rows if row["verdict"] == "no difference shown"]
-    few = [row for row in rows if row["verdict"] not in (*by, "no difference shown")]
+    few = [row for row in rows if row["verdict"] == "inconclusive"]
+    apart = [words(row["condition"]) for row in rows if row["verdict"] == "refused"]
     if same:
         against = "" if parts else f" from {who}"
         names = _listed([words(row["condition"]) for row in same])
@@ -109,17 +110,16 @@ def _against_baseline(facts: Facts) -> str:
     if few:
         against = "" if parts else f" from {who}"
         parts.append(f"too few episodes to tell a difference{against} in {_few(few)}")
+    if apart:
+        as_who = "" if parts else f" as {who}"
+        parts.append(f"not on the same episodes{as_who} in {_listed(apart)}")
     text = "; ".join(parts)
     return text[0].upper() + text[1:]
 
 
 def _few(rows: Rows) -> str:
     return _listed(
-        [
-            words(row["condition"])
-            + ("" if row["difference"] is None else f" ({_signed(row['difference'])} points)")
-            for row in rows
-        ]
+        [f"{words(row['condition'])} ({_signed(row['difference'])} points)" for row in rows]
     )
 
 
