@@ -80,6 +80,23 @@ def test_a_damaged_recording_is_read_as_far_as_it_is_intact_where_that_is_asked_
     assert not (out / "floor.toml").exists()
 
 
+def test_a_robot_larger_than_its_aisles_is_told_to_be_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aisle = np.zeros((80, 300), np.uint8)
+    aisle[34:46, 5:295] = 254  # .6 m wide, around y = 1 m
+    write_pgm(tmp_path / "aisle.pgm", aisle)
+    known = tmp_path / "aisle.yaml"
+    known.write_text("image: aisle.pgm\nresolution: 0.05\norigin: [-1.0, -1.0, 0]\n")
+    bag, out = write_bag(Drive(), tmp_path / "bag"), tmp_path / "out"
+    argv = (str(bag), "--out", str(out), "--map", str(known), "--footprint", "0.9x0.8")
+    code, document = start(capsys, *argv)
+    assert code == 3
+    assert "no free place that a robot fits in" in document["stages"][-1]["errors"][0]
+    assert document["stopped"]["remedies"][0].startswith("measure the robot")
+    assert not (out / "floor.toml").exists()
+
+
 CART = """<robot name='cart'><link name='base_link'>
 <inertial><mass value='20'/></inertial>
 <collision><geometry><box size='0.6 0.4 0.2'/></geometry></collision></link>{}</robot>"""

@@ -276,9 +276,11 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if twin:
         floor = work.do(stages.floor(to))
         if not floor.good and to.map is not None:
+            sized = ("measure the robot, and add --footprint LxW to this command",)
             return Stop(
                 f"{to.map} cannot be the floor of these recordings",
                 (
+                    *(sized if any("--footprint" in why for why in floor.errors) else ()),
                     "name the map.yaml that the robot localised in, or leave out --map: the floor"
                     " is then that of the recordings",
                     again,
