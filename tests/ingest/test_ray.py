@@ -74,6 +74,7 @@ def test_the_store_and_the_answers_are_those_of_one_process(bags, tmp_path, clus
     assert table(tmp_path / "processes").equals(table(tmp_path / "ray"))
 
 
+@pytest.mark.long  # test_workers has that of processes
 def test_a_task_that_dies_costs_its_recording_only(bags, tmp_path, cluster):
     job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(run_on_ray(job, [bags / f"drive{number}" for number in range(3)]))

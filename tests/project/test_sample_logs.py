@@ -88,6 +88,7 @@ def test_the_readme_says_that_they_are_simulated() -> None:
     assert all(name in text for name in RECORDINGS)
 
 
+@pytest.mark.long  # test_recorder has a shorter recording
 def test_making_them_twice_gives_the_same_bytes(tmp_path: Path) -> None:
     """Two missions of each; all of them: see the slow test."""
     made = []

@@ -519,6 +519,7 @@ def test_terms_that_the_logs_cannot_serve_are_refused(
         session(tmp_path / "r", config(loss=loss))
 
 
+@pytest.mark.long
 def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
     settings = config(
         loss={"margin": 0.5, "conservative": 0.1},

@@ -198,6 +198,7 @@ def test_every_step_has_the_teachers_answer_for_its_own_state(taught: Any) -> No
     assert probability[~chosen].max() == pytest.approx(epsilon / 3)  # explores over all actions
 
 
+@pytest.mark.long
 def test_interrupted_and_resumed_is_bit_exact(taught: Any, tmp_path: Path) -> None:
     class Walker:
         """Draws, so that its state matters."""

@@ -102,6 +102,7 @@ def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_pa
     assert "in the twin" not in alone
 
 
+@pytest.mark.long  # test_loop shows it on the corridor
 def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
     path = tmp_path / "a"
     # Random driving for longer than an episode, so that several end.
@@ -118,6 +119,7 @@ def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
     assert all((row["bumps"] == 0) or not row["success"] for row in episodes)
 
 
+@pytest.mark.long  # test_loop shows it on the corridor
 def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
@@ -227,6 +229,7 @@ def test_what_a_run_measures_on_fresh_steps_does_not_depend_on_a_kill(tmp_path: 
     assert trained(tmp_path / "killed", 80) == whole
 
 
+@pytest.mark.long  # test_eval_run has the shorter ones
 def test_eval_drives_everyone_through_the_same_episodes(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
