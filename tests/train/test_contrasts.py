@@ -202,7 +202,8 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
     plan = study(tmp_path, text)
     for job in plan.jobs:
         level = 0.2 if job.arm.name == "uniform" else 0.7 + 0.05 * job.seed
-        make_run(job.path, document(job.seed), success=level)
+        own = {} if job.arm.name == "uniform" else {"config__replay__logs_share": 0.9}
+        make_run(job.path, document(job.seed, **own), success=level)
         add_evaluation(job.path, driven("agent", level, 12.0))
         job.done.write_text(plan.fingerprint(job))
     add_evaluation(plan.jobs[0].path, driven("planner", 0.5, 10.0))
@@ -221,4 +222,5 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
         for head in ("## Contrasts", "## Success and safety", "## quotas against uniform")
     ]
     assert places == sorted(places)
+    assert "Treatment: mixture; what differs: `replay.logs_share`." in page
     assert "| **primary**: quotas against uniform | success_rare | 0.750 | 0.200 |" in page

@@ -8,6 +8,7 @@ from restock.stats import interval_text
 from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS
 from restock.train.study.findings import SAFETY
 
+FEW_SETTINGS = 4  # that differ, to be named in a line
 _FORMS = {"bumps_per_km": ".1f", "closest_person_m": ".2f", "time_lost_s": "+.1f"}
 
 
@@ -107,7 +108,7 @@ def _comparison(comparison: dict[str, Any]) -> list[str]:
         "",
         f"## {comparison['arm']} against {baseline}",
         "",
-        f"Compared: the {treatment}.",
+        f"Treatment: {treatment}{_differing(comparison)}.",
         "",
     ]
     if treatment == "method":
@@ -135,6 +136,16 @@ def _comparison(comparison: dict[str, Any]) -> list[str]:
             f"{interval}{apart} | {_improvement(row)} |"
         )
     return lines
+
+
+def _differing(comparison: dict[str, Any]) -> str:
+    """The settings that differ, where they are few enough to read."""
+    named = [
+        f"`{row['setting'].removeprefix('config.')}`"
+        for row in comparison["differences"]
+        if row["kind"] not in ("free", "software")
+    ]
+    return f"; what differs: {', '.join(named)}" if 0 < len(named) <= FEW_SETTINGS else ""
 
 
 def _improvement(row: dict[str, Any]) -> str:
