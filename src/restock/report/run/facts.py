@@ -67,6 +67,7 @@ class Facts:
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
     teacher: Rows = field(default_factory=list)  # what its filter did at last
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
+    compared: dict[str, Rows] = field(default_factory=dict)  # with whom, as `headline` asks
 
     @property
     def strata(self) -> list[Stratum]:

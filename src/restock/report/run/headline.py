@@ -57,11 +57,13 @@ def compared(facts: Facts, name: str | None = None) -> Rows:
     name = name or baseline(facts)
     if name is None or facts.no_goal:
         return []
-    try:
-        rows = regression(of_run(facts.run, name), of_run(facts.run))
-    except RunError:  # the episodes have no success that can be compared
-        return []
-    return [row for row in rows if row["condition"] != EVERY]
+    if name not in facts.compared:
+        try:
+            rows = regression(of_run(facts.run, name), of_run(facts.run))
+        except RunError:  # the episodes have no success that can be compared
+            rows = []
+        facts.compared[name] = [row for row in rows if row["condition"] != EVERY]
+    return facts.compared[name]
 
 
 def losses(facts: Facts) -> list[str]:
