@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
 from restock.errors import RecordingError, RestockError
 
 if TYPE_CHECKING:
-    from restock.ingest.containers.recording import Watch
+    from restock.ingest.containers.storage import Watch
     from restock.ingest.pipeline import IngestResult, OnRepeat
     from restock.ingest.profile.profile import Profile
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording, Watch
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.storage import Watch
 from restock.ingest.containers.topic_reading import LATEST_NS
 from restock.ingest.steps.clocks import STAMP, topic_clock
 
@@ -40,8 +41,7 @@ def describe_recording(
     Raises:
         RecordingError: it cannot be opened; see `open_recording`.
     """
-    with open_recording(path, typestore=typestore, salvage=salvage) as recording:
-        recording.watch = watch or recording.watch
+    with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)

@@ -21,7 +21,8 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.camera.frame_rows import KeptFrames, frame_rows, kept_frames
 from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording, Watch
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.storage import Watch
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
@@ -103,8 +104,7 @@ def ingest(
             be refused. The store is as it was.
         StoreError: the store cannot be written.
     """
-    with open_recording(path, typestore=typestore, salvage=salvage) as recording:
-        recording.watch = watch or recording.watch
+    with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
         profile = as_recorded(profile, recording.topics)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}

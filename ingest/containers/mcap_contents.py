@@ -22,12 +22,13 @@ from restock.ingest.containers.mcap_records import (
     parse,
     walk,
 )
-from restock.ingest.containers.storage import Extra, Metadata, keep_entries
+from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, unwatched
 
 # What the survey keeps is bounded, whatever a file is made of.
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
 MOST_DAMAGED = 100
+TELL_EVERY = 65_536  # records, of how far the walk is
 ROSBAG2 = "rosbag2"  # the metadata record of rosbag2's storage
 MOST_OTHERS = 1_000_000  # records beside those of messages
 _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
@@ -81,14 +82,16 @@ class Contents:
         self.chunks = [replace(c, index={}) if c.index else c for c in self.chunks]
 
 
-def survey(file: FileBytes) -> Contents:
-    """Walk the file's top-level records."""
+def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
+    """Walk the file's top-level records; `watch` is told how far that is."""
     contents = Contents()
     end = len(file)
     finished = False
     others = 0
     try:
-        for opcode, at, stop in walk(file, len(MAGIC), end):
+        for number, (opcode, at, stop) in enumerate(walk(file, len(MAGIC), end)):
+            if number % TELL_EVERY == 0:
+                watch("looking through the file, bytes", at, end)
             others += opcode not in _MANY
             if others > MOST_OTHERS:
                 raise Malformed(f"more than {MOST_OTHERS:,} records of no messages", at)

@@ -21,7 +21,9 @@ from restock.ingest.containers.storage import (
     Integrity,
     Metadata,
     Packed,
+    Watch,
     custom_data,
+    unwatched,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
@@ -32,18 +34,20 @@ GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's 
 class McapFile:
     """One MCAP file, chunked or not, with or without summary, statistics and message index.
 
+    `watch` is told how far it is opened: without statistics its messages must be counted.
+
     Raises:
         RecordingError: no MCAP file, or cut short and not to be salvaged.
     """
 
-    def __init__(self, path: Path, *, salvage: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        self.path, self._watch = path, watch
         self._checks = Checks()
         self.damage, self.notes = self._checks.damage, self._checks.notes
         self._file = FileBytes(path)
         if self._file[: len(MAGIC)] != MAGIC:
             raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
-        self._contents = survey(self._file)
+        self._contents = survey(self._file, watch)
         self.profile = self._contents.profile
         for what in self._contents.damaged:
             self._checks.damaged(what, {})
@@ -103,7 +107,8 @@ class McapFile:
             return {**claimed, **{number: counts[number] for number in more}}
         contents.distrust_index()
         counts = contents.indexed_counts()
-        for chunk in contents.chunks:
+        for done, chunk in enumerate(contents.chunks):
+            self._watch("counting messages, chunks", done, len(contents.chunks))
             for number, positions in self._chunks.walk(chunk).items():
                 counts[number] += len(positions)
         return counts

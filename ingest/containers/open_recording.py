@@ -20,7 +20,7 @@ from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.sqlite_file import SqliteFile, open_sqlite
 from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
-from restock.ingest.containers.storage import Damage, Storage
+from restock.ingest.containers.storage import Damage, Storage, Watch, unwatched
 from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE
@@ -28,7 +28,11 @@ from restock.ingest.decoding.definitions import DEFAULT_DISTRO, refuse_unknown
 
 
 def open_recording(
-    path: Path | str, *, typestore: str | None = None, salvage: bool = False
+    path: Path | str,
+    *,
+    typestore: str | None = None,
+    salvage: bool = False,
+    watch: Watch | None = None,
 ) -> Recording:
     """Open an MCAP file, a rosbag2 folder or one of its files, or a ROS 1 bag.
 
@@ -39,6 +43,8 @@ def open_recording(
             of the folder's .msg and .idl files on top.
         salvage: read what can still be read of a file that is cut short or damaged, instead of
             refusing it; what is missing is in the recording's `lost_messages`.
+        watch: is told how far a long opening, and later a long read, is: what is being done, how
+            much of it is done, and of how much.
 
     Raises:
         RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
@@ -47,7 +53,7 @@ def open_recording(
     path = Path(path)
     distro = typestore or DEFAULT_DISTRO
     refuse_unknown(distro)  # before anything is opened
-    return _Opening(path, distro, salvage).open()
+    return _Opening(path, distro, salvage, watch or unwatched).open()
 
 
 def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
@@ -66,8 +72,9 @@ def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
 class _Opening:
     """Opens the files of one recording, and closes them again if one is refused."""
 
-    def __init__(self, path: Path, distro: str, salvage: bool) -> None:
+    def __init__(self, path: Path, distro: str, salvage: bool, watch: Watch) -> None:
         self.path, self.distro, self.salvage = path, distro, salvage
+        self.watch = watch
         self.storages: list[Storage] = []
         self.kinds: list[str] = []
         self.damage: list[Damage] = []
@@ -96,11 +103,13 @@ class _Opening:
             self._open_file(file)
         self._refuse_serialisation(metadata)
         self._compare(metadata)
-        return Recording(
+        recording = Recording(
             *(self.path, self._format(), files, self.storages, self.distro),
             *(self.damage, self.notes, self.cleanup),
             metadata=[metadata.custom_data] if metadata.custom_data else [],
         )
+        recording.watch = self.watch
+        return recording
 
     def _bag(self) -> tuple[list[Path], BagMetadata]:
         if not discover.is_bag(self.path):
@@ -131,7 +140,7 @@ class _Opening:
                 raise RecordingError("compressed twice", where=str(self.path))
             self._open_compressed(file)
         elif kind == "mcap":
-            self._add("mcap", McapFile(file, salvage=self.salvage))
+            self._add("mcap", McapFile(file, salvage=self.salvage, watch=self.watch))
         elif kind == "sqlite3":
             self._add("sqlite3", open_sqlite(file, salvage=self.salvage))
         else:

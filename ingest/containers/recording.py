@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed, Storage
+from restock.ingest.containers.storage import (
+    Damage,
+    Extra,
+    Integrity,
+    Metadata,
+    Packed,
+    Storage,
+    Watch,
+    unwatched,
+)
 from restock.ingest.containers.topic_reading import (
     Account,
     Fields,
@@ -38,7 +47,6 @@ from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import Decoder
 
 STATIC_TRANSFORMS = "/tf_static"
-Watch = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
 MOST_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
 
 
@@ -89,7 +97,7 @@ class Recording:
     ) -> None:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
-        self.watch: Watch = lambda doing, done, whole: None  # is told how far a long read is
+        self.watch: Watch = unwatched  # is told how far a long read is
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
@@ -14,6 +14,7 @@ from restock.errors import visible
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 Integrity = Literal["verified", "unverified", "damaged"]
+Watch = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
 
 # Of a file's metadata so much is kept; the rest is counted.
 MOST_ENTRIES = 1_000
@@ -30,6 +31,10 @@ _CUSTOM_DATA = re.compile(
     r"^(?P<indent> {0,4})custom_data:(?P<value>.*)(?P<block>(?:\n(?:(?P=indent) .*|[ \t]*$))*)",
     re.MULTILINE,
 )
+
+
+def unwatched(doing: str, done: int, whole: int) -> None:
+    """A `Watch` that is not interested."""
 
 
 @dataclass

@@ -13,6 +13,7 @@ from restock.errors import visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
+from restock.ingest.propose.cameras import CameraTopic, camera_lines
 from restock.ingest.propose.candidates import Candidate
 from restock.ingest.propose.clock_choice import ClockChoice, Gaps
 from restock.ingest.propose.command_choice import CommandChoice
@@ -92,6 +93,7 @@ class Evidence:
     outline: ScannedOutline | None  # where its scans say something of it
     goal: GoalChoice
     signals: list[Candidate]
+    cameras: list[CameraTopic]
     robot: RobotProposal
 
 
@@ -138,6 +140,7 @@ def profile_lines(
         ]
     for signal in seen.signals:
         lines += ["# " + line for line in signal.toml(_max_age_s(signal.topic, seconds))] + [""]
+    lines += camera_lines(seen.cameras)
     # Names are of a stranger: a line break in one starts no key.
     return [visible(line) for line in [*lines, *_ENDING]]
 

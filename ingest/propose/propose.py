@@ -20,6 +20,7 @@ from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.inputs import MOTION
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.propose.cameras import camera_topics
 from restock.ingest.propose.candidates import candidates
 from restock.ingest.propose.clock_choice import Gaps, by_log_time, choose_clock
 from restock.ingest.propose.command_choice import CommandChoice, choose_command
@@ -312,6 +313,7 @@ def gather(
             without={topic.name for role, topic, _ in best if role in SPENT},
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
+        camera_topics(recording, _driven_s(recording, gaps)),
         robot,
     )
 

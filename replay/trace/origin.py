@@ -19,6 +19,7 @@ from restock.files import first_line
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.profile.profile_text import read_profile_toml
 from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
+from restock.ingest.store.writer import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
 from restock.replay.store.store import Store, is_store
@@ -27,6 +28,7 @@ from restock.replay.store.store import Store, is_store
 # some take longer than others to be received.
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
+_ROW_OF_FRAMES = {"id": "transition_id", "recording": "recording_id", "stamp": "stamp_ns"}
 # Of a manifest: long.
 _LEFT_OUT = (
     "task_json",
@@ -57,6 +59,7 @@ class Origin:
     recording: dict[str, Any] | None = None  # the manifest of the ingest that wrote the row
     topics: list[dict[str, Any]] = field(default_factory=list)  # that the profile reads
     messages: list[MessageAtTick] = field(default_factory=list)  # that its tick was made of
+    frames: list[dict[str, Any]] = field(default_factory=list)  # of cameras, and their file
     notes: list[str] = field(default_factory=list)
 
 
@@ -132,16 +135,19 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
                 for r in rows_of(store.connection, sql_file("trace_around.sql"), around)
             }
             version = store.version
+            manifest = manifests[0] if manifests else None
+            frames, lost = _frames(store, source.path, row, manifest)
     except (duckdb.IOException, StoreError):
         if source.version is None:
             raise
         return None
-    manifest = manifests[0] if manifests else None
     origin = Origin(
         transition=row,
         store={"path": source.path, "version": version},
         moment=_moment(row, manifest),
         recording=manifest,
+        frames=frames,
+        notes=lost,
     )
     if manifest is None:
         origin.notes.append("no manifest of its recording is left: see the row's own provenance")
@@ -150,6 +156,30 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
         origin.notes.append("the manifest is of a later ingest of the same recording")
     origin.reward_parts = _reward_parts(row, near, manifest["task_json"])
     return origin
+
+
+def _frames(
+    store: Store, path: str, row: Mapping[str, Any], manifest: Mapping[str, Any] | None
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """The camera frames in force at a row with the file each lies in, and why some are not told.
+
+    Frames are replaced with the rows of their recording: those of a later ingest are not the row's.
+    """
+    kept = {one["camera"]: one for one in (manifest or {}).get("cameras") or []}
+    if manifest is None or not kept:
+        return [], []
+    if manifest["ingest_id"] != row["ingest_id"]:
+        return [], ["the frames of its cameras were replaced by a later ingest"]
+    named = {key: row[column] for key, column in _ROW_OF_FRAMES.items()}
+    try:
+        found = rows_of(store.connection, sql_file("trace_frames.sql"), named)
+    except duckdb.Error as error:
+        return [], [f"the frames of its cameras cannot be read: {first_line(error)}"]
+    without = sorted(kept.keys() - {frame["camera"] for frame in found})
+    notes = [f"no frame of {', '.join(without)} is in force at its step"] if without else []
+    return [
+        frame | {"file": f"{path}/{FRAMES}/{kept[frame['camera']]['file']}"} for frame in found
+    ], notes
 
 
 def rows_of(

@@ -13,6 +13,7 @@ from support.page_scripts import charts_of
 
 from restock.cli import main
 from restock.report import write_study_page
+from restock.report.study.comparison import gate_section
 
 HOSTILE = "</script><script>alert(1)</script><!--"
 
@@ -80,6 +81,14 @@ def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
     assert "gate refused: not comparable" in found.text
     assert "cannot be compared: they differ in config.replay.batch_size" in found.text
     assert "How probably" not in found.text
+
+
+def test_a_check_without_an_end_of_its_interval_is_shown() -> None:
+    ratio = {"name": "share of fresh/blocked_aisle", "part": "whole run", "value": 1.14}
+    ratio |= {"low": 1.0, "high": None, "limit": 1.25, "verdict": "inconclusive"}
+    found = {"refused": [], "differences": [], "checks": [ratio], "treatment": "mixture"}
+    (_, fed) = gate_section(found, "plain", "dueling").tables
+    assert fed.rows[0]["95 %"] == "1 or more"
 
 
 def test_a_study_has_a_page_of_its_findings(tmp_path: Path) -> None:

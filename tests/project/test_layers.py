@@ -27,7 +27,7 @@ MAY_IMPORT = {
     "ingest/task": "",
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": "containers decoding profile propose/driven steps task urdf",
+    "ingest/propose": "camera containers decoding profile propose/driven steps task urdf",
     "ingest/propose/driven": "steps task",
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",

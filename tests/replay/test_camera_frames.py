@@ -163,3 +163,23 @@ def test_the_command_line_names_cameras(
     assert "observation.images.front: 29 pictures as they were recorded" in capsys.readouterr().out
     assert cli.main([*export, "minari", "--cameras", "front"]) == ExitCode.USAGE
     assert "holds no images" in capsys.readouterr().err
+
+
+def test_a_trace_names_the_frames_of_its_row(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Store(store_path) as store:
+        (front, *_) = camera_frames(store, "FROM transitions WHERE step_index = 2", "front")
+    argv = ["trace", str(store_path), str(front.transition_id)]
+    assert cli.main([*argv, "--json"]) == 0
+    found = {one["camera"]: one for one in json.loads(capsys.readouterr().out)["frames"]}
+    assert list(found) == ["front", "rear"]
+    assert found["front"]["frame_index"] == front.frame_index
+    assert found["front"]["age_s"] == pytest.approx(front.age_s)
+    assert found["front"]["sha256"] == front.sha256
+    held = pq.read_table(found["rear"]["file"]).to_pylist()
+    assert found["rear"]["sha256"] in {one["sha256"] for one in held if one["camera"] == "rear"}
+    assert cli.main(argv) == 0
+    out = capsys.readouterr().out
+    assert "the frames of its cameras" in out
+    assert "48 x 32 jpeg" in out

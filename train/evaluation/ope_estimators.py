@@ -148,9 +148,9 @@ class EssGate:
             noun = "episode" if len(logged) == 1 else "episodes"
             return f"{len(logged)} {noun}, and weights take at least {self.episodes:g}"
         return (
-            f"the weights are worth {least:.1f} of {len(logged)} episodes, less than"
-            f" {max(self.episodes, self.share * len(logged)):.1f}: policy and logs agree for"
-            f" {reach} of {logged.ratio.shape[1]} steps"
+            f"the importance weights leave an effective sample of {least:.1f} of {len(logged)}"
+            f" episodes, less than {max(self.episodes, self.share * len(logged)):.1f}: policy and"
+            f" logs agree for {reach} of {logged.ratio.shape[1]} steps"
         )
 
     def measure(self, logged: OpeEpisodes) -> tuple[float, int]:

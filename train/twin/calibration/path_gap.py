@@ -33,7 +33,7 @@ SIGNALS = {
     "wheel_yaw_rate_radps": "rad/s",
     "gyro_yaw_rate_radps": "rad/s",
     "localised_speed_mps": "m/s",
-    "accel_x_mps2": "m/s2",
+    "accel_x_mps2": "m/s²",
 }
 QUANTITIES = {"position": "m", "heading": "rad", **SIGNALS}
 ODOMETRY, FLOOR = "odometry", "floor"

@@ -150,9 +150,16 @@ class ProfileCommand:
         return recordings
 
     def _open(self, path: Path | str) -> Recording:
+        from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
+        from restock.ingest.containers.storage import unwatched
 
-        return open_recording(path, typestore=self._typestore, salvage=self.salvage)
+        with output.progress(f"opening {Path(path).name}", None) as advance:
+            recording = open_recording(
+                path, typestore=self._typestore, salvage=self.salvage, watch=advance.part
+            )
+        recording.watch = unwatched  # the bar is over
+        return recording
 
     def _check(self) -> int:
         from restock.cli import output

@@ -136,7 +136,10 @@ class TraceCommand:
 def document(trace: tracing.Trace) -> dict[str, Any]:
     """A trace as one document: what `--json` prints. What is not known is null."""
     origin = asdict(trace.origin) if trace.origin is not None else None
-    names = ("transition", "reward_parts", "store", "recording", "moment", "topics", "messages")
+    names = (
+        *("transition", "reward_parts", "store", "recording", "moment", "topics"),
+        *("messages", "frames"),
+    )
     return {
         "audit": trace.audit,
         "episode": trace.episode,
@@ -168,6 +171,24 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
     manifest = origin.recording or {}
     _section("its recording", {k: v for k, v in manifest.items() if k not in _TABLES})
     _section("when it was", origin.moment)
+    if origin.frames:
+        files = list(dict.fromkeys(frame["file"] for frame in origin.frames))
+        output.print_table(
+            [
+                {
+                    "camera": frame["camera"],
+                    "topic": frame["topic"],
+                    "frame": frame["frame_index"],
+                    "stamp_ns": frame["stamp_ns"],
+                    "age_s": frame["age_s"],
+                    "image": f"{frame['width']} x {frame['height']} {frame['encoding']}",
+                    "bytes": frame["size_bytes"],
+                }
+                for frame in origin.frames
+            ],
+            title=f"the frames of its cameras, in {', '.join(files)}",
+        )
+        output.stdout().print()
     if origin.messages:
         output.print_table(
             [

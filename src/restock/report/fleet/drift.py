@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -16,9 +17,25 @@ from restock.report.look.blocks import Figure, Rows, Section, Table, words
 
 MOST_ROBOTS = 12  # in a chart: those with findings first
 MOST_PERIODS = 26  # the newest
+MOST_ROWS = 24  # of a table that is not folded
 MOST_FINDINGS = 8  # with a chart of their own
 _BEYOND = 3.0  # sizes past it look alike
 _BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
+_VERDICTS = ("changed", "undecided", "unchanged", "too few")
+_MEANINGS = {  # what a signal tells of; docs/drift.md has how each is measured
+    "odometry_scale": "metres localised a metre that the wheels report, straight",
+    "wheel_yaw_scale": "yaw rate of the gyroscope over that of the wheels, turning",
+    "wheel_pull_radpm": "turn that the wheels did not report, a metre of straight driving",
+    "command_gain": "wheel speed over the command, once held",
+    "command_response": "share of a changed command that is reached within one step",
+    "gyro_bias_radps": "gyroscope less the pose's turn, straight",
+    "accel_bias_mps2": "acceleration at a steady speed: bias, or a slope of the floor",
+    "vibration_mps2": "spread of the acceleration at a steady speed",
+    "localiser_jitter_mps": "sideways speed of the poses, straight",
+    "localiser_age_s": "age of the pose at a step",
+    "lidar_noise_m": "unevenness of a sector's range over three steps, straight",
+    "silent_sectors": "lidar sectors that show nothing, or the same, for a whole episode",
+}
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
@@ -53,7 +70,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
                 (len(robots), "robots"),
                 (len(periods), f"{drift.every}s with driving"),
                 (sum(row["p"] is not None for row in own), "tests against a robot's own reference"),
-                (len(drift.findings), "robots' signals that changed"),
+                (len(drift.findings), "changes: a signal of a robot"),
                 (
                     sum(row["verdict"] == "too few" for row in own),
                     "comparisons with too little data",
@@ -75,7 +92,12 @@ def headline(drift: Drift) -> str:
             who = f"site {row['site']}" if row["scope"] == "site" else row["robot"]
             named += [] if who in named else [who]
     if parts:
-        return "Changed: " + "; ".join(f"{part} of {_list(who)}" for part, who in parts.items())
+        text = "Changed: " + "; ".join(f"{part} of {_list(who)}" for part, who in parts.items())
+        hardware = [row for row in drift.findings if row["part"] not in _BESIDE]
+        if len(hardware) == 1:
+            (row,) = hardware
+            text += f", {_signal(row)} {_change(row)} since {row['since']}"
+        return text
     if all(row["p"] is None for row in drift.tests):
         return "Too little to compare: no robot has a reference and enough later episodes"
     if drift.findings:
@@ -150,7 +172,8 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
         [
             {
                 "robot": row["robot"],
-                "signal": f"{row['part']}: {_signal(row)}",
+                "signal": _signal(row),
+                "part": row["part"],
                 "period": str(row["period"]),
                 "size": max(-_BEYOND, min(_BEYOND, _signed_size(row))),
                 "mark": "●" if row["verdict"] == "changed" else "",
@@ -161,12 +184,12 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
     )
     if not rows:
         return None
-    signals = sorted({row["signal"] for row in rows})
+    signals = list(dict.fromkeys(row["signal"] for row in sorted(rows, key=_by_part)))
     periods = len({row["period"] for row in rows})
     robots = sorted({row["robot"] for row in rows})
 
     def chart(width: int) -> Any:
-        labels_px = min(charts.label_px(signals), 240 if width > charts.HALF[0] else 130)
+        labels_px = min(charts.label_px(signals), 240 if width > charts.HALF[0] else 150)
         base = charts.plot(rows).encode(
             x=alt.X("period:O", title=None, axis=_PERIODS),
             y=alt.Y(
@@ -216,6 +239,10 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
             if row["robot"] in robots
         ]
     )
+    never = {row["condition"] for row in rows} - {
+        row["condition"] for row in rows if row["events_per_h"]
+    }
+    rows = [row for row in rows if row["condition"] not in never]
     if not rows:
         return None
 
@@ -241,7 +268,12 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
         intro=f"Events an hour driven. {compared:,} comparisons by robot, zone and {drift.every}"
         " had five events or more and were tested (a quasi-Poisson score test, whose dispersion is"
         " from how a robot's drives differ).",
-        figures=[Figure(charts.draw(chart, charts.FULL))],
+        figures=[
+            Figure(
+                charts.draw(chart, charts.FULL),
+                caption=f"None began of: {_list(sorted(never))}." if never else "",
+            )
+        ],
     )
 
 
@@ -296,16 +328,25 @@ def _comparisons_section(own: Rows) -> Section | None:
             "corrected p": "" if row["q"] is None else f"{row['q']:.1g}",
             "samples": f"{row['n']} / {row['n_reference']} {row['samples']}",
         }
-        for row in newest.values()
+        for row in sorted(newest.values(), key=lambda row: _VERDICTS.index(row["verdict"]))
     ]
     numbers = {"reference", "now", "Cliff's delta", "KS", "corrected p"}
     return Section(
         "comparisons",
         "The newest comparison of each signal",
-        intro="Undecided: neither shown to have changed nor to be within what matters; more drives"
-        " would decide. Cliff's delta and the Kolmogorov-Smirnov distance compare episodes: 0 is no"
-        " difference, 1 no overlap.",
-        tables=[Table(rows[:120], numbers=numbers)],
+        intro="What changed stands first. Undecided: neither shown to have changed nor to be within"
+        " what matters; more drives would decide. Samples are of now and of the reference."
+        " Cliff's delta and the Kolmogorov-Smirnov distance compare episodes: 0 is no difference,"
+        " 1 no overlap.",
+        tables=[
+            Table(
+                rows[:120],
+                numbers=numbers,
+                title=_count(min(len(rows), 120), "comparison"),
+                folded=len(rows) > MOST_ROWS,
+            ),
+            Table(_meanings(newest.values()), title="What the signals are", folded=True),
+        ],
     )
 
 
@@ -319,13 +360,30 @@ def _signal(row: dict[str, Any]) -> str:
     return f"{name} in {zone}" if zone else name
 
 
+def _by_part(row: dict[str, Any]) -> tuple[str, str]:
+    return str(row["part"]), str(row["signal"])
+
+
+def _meanings(rows: Iterable[dict[str, Any]]) -> Rows:
+    """What the signals of these rows are, in the order of their parts."""
+    signals = {row["signal"]: row for row in sorted(rows, key=_by_part)}
+    return [
+        {"signal": _signal(row), "part": row["part"], "what it is": _MEANINGS[name]}
+        for name, row in signals.items()
+        if name in _MEANINGS
+    ]
+
+
 def _change(row: dict[str, Any]) -> str:
     """`× 0.942 [0.935, 0.950]`, or a difference with its sign."""
     if row["change"] is None:
         return ""
     ratio = row["compared"] == "ratio"
     values = [row["change"], row["change_low"], row["change_high"]]
-    value, low, high = (f"{v:.3f}" if ratio else f"{v:+.3g}" for v in values)
+    least = 0.0 if ratio else 1e-3 * max(abs(row["change_low"]), abs(row["change_high"]))
+    value, low, high = (  # what is far below the interval's width is nothing
+        f"{v:.3f}" if ratio else f"{v if abs(v) >= least else 0.0:+.3g}" for v in values
+    )
     unit = " sd" if row["compared"] == "spread" else ""
     return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
 

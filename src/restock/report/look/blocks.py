@@ -66,6 +66,11 @@ class Table:
     def columns(self) -> list[str]:
         return list(self.rows[0]) if self.rows else []
 
+    @property
+    def stacks(self) -> str:
+        """A class of CSS: on a phone its rows become lists of column and value."""
+        return "broad" if len(self.columns) > 4 else ""
+
 
 @dataclass(frozen=True)
 class Section:

@@ -66,7 +66,15 @@ CONFIG = {
         "labelSeparation": 6,
         "labelLimit": 220,
     },
-    "legend": {"labelFontSize": 12, "labelColor": "#334155", "title": None, "orient": "top"},
+    "legend": {
+        "labelFontSize": 12,
+        "labelColor": "#334155",
+        "title": None,
+        "titleColor": "#475569",
+        "titleFontSize": 12,
+        "titleFontWeight": 500,
+        "orient": "top",
+    },
     "header": {"labelFontSize": 12, "labelFontWeight": 600, "labelColor": "#0f172a", "title": None},
     "range": {"category": list(SPARE_COLOURS)},
 }

@@ -6,6 +6,12 @@ from __future__ import annotations
 from restock.report.look.blocks import Rows, Section, Table, estimate
 from restock.report.run.facts import Facts
 
+_NAMES = {
+    "logged": "what was logged",
+    "fqe": "fitted Q evaluation (FQE)",
+    "pdwis": "per-decision weighted importance sampling (PDWIS)",
+    "wdr": "weighted doubly robust (WDR)",
+}
 BEST_FIRST = ("wdr", "pdwis")  # estimators with an interval
 NOTHING_DROVE = (
     "This run learnt from the logs alone: nothing drove, in a twin or on a robot, so there is no"
@@ -72,7 +78,7 @@ def table(rows: Rows) -> Table:
     shown = [
         {
             "measure": row["measure"],
-            "estimator": row["estimator"],
+            "estimator": _NAMES.get(row["estimator"], row["estimator"]),
             "value [95 %]": estimate(row),
             "episodes": row["episodes"],
         }
@@ -83,8 +89,8 @@ def table(rows: Rows) -> Table:
         {"episodes"},
         title="Off-policy evaluation on held-out logs, before it drove",
         caption="Over all conditions; an estimate is refused where the weights leave too few"
-        " episodes to say. `logged` is what the logs' drivers achieved; `fqe` is a fitted model's"
-        " word, and has no interval.",
+        " episodes to say. What was logged is what the logs' drivers achieved. Fitted Q"
+        " evaluation rests on a model of the values alone, and has no interval.",
     )
 
 

@@ -163,7 +163,7 @@ def _newest(facts: Facts) -> str:
     if facts.panel is None or began_ns is None:
         return ""
     days = (began_ns - facts.panel.header.newest_ns) / DAY_NS
-    return f", when the panel's newest row was {days:,.1f} days old: take that off for its age then"
+    return f"; the panel's newest row was {days:,.1f} days old then"
 
 
 def _age_rows(facts: Facts) -> Rows:
@@ -318,7 +318,7 @@ def floor_section(facts: Facts) -> Section | None:
 def provenance(facts: Facts) -> Section:
     tables = []
     unlabelled = [
-        f"The twin has no {', '.join(signals)}: condition {name} was not evaluated there."
+        {"condition": words(name), "not labelled in the twin, which has no": ", ".join(signals)}
         for name, signals in facts.config.get("not_evaluated", {}).items()
     ]
     if facts.panel is not None:
@@ -348,13 +348,14 @@ def provenance(facts: Facts) -> Section:
             for row in facts.recordings
         ]
         tables.append(Table(rows, {"length", "episodes", "transitions"}, title="Recordings"))
+    tables.append(Table(unlabelled, title="Conditions of the logs that the twin cannot show"))
     versions = facts.config.get("versions", {})
     software = [{"software": name, "version": str(value)} for name, value in versions.items()]
     tables.append(Table(software, title="Software"))
     return Section(
         "provenance",
         "Where does all of this come from?",
-        intro=" ".join([*facts.missing, *unlabelled]),
+        intro=" ".join(facts.missing),
         tables=tables,
         details=pretty(facts.config),
         details_title="The whole configuration of the run",

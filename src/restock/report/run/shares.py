@@ -83,7 +83,7 @@ def remarks(facts: Facts) -> list[str]:
     if lost:
         texts.append(f"Weights leave less than the plain logs would: {'; '.join(lost)}.")
     if short:
-        texts.append(f"To bear what is wanted of them, there are missing: {', '.join(short)}.")
+        texts.append(f"Too few rows for the wanted shares; missing: {', '.join(short)}.")
     return texts
 
 

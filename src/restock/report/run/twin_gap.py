@@ -35,6 +35,7 @@ COLOURS = {
     "floor": "#2563eb",
     "persistence": "#94a3b8",
 }
+MOST_ROWS = 24  # of a table that is not folded
 _MEANING = {
     TRUSTED: "shown to be within the limits",
     UNTRUSTED: "shown to be beyond a limit",
@@ -88,12 +89,20 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         f" driven again in the twin. Verdicts are on the {source_name(about['judged'])}.",
         "cards": [
             {
-                "value": str(sum(v.verdict == kind for v in gap.verdicts)),
-                "label": f"{kind}: {meaning}",
+                "value": f"{sum(v.verdict == kind for v in gap.verdicts)} {kind}",
+                "label": f"of {_count(len(gap.verdicts), 'condition')}: {meaning}",
             }
             for kind, meaning in _MEANING.items()
         ],
-        "sections": [gap_section(gap), _steps_section(gap), _signals_section(gap)],
+        "sections": [
+            section
+            for section in (
+                replace(gap_section(gap), callout=""),  # the headline says it
+                _steps_section(gap),
+                _signals_section(gap),
+            )
+            if section is not None
+        ],
         "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
         f" {about['store']}, version {about['store_version']}",
     }
@@ -122,7 +131,9 @@ def gap_section(gap: TwinGap) -> Section:
             "horizon": f"after {row['horizon_s']:g} s",
         }
         for row in gap.paths
-        if row["quantity"] == "position" and row["median"] is not None
+        if row["quantity"] == "position"
+        and row["median"] is not None
+        and (row["source"] != "floor" or row["p90"])  # nothing to see without localisation noise
     ]
     rows = [
         {
@@ -130,8 +141,10 @@ def gap_section(gap: TwinGap) -> Section:
             "verdict": item.verdict,
             "segments": item.segments,
             "episodes": item.episodes,
-            f"90 % within, {limits['horizon_s']:g} s": _interval(item.position_p90, "m"),
-            "reward gap / spread": _interval(item.reward_ratio, ""),
+            f"9 in 10 end within, after {limits['horizon_s']:g} s": _interval(
+                item.position_p90, "m"
+            ),
+            "reward gap / its spread": _interval(item.reward_ratio, ""),
             "why": "; ".join(item.reasons),
         }
         for item in gap.verdicts
@@ -140,11 +153,12 @@ def gap_section(gap: TwinGap) -> Section:
         "twin-gap",
         "Can the twin be trusted?",
         intro="Logged commands, driven again in the twin open loop, without feedback from the log."
-        " Odometry is the logged wheels, dead-reckoned: a twin should beat it. The floor is what a"
-        " perfect twin would show through localisation noise. A condition is trusted where nine in"
+        " Odometry is the logged wheels, dead-reckoned: a twin should beat it. The floor is the"
+        " least that could be measured: what a perfect twin would show through localisation noise."
+        " A condition is trusted where nine in"
         f" ten segments of {limits['horizon_s']:g} s end within {limits['position_m']:g} m of"
         f" the log, and the one-step reward is off by less than {limits['reward_ratio']:g} times"
-        " its own spread, both with 95 % confidence over episodes.",
+        " its standard deviation in the log (its spread), both with 95 % confidence over episodes.",
         callout=headline(gap) + "." if gap.untrusted else "",
         figures=[
             Figure(
@@ -167,20 +181,27 @@ def _positions(rows: Rows) -> Drawing:
     sources = charts.ordered(rows, "source", COLOURS)
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
     horizons = list(dict.fromkeys(row["horizon"] for row in rows))
+    known = any(row["median_low"] is not None for row in rows)
 
     def chart(width: int) -> Any:
         quiet = alt.Axis(grid=False, ticks=False)
+        metres = alt.Axis(tickCount=max(3, width // len(horizons) // 90))
         base = charts.plot(rows).encode(
             y=alt.Y("condition:N", sort=conditions, title=None, axis=quiet),
             yOffset=alt.YOffset("source:N", sort=sources),
             color=charts.coloured("source", sources, COLOURS, width, charts.label_px(conditions)),
         )
-        bars = base.mark_rule(strokeWidth=3, opacity=0.45).encode(
-            x=alt.X("median_low:Q", title="metres"), x2="median_high:Q"
+        bars = (
+            base.transform_filter("isValid(datum.median_low)")
+            .mark_rule(strokeWidth=3, opacity=0.45)
+            .encode(x=alt.X("median_low:Q", title="metres", axis=metres), x2="median_high:Q")
         )
-        dots = base.mark_circle(size=60, opacity=1).encode(x=alt.X("median:Q"))
+        dots = base.mark_circle(size=60, opacity=1).encode(
+            x=alt.X("median:Q", title="metres", axis=metres)
+        )
         ticks = base.mark_tick(thickness=2, size=9).encode(x=alt.X("p90:Q"))
-        layered = alt.layer(bars, dots, ticks).properties(height=60 * len(conditions))
+        layers = [bars, dots, ticks] if known else [dots, ticks]
+        layered = alt.layer(*layers).properties(height=60 * len(conditions))
         labels_px = charts.label_px(conditions)
         return charts.side_by_side(layered, "horizon", horizons, width, labels_px)
 
@@ -221,14 +242,15 @@ def _steps_section(gap: TwinGap) -> Section:
                 _observations(gap),
                 numbers={*map(source_name, twins), "persistence"},
                 title="Observation, by component, in nominal driving",
-                caption="Sectors of the lidar are taken together; observations.parquet has each"
-                " component and condition.",
+                caption="As the policy sees them, scaled to about -1 to 1. A lidar's sectors are"
+                " taken together; observations.parquet has each component and condition.",
             ),
         ],
     )
 
 
-def _signals_section(gap: TwinGap) -> Section:
+def _signals_section(gap: TwinGap) -> Section | None:
+    """None where no segment is as long as a horizon."""
     sources = [source_name(name) for name in dict.fromkeys(row["source"] for row in gap.paths)]
     keys = ("condition", "quantity", "horizon_s")
     medians = _by_source(gap.paths, "median", *keys)
@@ -243,14 +265,24 @@ def _signals_section(gap: TwinGap) -> Section:
             **medians[tuple(row[key] for key in keys)],
         }
         for row in gap.paths
-        if row["source"] == "floor"
+        if row["source"] == "floor" and row["segments"]
     ]
+    if not rows:
+        return None
     return Section(
         "signals",
         "Pose and signals, by horizon",
-        intro="Medians over segments: of a pose at the horizon's end, of a signal the root mean"
-        " square on the way.",
-        tables=[Table(rows, numbers={"segments", *sources})],
+        intro="Medians over segments: of a pose its distance from the log at the horizon's end, of"
+        " a signal the root mean square of its difference on the way. Empty where a source has no"
+        " such signal.",
+        tables=[
+            Table(
+                rows,
+                numbers={"segments", *sources},
+                title=_count(len(rows), "median"),
+                folded=len(rows) > MOST_ROWS,
+            )
+        ],
     )
 
 
@@ -286,8 +318,9 @@ def _count(number: int, noun: str) -> str:
 def _interval(interval: ConfidenceInterval, unit: str) -> str:
     if math.isnan(interval.value):
         return ""
-    text = f"{interval.value:.2f} {unit}".strip()
-    ends = f" [{interval.low:.2f}, {interval.high:.2f}]"
+    form = ".3f" if 0 < interval.value < 0.1 else ".2f"
+    text = f"{interval.value:{form}} {unit}".strip()
+    ends = f" [{interval.low:{form}}, {interval.high:{form}}]"
     return text if math.isnan(interval.low) else text + ends
 
 

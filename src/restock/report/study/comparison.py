@@ -192,8 +192,8 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
     differences = [
         {
             "setting": row["setting"],
-            first: str(row["first"]),
-            second: str(row["second"]),
+            first: _setting(row["first"]),
+            second: _setting(row["second"]),
             "kind": row["kind"],
             "allowed": "no" if row["setting"] in refused else "yes",
         }
@@ -206,7 +206,7 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
             "part": words(row["part"]),
             "verdict": row["verdict"],
             "value": number(row["value"]),
-            "95 %": f"{row['low']:.3g} to {row['high']:.3g}",
+            "95 %": _ends(row["low"], row["high"]),
             "limit": f"{row['limit']:g}",
         }
         for row in sorted(found["checks"], key=lambda row: order[row["verdict"]])
@@ -221,6 +221,17 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
             Table(checks, {"value", "95 %", "limit"}, title="What was fed", folded=True),
         ],
     )
+
+
+def _setting(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _ends(low: float | None, high: float | None) -> str:
+    """An interval, which has no end where a share was nought in some resample."""
+    if low is None:
+        return "" if high is None else f"up to {high:.3g}"
+    return f"{low:.3g} or more" if high is None else f"{low:.3g} to {high:.3g}"
 
 
 def cost_cards(rows: Rows) -> list[dict[str, str]]:
