@@ -123,6 +123,7 @@ def headline(gap: TwinGap) -> str:
 def gap_section(gap: TwinGap) -> Section:
     """Pose gaps by horizon and condition, the verdicts and what could not be done."""
     limits = gap.about["limits"]
+    worst_first = [UNTRUSTED, UNDECIDED, UNKNOWN, TRUSTED]
     shown = [
         {
             **row,
@@ -147,7 +148,7 @@ def gap_section(gap: TwinGap) -> Section:
             "reward gap / its spread": _interval(item.reward_ratio, ""),
             "why": "; ".join(item.reasons),
         }
-        for item in gap.verdicts
+        for item in sorted(gap.verdicts, key=lambda item: worst_first.index(item.verdict))
     ]
     return Section(
         "twin-gap",
@@ -172,7 +173,7 @@ def gap_section(gap: TwinGap) -> Section:
         else [],
         tables=[
             Table(rows, numbers={"segments", "episodes"}),
-            Table([{"notes": note} for note in gap.not_done]),
+            Table([{"notes": note.replace("`", "")} for note in gap.not_done]),
         ],
     )
 
