@@ -27,14 +27,12 @@ CREATE OR REPLACE MACRO student_quantile(df) AS
 
 -- Every comparison. `every` is the length of a period as date_trunc has it (day, week, month, year,
 -- decade); the first `reference` periods that a robot has of a signal are what its later ones are
--- compared with. Fewer than `least_episodes` episodes on a side are too few.
-CREATE OR REPLACE MACRO drift_by(every := 'week', reference := 2, least_episodes := 5) AS TABLE
+-- compared with. Fewer than `least_episodes` episodes on a side are too few. Without `sizes`, cliffs_delta
+-- and ks_distance are null: they take every value's place among the others.
+CREATE OR REPLACE MACRO drift_by(every := 'week', reference := 2, least_episodes := 5, sizes := true) AS TABLE
 WITH valued AS (
     SELECT
-        part,
         signal,
-        compared,
-        matters,
         robot,
         site,
         recording_id,
@@ -59,23 +57,27 @@ WITH valued AS (
 ), samples AS (
     SELECT * EXCLUDE (recording_id), 'episodes' AS samples FROM grouped
     UNION ALL
-    SELECT part, signal, compared, matters, robot, site, period, median(x), 'recordings'
+    SELECT signal, robot, site, period, median(x), 'recordings'
     FROM grouped
-    GROUP BY part, signal, compared, matters, robot, site, period, recording_id
+    GROUP BY signal, robot, site, period, recording_id
 ), sorted AS (
-    SELECT * EXCLUDE (x), list(x ORDER BY x) AS x, count(*) AS n, count(*) // 10 AS cut
-    FROM samples
-    GROUP BY ALL
+    SELECT *, x[cut + 1] AS low, x[n - cut] AS high
+    FROM (
+        SELECT * EXCLUDE (x), list(x ORDER BY x) AS x, count(*) AS n, count(*) // 10 AS cut
+        FROM samples
+        GROUP BY ALL
+    )
 ), spreads AS (
     SELECT
-        * EXCLUDE (x, cut),
+        * EXCLUDE (x, cut, low, high),
         n - 2 * cut AS kept,
         list_avg(x[cut + 1:n - cut]) AS mean,
         list_stddev_samp(x) AS spread,
         coalesce((n - 1) * list_var_samp(
-            list_transform(x, lambda v: least(greatest(v, x[cut + 1]), x[n - cut]))
+            list_transform(x, lambda v: least(greatest(v, low), high))
         ), 0) AS squares -- of the values, those beyond the cut drawn in to it
     FROM sorted
+    JOIN (SELECT signal, part, compared, matters FROM drift_signals) USING (signal)
 ), means AS (
     SELECT
         * EXCLUDE (squares),
@@ -161,11 +163,13 @@ WITH valued AS (
         robot,
         site,
         recording_id,
-        episode_id,
         CAST(date_trunc(every, start_time) AS DATE) AS period,
-        driven_h,
-        events
+        count(*) AS episodes,
+        sum(driven_h) AS driven_h,
+        sum(events) AS events,
+        sum(events * events / driven_h) AS squares
     FROM episode_conditions
+    GROUP BY ALL
 ), driven_periods AS (
     SELECT
         robot,
@@ -174,27 +178,13 @@ WITH valued AS (
             <= least(reference, count(*) OVER (PARTITION BY robot) - 1) AS is_reference
     FROM (SELECT DISTINCT robot, period FROM counted)
 ), counts AS (
-    SELECT
-        condition,
-        zone,
-        robot,
-        site,
-        period,
-        CASE grouping(episode_id) WHEN 0 THEN 'episodes' ELSE 'recordings' END AS samples,
-        sum(driven_h) AS driven_h,
-        sum(events) AS events
-    FROM counted
-    GROUP BY GROUPING SETS (
-        (condition, zone, robot, site, period, recording_id, episode_id),
-        (condition, zone, robot, site, period, recording_id)
-    )
-), counts_grouped AS ( -- a null period is the reference
-    FROM counts
+    SELECT * EXCLUDE (recording_id), 'episodes' AS samples FROM counted
     UNION ALL
-    SELECT * REPLACE (CAST(NULL AS DATE) AS period)
-    FROM counts
-    SEMI JOIN (FROM driven_periods WHERE is_reference) AS early USING (robot, period)
-), rates AS (
+    SELECT
+        * EXCLUDE (recording_id) REPLACE (1 AS episodes, events * events / driven_h AS squares),
+        'recordings'
+    FROM counted
+), rates AS ( -- a null period is the reference
     SELECT
         condition,
         zone,
@@ -202,13 +192,18 @@ WITH valued AS (
         site,
         period,
         samples,
-        count(*) AS n,
+        CAST(sum(episodes) AS BIGINT) AS n,
         sum(events) AS events,
         sum(driven_h) AS driven_h,
         -- Pearson's: the sum of (events - expected)^2 / expected
-        coalesce(sum(driven_h) * sum(events * events / driven_h) / nullif(sum(events), 0) - sum(events), 0)
-            AS residual
-    FROM counts_grouped
+        coalesce(sum(driven_h) * sum(squares) / nullif(sum(events), 0) - sum(events), 0) AS residual
+    FROM (
+        FROM counts
+        UNION ALL
+        SELECT * REPLACE (CAST(NULL AS DATE) AS period)
+        FROM counts
+        SEMI JOIN (FROM driven_periods WHERE is_reference) AS early USING (robot, period)
+    )
     GROUP BY condition, zone, robot, site, period, samples
 ), dispersed AS (
     SELECT
@@ -329,41 +324,35 @@ WITH valued AS (
         ) AS apart_error
     FROM judged
     WINDOW site AS (PARTITION BY against, site, part, signal, zone, period)
-), distributions AS (
+), places AS ( -- of each value, by its size: among those of its period, and among the reference's
     SELECT
-        robot,
-        signal,
-        period,
-        is_now,
-        rank() OVER (PARTITION BY robot, signal, period ORDER BY x)
-            + (count(*) OVER (PARTITION BY robot, signal, period, x) - 1) / 2 AS place,
-        count(*) FILTER (is_now) OVER below / count(*) FILTER (is_now) OVER whole
-            - count(*) FILTER (NOT is_now) OVER below / count(*) FILTER (NOT is_now) OVER whole AS apart,
-        count(*) FILTER (is_now) OVER whole AS n,
-        count(*) FILTER (NOT is_now) OVER whole AS n_reference
-    FROM (
-        SELECT robot, signal, period, x, true AS is_now
-        FROM valued
-        UNION ALL
-        SELECT robot, signal, later.period, x, false
-        FROM grouped
-        JOIN (FROM periods WHERE NOT is_reference) AS later USING (robot, signal)
-        WHERE grouped.period IS NULL
-    )
+        *,
+        count(*) OVER (PARTITION BY robot, signal, period) AS n,
+        count(*) FILTER (is_reference) OVER (PARTITION BY robot, signal) AS n_reference,
+        count(*) OVER below AS place,
+        count(*) OVER (below RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW EXCLUDE GROUP) AS place_before,
+        count(*) FILTER (is_reference) OVER below_all AS among,
+        count(*) FILTER (is_reference) OVER (
+            below_all RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW EXCLUDE GROUP
+        ) AS among_before
+    FROM (SELECT robot, signal, period, x FROM valued WHERE sizes)
+    JOIN periods USING (robot, signal, period)
     WINDOW
-        whole AS (PARTITION BY robot, signal, period),
-        below AS (PARTITION BY robot, signal, period ORDER BY x RANGE UNBOUNDED PRECEDING)
-), sizes AS (
+        below AS (PARTITION BY robot, signal, period ORDER BY x),
+        below_all AS (PARTITION BY robot, signal ORDER BY x)
+), distances AS (
     SELECT
         'own reference' AS against,
         robot,
         signal,
         period,
-        2 * (sum(place) FILTER (is_now) - any_value(n) * (any_value(n) + 1) / 2)
-            / (any_value(n) * any_value(n_reference)) - 1 AS cliffs_delta,
-        max(abs(apart)) AS ks_distance
-    FROM distributions
-    WHERE n > 0 AND n_reference > 0
+        2 * sum((among + among_before) / 2) / (any_value(n) * any_value(n_reference)) - 1 AS cliffs_delta,
+        -- The two distributions are furthest apart at one of the period's values, or just before it.
+        max(greatest(
+            abs(place / n - among / n_reference), abs(place_before / n - among_before / n_reference)
+        )) AS ks_distance
+    FROM places
+    WHERE NOT is_reference AND n_reference > 0
     GROUP BY robot, signal, period
 )
 SELECT
@@ -406,7 +395,7 @@ SELECT
     CASE WHEN difference > 0 THEN risen ELSE fallen END - CAST(verdict = 'changed' AS INTEGER)
         AS others_changed
 FROM beside
-LEFT JOIN sizes USING (against, robot, signal, period)
+LEFT JOIN distances USING (against, robot, signal, period)
 ORDER BY robot, against DESC, part, signal, zone NULLS FIRST, period;
 
 CREATE OR REPLACE VIEW drift AS FROM drift_by();
