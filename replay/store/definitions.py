@@ -25,6 +25,7 @@ FRAMES = "frames.sql"  # over stored_frames, which a store alone has
 MACROS = (
     "macros.sql",
     "flawed_rows.sql",
+    "recording_conditions.sql",
     "capacity.sql",
     "shared_rows.sql",
     "repeated_rows.sql",
@@ -38,8 +39,10 @@ MACROS = (
 SUMMARIES = "summaries.sql"  # in place of others of the same name, where manifests have summaries
 # What `Store.connection` has from the start, for those who ask it without `install_named`.
 COMMON = ("rows.sql", "views.sql", "labels.sql", "macros.sql", "corrections.sql")
-# Views that others are made of. Of FEW_ROWS they are held in memory where many queries follow: to
-# bind a table takes a tenth of the time, and its columns are read once.
+# Views that are held in memory where many queries follow. Of any store, those of few rows that scan
+# many and are asked for more than once; of FEW_ROWS, those that others are made of, too: to bind a
+# table takes a tenth of the time, and its columns are read once.
+HELD_OF_MANY = ("driven_episodes",)
 HELD = (
     "recordings",
     "transitions",
@@ -77,6 +80,7 @@ class Definitions:
         observation_type: what observations are cast to.
         summaries: take the common views from `stored_summaries`.
         computed: names of macros -> what makes them, where a text names one.
+        replaced: the same of tables in place of views, which take too long to make for a list.
     """
 
     def __init__(
@@ -86,12 +90,13 @@ class Definitions:
         *,
         summaries: bool = False,
         computed: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
+        replaced: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
     ) -> None:
         self._connection = connection
         self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
-        self._computed = dict(computed or {})
+        self._computed, self._replaced = dict(computed or {}), dict(replaced or {})
         self._made: set[str] = set()
         self._held: list[str] = []
         _OF[connection] = self
@@ -103,8 +108,9 @@ class Definitions:
             self.make_all()
             return
         self._make(words)
-        for names in [names for names in self._computed if words & set(names)]:
-            self._computed.pop(names)()
+        for makers in (self._computed, self._replaced):
+            for names in [names for names in makers if words & set(names)]:
+                makers.pop(names)()
 
     def make_common(self) -> None:
         """Those of COMMON."""
@@ -138,10 +144,10 @@ class Definitions:
             self._follow(other, order, seen)
         order[name] = None
 
-    def hold(self) -> None:
-        """Have the rows of HELD in memory, as tables of these names."""
-        self._make(HELD)
-        for view in HELD:
+    def hold(self, views: Sequence[str]) -> None:
+        """Have the rows of these in memory, as tables of these names."""
+        self._make(views)
+        for view in views:
             self._connection.execute(
                 f"CREATE TABLE held_rows AS FROM {view}; DROP VIEW {view};"
                 f" ALTER TABLE held_rows RENAME TO {view}"
@@ -168,14 +174,14 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """The views of a store of FEW_ROWS as tables in memory, for as long as many queries follow."""
+    """Views of a store as tables in memory, for as long as many queries follow."""
     made = _OF.get(connection)
-    if made is None or not _few(connection):
+    if made is None:
         yield
         return
     try:
         try:
-            made.hold()
+            made.hold((*HELD, *HELD_OF_MANY) if _few(connection) else HELD_OF_MANY)
         except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
             made.release()
         yield

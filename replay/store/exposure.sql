@@ -72,7 +72,7 @@ CREATE OR REPLACE VIEW success_by_exposure AS
 WITH met AS (
     SELECT DISTINCT exposure, episode_id FROM held_exposures
 ), named AS (
-    SELECT DISTINCT condition, episode_id FROM held_conditions WHERE condition <> 'nominal'
+    SELECT unnest(conditions) AS condition, episode_id FROM episodes
 ), judged AS (
     SELECT episode_id, CAST(success AS DOUBLE) AS success FROM episodes WHERE success IS NOT NULL
 ), of_condition AS (

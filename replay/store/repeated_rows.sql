@@ -6,13 +6,24 @@
 -- once in a recording (a robot that stands still) proves nothing and is left aside. Each row
 -- is given with the one of the first recording, by id, that has it.
 CREATE OR REPLACE MACRO repeated_rows(min_rows) AS TABLE
-WITH alike AS MATERIALIZED (
-    SELECT
-        *,
-        recording_id = min(recording_id) OVER (PARTITION BY content) AS is_first
-    FROM shared_rows
-    JOIN (SELECT recording_id, transition_id, episode_id, stamp_ns FROM transitions)
-        USING (recording_id, transition_id)
+WITH marked AS MATERIALIZED (
+    SELECT *, min(recording_id) OVER (PARTITION BY content) AS first_recording FROM shared_rows
+), enough AS (
+    -- Where two recordings have few contents in common, no row of theirs is read.
+    FROM (
+        SELECT recording_id, first_recording, count(*) AS alike
+        FROM marked
+        WHERE recording_id <> first_recording
+        GROUP BY recording_id, first_recording
+    )
+    WHERE alike >= min_rows
+), alike AS MATERIALIZED (
+    SELECT *, recording_id = first_recording AS is_first
+    FROM (SELECT recording_id, transition_id, episode_id, stamp_ns FROM transitions)
+    JOIN (
+        FROM marked
+        SEMI JOIN (FROM marked SEMI JOIN enough USING (recording_id, first_recording)) USING (content)
+    ) USING (recording_id, transition_id)
 ), matches AS (
     SELECT
         other.transition_id,

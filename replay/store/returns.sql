@@ -21,11 +21,19 @@ FROM episodes
 JOIN (
     SELECT
         episode_id,
-        array_to_string(list_sort(list(DISTINCT concat_ws(' ', behaviour_policy, behaviour_version))), ' + ') AS driver,
-        count(DISTINCT concat_ws(' ', behaviour_policy, behaviour_version)) AS drivers,
-        min(step_index) AS first_step,
-        sum(reward * pow(discount, step_index)) AS discounted_return
-    FROM transitions
+        array_to_string(list_sort(list(driver)), ' + ') AS driver,
+        count(*) AS drivers,
+        min(first_step) AS first_step,
+        sum(discounted_return) AS discounted_return
+    FROM (
+        SELECT
+            episode_id,
+            concat_ws(' ', behaviour_policy, behaviour_version) AS driver,
+            min(step_index) AS first_step,
+            sum(reward * pow(discount, step_index)) AS discounted_return
+        FROM transitions
+        GROUP BY episode_id, concat_ws(' ', behaviour_policy, behaviour_version)
+    )
     GROUP BY episode_id
 ) USING (episode_id)
 JOIN (SELECT episode_id, kind FROM episode_kinds(3)) USING (episode_id)

@@ -41,11 +41,15 @@ from restock.replay.store.computed import computed
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.parquet_views import column_types, read_parquet
 from restock.replay.store.query import query
+from restock.replay.store.shared_rows import COLUMNS, SHARED, install_shared_rows
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
 FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
+# Joins are done as they are written, the right side in memory: of files whose columns are told
+# DuckDB takes every scan for one row, and would hold all transitions to look up their recordings.
+AS_WRITTEN = "join_order,build_side_probe_side"
 T = TypeVar("T")
 
 
@@ -97,7 +101,11 @@ class Store:
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
         self.bare = duckdb.connect(
-            config={"temp_directory": self._spill.name, "autoinstall_known_extensions": False}
+            config={
+                "temp_directory": self._spill.name,
+                "autoinstall_known_extensions": False,
+                "disabled_optimizers": AS_WRITTEN,
+            }
         )
         if memory_limit is not None:
             self._set_memory(memory_limit)
@@ -134,11 +142,13 @@ class Store:
         self.observation_type = self._observation_type()
         # Of a query's text, before it runs: what only fails while rows are fetched is said here.
         self.checks: list[Callable[[str], None]] = []
+        summaries = self._present_summaries()
         self._definitions = Definitions(
             self.bare,
             self.observation_type,
-            summaries=self._present_summaries(),
+            summaries=summaries,
             computed=computed(self),
+            replaced={SHARED: self._install_shared_rows} if summaries else {},
         )
 
     def __enter__(self) -> Store:
@@ -292,6 +302,18 @@ class Store:
             return False
         self._present(self.bare, "main", self._summaries)
         return True
+
+    def _install_shared_rows(self) -> None:
+        """`shared_rows` of what the manifests keep, in place of the view over rows."""
+        table = self._summaries
+        held = self._ingests.to_pylist()
+        with self.path.translate_errors():
+            parts = (
+                self.path.read(f"{table.table}/{path}", columns=list(COLUMNS))
+                for path in table.paths
+            )
+            recordings = {one["ingest_id"]: one["recording_id"] for one in held}
+            install_shared_rows(self.bare, parts, recordings)
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """`stored_ingests`, what the files hold, and a view `stored_…` of each table.

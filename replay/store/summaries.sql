@@ -106,6 +106,26 @@ WITH seen AS (
 -- include: coverage_columns.sql
 ;
 
+CREATE OR REPLACE VIEW recording_cells AS
+SELECT
+    recording_id,
+    cell.condition AS condition,
+    cell.action AS action,
+    cell.behaviour_policy AS behaviour_policy,
+    CAST(sum(cell.rows) AS BIGINT) AS rows
+FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id)
+GROUP BY ALL;
+
+CREATE OR REPLACE VIEW recording_conditions AS
+SELECT
+    recording_id,
+    part.condition AS condition,
+    part.rows AS rows,
+    part.episodes AS episodes
+FROM (SELECT ingest_id, unnest(condition_episodes) AS part FROM stored_summaries)
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+
 CREATE OR REPLACE VIEW measured_signals AS
 SELECT
     recording_id,
@@ -136,19 +156,6 @@ SELECT
     one.events AS events
 FROM (SELECT ingest_id, unnest(condition_steps) AS one FROM stored_summaries)
 JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
-
--- Contents first, and alone: there are as many as rows.
-CREATE OR REPLACE VIEW shared_rows AS
-SELECT recording_id, one.transition_id AS transition_id, one.content AS content
-FROM (SELECT ingest_id, unnest(distinctive_rows) AS one FROM stored_summaries)
-JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id)
-WHERE one.content IN (
-    SELECT row.content
-    FROM (SELECT ingest_id, unnest(distinctive_rows) AS row FROM stored_summaries)
-    SEMI JOIN recordings USING (ingest_id)
-    GROUP BY row.content
-    HAVING count(*) > 1
-);
 
 CREATE OR REPLACE VIEW flawed_rows AS
 SELECT
@@ -181,6 +188,30 @@ LEFT JOIN held USING (condition, action)
 ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
 ORDER BY condition, action;
+
+-- Where rows know their true condition they are read; of a fleet's logs, none does.
+CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
+WITH told AS (
+    SELECT DISTINCT episode_id FROM transitions WHERE true_condition IS NOT NULL
+), held AS (
+    SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind, 1 AS steps
+    FROM transitions
+    WHERE true_condition IS NOT NULL AND true_condition <> 'nominal'
+    UNION ALL
+    SELECT episode_id, unnest(conditions), 1
+    FROM transitions
+    SEMI JOIN told USING (episode_id)
+    WHERE true_condition IS NULL
+    UNION ALL
+    SELECT episode_id, condition, steps FROM condition_steps ANTI JOIN told USING (episode_id)
+), longest AS (
+    SELECT episode_id, arg_max(kind, steps) AS kind
+    FROM (SELECT episode_id, kind, sum(steps) AS steps FROM held GROUP BY ALL HAVING sum(steps) >= min_steps)
+    GROUP BY episode_id
+)
+SELECT episode_id, coalesce(kind, 'nominal') AS kind, success, return, first_policy
+FROM episodes
+LEFT JOIN longest USING (episode_id);
 
 CREATE OR REPLACE VIEW missing_cells AS
 SELECT condition, action, speed_mps, yaw_rate_radps FROM cells_below(1);

@@ -65,6 +65,9 @@ COMMON = (
     "condition_steps ORDER BY ALL",
     "episode_conditions ORDER BY episode_id, zone NULLS FIRST, condition",
     "repeated_rows(1)",
+    "recording_cells ORDER BY ALL",
+    "recording_conditions ORDER BY ALL",
+    "episode_kinds(3) ORDER BY episode_id",
 )
 
 

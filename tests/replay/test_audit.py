@@ -141,7 +141,8 @@ def bag_and_a_part_of_it(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def two_tasks(table: pa.Table, recordings: pa.Table) -> Tables:
-    hashes = np.where(rows_where(table, "episode_index", 0), "0" * 12, TASK.hash)
+    hashes = np.where(rows_where(table, "recording_id", f"{2:016x}"), "0" * 12, TASK.hash)
+    recordings = replaced(recordings, "task_hash", [TASK.hash, "0" * 12])
     return replaced(table, "task_hash", hashes), recordings
 
 
@@ -330,7 +331,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("null_values", null_in_an_observation, 1, {"transition_id": (1 << 25) + 17}),
     ("non_finite_values", nan_observation, 2, {"transition_id": (1 << 25) + 5}),
     ("duplicate_transitions", twice, 2, {"copies": 2}),
-    ("several_tasks", two_tasks, 2, {"task_hash": TASK.hash}),
+    ("several_tasks", two_tasks, 2, {"recordings": 1}),
     ("stale_labels", old_labels, 1, {"recording_id": f"{2:016x}"}),
     ("stale_labels", old_labels_and_a_newer_robot, 1, {"recording_id": f"{2:016x}"}),
     ("label_quality", poor_labels, 1, {"condition": "wheel_slip", "precision": 0.5}),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -40,6 +42,22 @@ def test_transitions_are_those_that_were_written(store: Store, transitions: pa.T
     assert pa.types.is_fixed_size_list(read.schema.field("observation").type)
     assert store.version == 2
     assert store.task() == TASK
+
+
+def test_no_join_holds_the_transitions_in_memory(store: Store) -> None:
+    def held(node: dict[str, Any]) -> list[str]:
+        """What the joins of a plan keep: their right sides."""
+        of_join = [str(node["children"][1])] if node["name"] == "HASH_JOIN" else []
+        return of_join + [text for child in node["children"] for text in held(child)]
+
+    for query in (
+        "SELECT sum(reward) FROM transitions",
+        "SELECT * FROM transitions WHERE recording_id IN (SELECT recording_id FROM recordings)",
+    ):
+        [(_, plan)] = store.sql(f"EXPLAIN (FORMAT JSON) {query}").fetchall()
+        joins = held(json.loads(plan)[0])
+        assert joins, query
+        assert not any("transitions" in text or "reward" in text for text in joins), query
 
 
 def test_a_store_opens_from_the_front_door(store_path: Path) -> None:

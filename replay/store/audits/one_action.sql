@@ -5,12 +5,12 @@ SELECT recording_id, source_file, action, rows, rows / of_recording AS share
 FROM (
     SELECT
         recording_id,
-        any_value(source_file) AS source_file,
         action,
-        count(*) AS rows,
-        sum(count(*)) OVER (PARTITION BY recording_id) AS of_recording
-    FROM transitions
+        CAST(sum(rows) AS BIGINT) AS rows,
+        sum(sum(rows)) OVER (PARTITION BY recording_id) AS of_recording
+    FROM recording_cells
     GROUP BY recording_id, action
 )
+JOIN (SELECT recording_id, source_file FROM recordings) USING (recording_id)
 WHERE rows / of_recording >= $max_share AND of_recording >= $min_rows
 ORDER BY share DESC, recording_id

@@ -6,9 +6,9 @@ FROM (
     SELECT
         condition,
         behaviour_policy,
-        count(*) AS rows,
-        sum(count(*)) OVER (PARTITION BY condition) AS of_condition
-    FROM transitions
+        CAST(sum(rows) AS BIGINT) AS rows,
+        sum(sum(rows)) OVER (PARTITION BY condition) AS of_condition
+    FROM recording_cells
     GROUP BY condition, behaviour_policy
 )
 WHERE rows / of_condition >= $max_share

@@ -2,8 +2,13 @@
 -- advice: Look at the robot (its wheels, its lidar, its floor) before learning from it: a policy for the others may never meet this, or a fault looks like it. `FROM coverage_by_robot` has the rates.
 -- doc: Conditions that one robot saw (almost) alone, though others drove too: the robot's own fault, or what only its site has.
 WITH seen AS (
-    SELECT robot, condition, count(*) AS rows, count(DISTINCT episode_id) AS episodes
-    FROM transitions
+    SELECT
+        robot,
+        condition,
+        CAST(sum(rows) AS BIGINT) AS rows,
+        CAST(sum(episodes) AS BIGINT) AS episodes
+    FROM recording_conditions
+    JOIN (SELECT recording_id, robot FROM recordings) USING (recording_id)
     WHERE robot IS NOT NULL
     GROUP BY robot, condition
 ), driven AS (

@@ -1,18 +1,25 @@
 -- severity: info
 -- advice: Leave such rows out of strata, have people review them (restock label --review), or log a better sensor.
 -- doc: Conditions of whose rows, labelled or uncertain, many are too near to call by their probability.
-SELECT condition, uncertain, rows, uncertain / rows AS uncertain_share
-FROM (
+WITH doubted AS (
     SELECT
         condition,
-        count(*) FILTER (WHERE list_contains(uncertain, condition)) AS uncertain,
-        count(*) AS rows
+        count(*) AS uncertain,
+        count(*) FILTER (WHERE NOT list_contains(coalesce(conditions, []), condition)) AS not_held
     FROM (
-        SELECT uncertain, unnest(list_distinct(list_concat(conditions, uncertain))) AS condition
+        SELECT conditions, unnest(list_distinct(uncertain)) AS condition
         FROM transitions
-        WHERE uncertain IS NOT NULL
+        WHERE len(uncertain) > 0
     )
     GROUP BY condition
+), held AS (
+    -- Nothing is read where nothing is in doubt.
+    SELECT condition, count(*) AS rows
+    FROM (SELECT unnest(conditions) AS condition FROM transitions WHERE uncertain IS NOT NULL)
+    WHERE condition IN (SELECT condition FROM doubted)
+    GROUP BY condition
 )
+SELECT condition, uncertain, rows, uncertain / rows AS uncertain_share
+FROM (SELECT condition, uncertain, not_held + coalesce(held.rows, 0) AS rows FROM doubted LEFT JOIN held USING (condition))
 WHERE rows >= $min_rows AND uncertain / rows > $max_uncertain_share
 ORDER BY uncertain_share DESC, condition

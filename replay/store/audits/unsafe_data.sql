@@ -1,20 +1,24 @@
 -- severity: warning
 -- advice: Leave these episodes out with the mixture's `where`, or keep them in a stratum of their own with a cap.
 -- doc: Behaviour policies that bumped into things in too many of their steps.
-SELECT
-    behaviour_policy,
-    count(*) AS rows,
-    avg(bumps::INTEGER) AS bumped_share,
-    count(DISTINCT episode_id) FILTER (bumps) AS episodes
-FROM (
-    SELECT
-        behaviour_policy,
-        episode_id,
-        -- Pressed at the start of a step, or what ended the episode.
-        bumped OR (terminated AND ended_by = 'bump') AS bumps
-    FROM transitions
+WITH bumps AS (
+    -- Pressed at the start of a step, or what ended the episode.
+    SELECT behaviour_policy, count(*) AS bumped, count(DISTINCT episode_id) AS episodes
+    FROM (
+        SELECT behaviour_policy, episode_id, bumped
+        FROM transitions
+        WHERE bumped OR terminated
+    )
     JOIN (SELECT episode_id, ended_by FROM episodes) USING (episode_id)
+    WHERE bumped OR ended_by = 'bump'
+    GROUP BY behaviour_policy
+), driven AS (
+    SELECT behaviour_policy, CAST(sum(rows) AS BIGINT) AS rows
+    FROM recording_cells
+    GROUP BY behaviour_policy
 )
-GROUP BY behaviour_policy
-HAVING avg(bumps::INTEGER) > $max_bumped_share
+SELECT behaviour_policy, rows, bumped / rows AS bumped_share, episodes
+FROM driven
+JOIN bumps USING (behaviour_policy)
+WHERE bumped / rows > $max_bumped_share
 ORDER BY bumped_share DESC
