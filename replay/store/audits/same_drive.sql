@@ -63,7 +63,7 @@ SELECT
 FROM pairs
 JOIN counts AS one ON one.recording_id = pairs.recording_id
 JOIN counts AS other ON other.recording_id = same_as
-JOIN recordings AS file ON file.recording_id = pairs.recording_id
-JOIN recordings AS other_file ON other_file.recording_id = same_as
+LEFT JOIN recordings AS file ON file.recording_id = pairs.recording_id
+LEFT JOIN recordings AS other_file ON other_file.recording_id = same_as
 WHERE rows / least(one.distinctive, other.distinctive) >= $min_share
 ORDER BY rows DESC, pairs.recording_id, same_as
