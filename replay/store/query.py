@@ -47,6 +47,8 @@ def query(
                 remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
             )
     install_named(connection, text)
+    if _by_commas(connection, text):
+        connection.execute("SET disabled_optimizers = ''")
     try:
         for statement in statements[:-1]:
             _named(connection, partial(connection.execute, statement)).fetchall()
@@ -63,6 +65,13 @@ def query(
 
 def _pivots(statement: duckdb.Statement) -> bool:
     return statement.type.name == "MULTI" and _PIVOT.match(statement.query) is not None
+
+
+def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
+    """Whether tables are joined by commas: as they are written some would be crossed, row by row,
+    so DuckDB finds their order, from here on in this connection."""
+    tree = connection.execute("SELECT json_serialize_sql($1::VARCHAR)", [text]).fetchall()[0][0]
+    return '"ref_type":"CROSS"' in tree
 
 
 def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:

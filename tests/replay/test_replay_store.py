@@ -259,6 +259,17 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_tables_between_commas_are_not_crossed(store: Store) -> None:
+    text = """
+        SELECT count(*) FROM transitions AS t, recordings AS r, episodes AS e
+        WHERE t.episode_id = e.episode_id AND e.recording_id = r.recording_id
+    """
+    assert store.sql(text).fetchall() == store.sql("SELECT count(*) FROM transitions").fetchall()
+    plan = store.sql(text).explain()
+    assert "HASH_JOIN" in plan.upper().replace(" ", "_")
+    assert "CROSS_PRODUCT" not in plan.upper().replace(" ", "_")
+
+
 def test_a_pivot_takes_its_columns_from_the_data(store: Store) -> None:
     found = store.sql("PIVOT (SELECT zone, condition FROM transitions) ON condition")
     held = store.sql("SELECT DISTINCT condition FROM transitions ORDER BY ALL").fetchall()
