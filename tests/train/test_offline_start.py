@@ -129,7 +129,7 @@ def test_a_bound_is_of_both_halves_and_refused_where_weights_do_not_reach() -> N
     parts["rare"] = episodes(8, 4, 0.01, 1.0)
     of_all, nominal, rare = estimates(parts, EssGate(0.2, 5), seed=0)
     assert nominal["refused"] is None
-    assert "worth 4.0 of 8 episodes" in rare["refused"]
+    assert "an effective sample of 4.0 of 8 episodes" in rare["refused"]
     assert of_all["refused"] == rare["refused"]
 
 
