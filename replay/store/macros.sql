@@ -43,7 +43,8 @@ WHERE episode_id = id
 ORDER BY step_index;
 
 -- Each episode with the one condition that best says what it was about: of those that held for at
--- least `min_steps` steps, the one that held longest; else nominal. The true condition, where known.
+-- least `min_steps` steps, the one that held longest (of several, the first by name); else nominal. The
+-- true condition, where known.
 CREATE OR REPLACE MACRO episode_kinds(min_steps) AS TABLE
 WITH held AS (
     SELECT episode_id, unnest(string_split(true_condition, ',')) AS kind
@@ -52,7 +53,7 @@ WITH held AS (
     UNION ALL
     SELECT episode_id, unnest(conditions) FROM transitions WHERE true_condition IS NULL
 ), longest AS (
-    SELECT episode_id, arg_max(kind, steps) AS kind
+    SELECT episode_id, first(kind ORDER BY steps DESC, kind) AS kind
     FROM (SELECT episode_id, kind, count(*) AS steps FROM held GROUP BY ALL HAVING count(*) >= min_steps)
     GROUP BY episode_id
 )

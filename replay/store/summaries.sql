@@ -205,7 +205,7 @@ WITH told AS (
     UNION ALL
     SELECT episode_id, condition, steps FROM condition_steps ANTI JOIN told USING (episode_id)
 ), longest AS (
-    SELECT episode_id, arg_max(kind, steps) AS kind
+    SELECT episode_id, first(kind ORDER BY steps DESC, kind) AS kind
     FROM (SELECT episode_id, kind, sum(steps) AS steps FROM held GROUP BY ALL HAVING sum(steps) >= min_steps)
     GROUP BY episode_id
 )

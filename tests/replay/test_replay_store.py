@@ -16,6 +16,7 @@ from support.stores import TASK, manifest, recording_transitions, write_store
 
 import restock
 from restock.errors import QueryError, StoreError
+from restock.ingest.store.transitions import replaced
 from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
 from restock.replay.store.column_docs import column_docs, rewrite, view_docs
@@ -257,6 +258,17 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
         with pytest.raises(QueryError, match="read-only"):
             store.sql(text)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_of_two_conditions_that_held_as_long_is_of_the_first_by_name(
+    tmp_path: Path,
+) -> None:
+    steps = recording_transitions(1)
+    both = pa.array([["wheel_slip", "near_collision"]] * len(steps), pa.list_(pa.string()))
+    steps = replaced(steps, {"conditions": both})
+    with Store(write_store(tmp_path / "store", [steps])) as store:
+        kinds = store.sql("SELECT DISTINCT kind FROM episode_kinds(3)").fetchall()
+    assert kinds == [("near_collision",)]
 
 
 def test_tables_between_commas_are_not_crossed(store: Store) -> None:
