@@ -147,7 +147,7 @@ def run_audits(
         f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
     }
     findings = []
-    with rows_held(connection):
+    with rows_held(connection, [audit.sql for audit in audits]):
         for audit in audits:
             finding = Finding(audit, "skipped", 0, [], [], {})
             if audit.needs is None or audit.needs in available:

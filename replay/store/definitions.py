@@ -145,11 +145,13 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Have the rows of these in memory, as tables of these names."""
+        """Have the rows of these in memory, as tables of these names; a view waits under another
+        as it is, which need not be how it was made here."""
         self._make(views)
         for view in views:
             self._connection.execute(
-                f"CREATE TABLE held_rows AS FROM {view}; DROP VIEW {view};"
+                f"CREATE TABLE held_rows AS FROM {view};"
+                f" ALTER VIEW {view} RENAME TO view_of_{view};"
                 f" ALTER TABLE held_rows RENAME TO {view}"
             )
             self._held.append(view)
@@ -158,9 +160,9 @@ class Definitions:
         """Forget the rows that are held: the tables are views again."""
         held, self._held = self._held, []
         for view in held:
-            self._connection.execute(f"DROP TABLE {view}")
-            self._made.remove(view)
-        self._make(held)
+            self._connection.execute(
+                f"DROP TABLE {view}; ALTER VIEW view_of_{view} RENAME TO {view}"
+            )
 
 
 _OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, Definitions] = WeakKeyDictionary()
@@ -173,15 +175,16 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 
 @contextmanager
-def rows_held(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Views of a store as tables in memory, for as long as many queries follow."""
+def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
+    """Views of a store as tables in memory, for as long as these queries follow."""
     made = _OF.get(connection)
     if made is None:
         yield
         return
+    named = [view for view in HELD_OF_MANY if sum(view in text for text in texts) > 1]
     try:
         try:
-            made.hold((*HELD, *HELD_OF_MANY) if _few(connection) else HELD_OF_MANY)
+            made.hold([*(HELD if _few(connection) else ()), *named])
         except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
             made.release()
         yield

@@ -143,6 +143,12 @@ def test_returns_are_discounted_from_the_first_step(tmp_path) -> None:
         assert [value for (value,) in rows.fetchall()] == [1.0 + 1.0 + 1.0, 9.0]
 
 
+def test_what_is_listed_beside_the_audits_is_discounted_as_they_are(tmp_path) -> None:
+    place = store_of(tmp_path / "store", [("planner", [1.0, 2.0, 4.0], "goal")])
+    found = audit_reward(place, load_audits(), load_thresholds(), discount=0.5)
+    assert {row["discounted_mean"] for row in found.returns} == {1.0 + 1.0 + 1.0}
+
+
 @pytest.mark.parametrize("drivers", ["few", "one", "handed over"])
 def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, capsys, drivers) -> None:
     episodes = hasty_and_careful(earlier, 19 if drivers == "few" else 60)
