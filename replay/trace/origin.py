@@ -22,13 +22,13 @@ from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tic
 from restock.ingest.store.writer import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store, is_store
 
 # Where in log time the messages of a tick lie: it takes a while until the next ones come, and
 # some take longer than others to be received.
 WINDOW_S = (-1.0, 0.1)
 _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ingest_id", "reward")
-_ROW_OF_FRAMES = {"id": "transition_id", "recording": "recording_id", "stamp": "stamp_ns"}
 # Of a manifest: long.
 _LEFT_OUT = (
     "task_json",
@@ -170,9 +170,9 @@ def _frames(
         return [], []
     if manifest["ingest_id"] != row["ingest_id"]:
         return [], ["the frames of its cameras were replaced by a later ingest"]
-    named = {key: row[column] for key, column in _ROW_OF_FRAMES.items()}
+    install_named(store.bare, "transition_frames")
     try:
-        found = rows_of(store.connection, sql_file("trace_frames.sql"), named)
+        found = rows_of(store.bare, sql_file("trace_frames.sql"), {"id": row["transition_id"]})
     except duckdb.Error as error:
         return [], [f"the frames of its cameras cannot be read: {first_line(error)}"]
     without = sorted(kept.keys() - {frame["camera"] for frame in found})

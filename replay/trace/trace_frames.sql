@@ -5,15 +5,12 @@ SELECT
     frame_index,
     log_time_ns,
     stamp_ns,
-    ($stamp - stamp_ns) * 1e-9 AS age_s,
+    age_s,
     encoding,
     width,
     height,
-    size_bytes,
+    frames.size_bytes AS size_bytes,
     sha256
-FROM stored_frames
-WHERE
-    recording_id = $recording
-    AND $id BETWEEN first_transition_id AND last_transition_id
-QUALIFY row_number() OVER (PARTITION BY camera ORDER BY first_transition_id DESC) = 1
+FROM frames
+JOIN (FROM transition_frames WHERE transition_id = $id) USING (recording_id, camera, frame_index)
 ORDER BY camera
