@@ -47,7 +47,7 @@ def query(
                 remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
             )
     install_named(connection, text)
-    if _by_commas(connection, text):
+    if any(_by_commas(connection, statement.query) for statement in statements):
         connection.execute("SET disabled_optimizers = ''")
     try:
         for statement in statements[:-1]:

@@ -13,11 +13,10 @@ from restock.replay.fleet.drift import OWN, Drift
 from restock.replay.store.column_docs import UNITS
 from restock.replay.store.column_docs import unit as unit_of
 from restock.report.look import charts
-from restock.report.look.blocks import Figure, Rows, Section, Table, words
+from restock.report.look.blocks import MOST_ROWS, Figure, Rows, Section, Table, words
 
 MOST_ROBOTS = 12  # in a chart: those with findings first
 MOST_PERIODS = 26  # the newest
-MOST_ROWS = 24  # of a table that is not folded
 MOST_FINDINGS = 8  # with a chart of their own
 _BEYOND = 3.0  # sizes past it look alike
 _BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware

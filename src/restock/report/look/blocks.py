@@ -11,6 +11,7 @@ from typing import Any
 from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
+MOST_ROWS = 24  # of a table that need not be folded
 
 
 @dataclass(frozen=True)

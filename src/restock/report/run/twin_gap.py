@@ -13,7 +13,16 @@ import altair as alt
 from restock import __version__
 from restock.errors import RestockError
 from restock.report.look import charts
-from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, number, words
+from restock.report.look.blocks import (
+    MOST_ROWS,
+    Drawing,
+    Figure,
+    Rows,
+    Section,
+    Table,
+    number,
+    words,
+)
 from restock.report.run.facts import Facts
 from restock.stats import ConfidenceInterval
 from restock.train.twin.calibration.gap import AFTER, BEFORE
@@ -35,7 +44,6 @@ COLOURS = {
     "floor": "#2563eb",
     "persistence": "#94a3b8",
 }
-MOST_ROWS = 24  # of a table that is not folded
 _MEANING = {
     TRUSTED: "shown to be within the limits",
     UNTRUSTED: "shown to be beyond a limit",
