@@ -19,16 +19,12 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
+from restock.ingest.store.commits import delta_columns, recording_columns
 from restock.ingest.store.data_files import AddedFile, add_action, merge
 from restock.ingest.store.lineage import Ingest, StoredFile, own_path
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.summary import VERSION, summarised
-from restock.ingest.store.writer import (
-    RECORDINGS,
-    TRANSITIONS,
-    StoreWriter,
-    delta_columns,
-    recording_columns,
-)
+from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import recording_schema
 
 FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most

@@ -13,12 +13,11 @@ import pyarrow.parquet as pq
 from deltalake.transaction import AddAction
 
 from restock.ingest.store.lineage import INGESTS, Ingest, StoredFile, packed_ingests
-from restock.ingest.store.location import Location
+from restock.ingest.store.location import TRANSITIONS, Location
 
 GROUP_ROWS = 65_536  # of a compacted file's row groups
 GROUP_BYTES = 64 << 20  # or where rows are large, as manifests are
 READ_ROWS = 2048
-TRANSITIONS = "transitions"
 
 
 @dataclass

@@ -33,6 +33,7 @@ from restock.ingest.store.version import Version, version_at
 if TYPE_CHECKING:
     import pyarrow.compute as pc
 
+TRANSITIONS, RECORDINGS, FRAMES = "transitions", "recordings", "frames"  # folders of a store
 # An endpoint that is down or silent is given up after a minute at most.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
 DEFAULT_REGION = "us-east-1"  # servers that are not Amazon's have none, and are signed for anyway

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import StoreError
-from restock.ingest.store.location import Location
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA
-from restock.ingest.store.writer import RECORDINGS, TRANSITIONS
 from restock.ingest.task.tags import NAMED
 from restock.replay.store.definitions import VIEWS, definitions
 from restock.replay.store.store import is_store

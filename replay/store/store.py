@@ -10,57 +10,33 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import duckdb
 import msgspec
 import pyarrow as pa
-from deltalake import DeltaTable
 
 from restock.errors import StoreError
-from restock.files import first_line
-from restock.ingest.store.lineage import Ingest, StoredFile, ingests_table, own_path, stored_files
-from restock.ingest.store.location import Location
-from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
+from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
+from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
 from restock.ingest.store.version import Version
-from restock.ingest.store.writer import (
-    FRAMES,
-    RECORDINGS,
-    RETENTION_HOURS,
-    TRANSITIONS,
-    StoreWriter,
-    frame_files,
-)
+from restock.ingest.store.writer import RETENTION_HOURS
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import computed
 from restock.replay.store.definitions import Definitions, install_common
-from restock.replay.store.parquet_views import column_types, read_parquet
 from restock.replay.store.query import query
 from restock.replay.store.shared_rows import COLUMNS, SHARED, install_shared_rows
+from restock.replay.store.stored_tables import StoredTable, manifest_tables, register
 
-if TYPE_CHECKING:
-    from pyarrow.dataset import Dataset
-
-FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
 # Joins are done as they are written, the right side in memory: of files whose columns are told
 # DuckDB takes every scan for one row, and would hold all transitions to look up their recordings.
 AS_WRITTEN = "join_order,build_side_probe_side"
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class _Stored:
-    """The files of one table at the version that is open, and what is read of them."""
-
-    view: str
-    table: str
-    schema: pa.Schema
-    paths: Sequence[str]  # in the table
 
 
 class StoredProfile(NamedTuple):
@@ -110,25 +86,20 @@ class Store:
         if memory_limit is not None:
             self._set_memory(memory_limit)
         held = stored_files(self.path, TRANSITIONS, transitions)
-        manifests = _manifests(self.path, recordings, held)
-        columns = pa.schema(recordings.schema().to_arrow())
-        self._transitions = _Stored(
+        self._ingests = ingests_table(held)
+        self._recordings, self._summaries = manifest_tables(self.path, recordings, held)
+        self._transitions = StoredTable(
+            self.path,
             "stored_transitions",
             TRANSITIONS,
             pa.schema(transitions.schema().to_arrow()),
             [file.path for file in held],
         )
-        self._recordings = _Stored("stored_recordings", RECORDINGS, _brief(columns), manifests)
-        kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
-        self._summaries = _Stored("stored_summaries", RECORDINGS, pa.schema(kept), manifests)
-        self.files = {
-            table.view: self._addresses(table) for table in (self._recordings, self._transitions)
-        }
-        self._ingests = ingests_table(held)
+        self.files = {one.view: one.addresses() for one in (self._recordings, self._transitions)}
         try:
-            self._manifests = self._held(self._recordings)
+            self._manifests = self._recordings.read()
             self._present_all(self.bare, "main")
-            self._present(self.bare, "main", self._frames())
+            self._frames().present(self.bare)
         except StoreError as error:
             if version is None:
                 raise
@@ -242,7 +213,7 @@ class Store:
             for one in self._ingests.to_pylist()
             if not recordings or one["recording_id"] in recordings
         ]
-        yield from StoreWriter(self.path).ends(held)
+        yield from StoreReader(self.path).ends(held)
 
     def _decode(self, text: str, kind: type[T], name: str) -> T:
         """What a manifest keeps as JSON.
@@ -300,7 +271,7 @@ class Store:
         held = self._ingests["ingest_id"].to_pylist()
         if not held or not summarised.issuperset(held):
             return False
-        self._present(self.bare, "main", self._summaries)
+        self._summaries.present(self.bare)
         return True
 
     def _install_shared_rows(self) -> None:
@@ -321,11 +292,11 @@ class Store:
         Manifests are held in memory; transitions on S3 are read at each query.
         """
         manifests = self._manifests.drop_columns(["summary_version"])
-        _register(connection, schema, "stored_ingests", self._ingests)
-        _register(connection, schema, self._recordings.view, manifests)
-        self._present(connection, schema, self._transitions)
+        register(connection, "stored_ingests", self._ingests, schema=schema)
+        register(connection, self._recordings.view, manifests, schema=schema)
+        self._transitions.present(connection, schema=schema)
 
-    def _frames(self) -> _Stored:
+    def _frames(self) -> StoredTable:
         """The frames of cameras that the manifests of its rows name."""
         files = frame_files(self._manifests)
         if files:
@@ -333,60 +304,7 @@ class Store:
 
             held = pc.is_in(self._manifests["ingest_id"], self._ingests["ingest_id"])
             files = frame_files(self._manifests.filter(held))
-        return _Stored("stored_frames", FRAMES, frame_schema(), files)
-
-    def _present(self, connection: duckdb.DuckDBPyConnection, schema: str, table: _Stored) -> None:
-        if table.paths and self.path.folder is not None:
-            kinds, files = column_types(connection, table.schema), self._addresses(table)
-            read_parquet(connection, table.view, files, schema=schema, kinds=kinds)
-            return
-        with self.path.translate_errors():
-            _register(connection, schema, table.view, self._dataset(table))
-
-    def _addresses(self, table: _Stored) -> list[str]:
-        return [f"{self.path.table(table.table)}/{path}" for path in table.paths]
-
-    def _dataset(self, table: _Stored) -> pa.Table | Dataset:
-        if not table.paths:
-            return table.schema.empty_table()
-        from pyarrow import dataset
-
-        parquet = dataset.ParquetFileFormat(
-            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(pre_buffer=True)
-        )
-        fragments = [
-            parquet.make_fragment(f"{table.table}/{path}", self.path.files) for path in table.paths
-        ]
-        return dataset.FileSystemDataset(fragments, table.schema, parquet, self.path.files)
-
-    def _held(self, table: _Stored) -> pa.Table:
-        try:
-            with self.path.translate_errors():
-                if len(table.paths) <= FEW_FILES and self.path.folder is not None:
-                    return self._read_each(table)
-                rows = self._dataset(table)
-                return rows if isinstance(rows, pa.Table) else rows.to_table()
-        except (OSError, pa.ArrowException) as error:
-            raise StoreError(
-                f"its manifests cannot be read: {first_line(error)}",
-                where=str(self.path),
-                remedy="restore the file from a copy, or ingest its recording again",
-            ) from error
-
-    def _read_each(self, table: _Stored) -> pa.Table:
-        """File by file; columns that a file has not are null."""
-        parts = [
-            self.path.read(f"{table.table}/{path}", columns=table.schema.names)
-            for path in table.paths
-        ]
-        wanted = {field.name: field for field in table.schema}
-        bare = []
-        for part in parts:
-            kinds = pa.schema([wanted[name] for name in part.column_names])
-            if part.schema.types != kinds.types:  # other tools write text as views or large strings
-                part = part.cast(kinds)
-            bare.append(part.replace_schema_metadata(None))
-        return pa.concat_tables([table.schema.empty_table(), *bare], promote_options="default")
+        return StoredTable(self.path, "stored_frames", FRAMES, frame_schema(), files)
 
     def _set_memory(self, limit: str) -> None:
         try:
@@ -395,29 +313,6 @@ class Store:
             raise StoreError(
                 f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
             ) from error
-
-
-def _register(
-    connection: duckdb.DuckDBPyConnection,
-    schema: str,
-    view: str,
-    rows: pa.Table | Dataset,
-) -> None:
-    name = view if schema == "main" else f"{schema}_{view}"
-    connection.register(name, rows)
-    if name != view:
-        connection.execute(f'CREATE VIEW "{schema}".{view} AS FROM "{name}"')
-
-
-def _brief(columns: pa.Schema) -> pa.Schema:
-    """The manifests' columns without those of their summaries, but for its version."""
-    names = set(SUMMARY_SCHEMA.names)
-    return pa.schema(
-        [
-            *(one for one in columns if one.name not in names),
-            SUMMARY_SCHEMA.field("summary_version"),
-        ]
-    )
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
@@ -457,18 +352,3 @@ def _expect(place: Location) -> None:
         where=str(place),
         remedy=f"`restock ingest RECORDINGS --store {place}` makes one",
     )
-
-
-def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
-    """The files of the manifests, those of an older version's rows included.
-
-    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
-    were before, by version or because the writer was between two commits, finds it by its name.
-    """
-    active = stored_files(place, RECORDINGS, recordings)
-    here = {one.ingest_id for file in active for one in file.ingests}
-    ingests = (one for file in held for one in file.ingests if one.ingest_id not in here)
-    gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
-    infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
-    found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]
-    return [file.path for file in active] + found

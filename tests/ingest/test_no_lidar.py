@@ -23,7 +23,9 @@ from restock.ingest.pipeline import IngestResult, ingest
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.steps import steps_of
-from restock.ingest.store.writer import TRANSITIONS, StoreWriter, delta_columns
+from restock.ingest.store.commits import delta_columns
+from restock.ingest.store.location import TRANSITIONS
+from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.conditions import shipped, told, unseen
 from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
 from restock.ingest.task.schema import transition_schema

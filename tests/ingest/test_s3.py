@@ -22,8 +22,8 @@ from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.pipeline import ingest
 from restock.ingest.store import location
-from restock.ingest.store.location import Location
-from restock.ingest.store.writer import TRANSITIONS, StoreWriter
+from restock.ingest.store.location import TRANSITIONS, Location
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.frames import camera_frames
 from restock.replay.store.store import Store, is_store
 

@@ -23,8 +23,8 @@ from support.stores import one, shown
 
 import restock
 from restock.errors import StoreError
-from restock.ingest.store.location import Location
-from restock.ingest.store.writer import RECORDINGS, TRANSITIONS, StoreWriter
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
 
@@ -157,14 +157,14 @@ def test_a_manifest_without_transitions_shows_nothing_and_is_cleared_away(tmp_pa
     """A kill between the two commits."""
     writer = StoreWriter(tmp_path / "s")
     writer.write(*one(1, "a"))
-    commit = StoreWriter._commit
+    commit = StoreWriter.commit
 
     def killed(self, name, *rest):
         if name == "transitions":
             raise KeyboardInterrupt
         return commit(self, name, *rest)
 
-    monkeypatch.setattr(StoreWriter, "_commit", killed)
+    monkeypatch.setattr(StoreWriter, "commit", killed)
     with pytest.raises(KeyboardInterrupt):
         writer.write(*one(1, "b"))
     monkeypatch.undo()
@@ -257,10 +257,10 @@ class _Overtaken(StoreWriter):
         super().__init__(path)
         self.meanwhile = meanwhile
 
-    def _commit(self, name, added, instead_of):
+    def commit(self, name, added, instead_of):
         if name == TRANSITIONS:
             self.meanwhile()
-        return super()._commit(name, added, instead_of)
+        return super().commit(name, added, instead_of)
 
 
 def test_a_writer_overtaken_by_another_of_the_same_recording_loses_nothing(tmp_path):

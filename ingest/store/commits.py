@@ -1,0 +1,207 @@
+"""Commits to a store's two Delta tables: all or nothing, and again where others were faster.
+
+A commit takes files that are written already, and what they replace, from a fresh look at the
+table; an attempt whose answer was lost is not done twice. Tables are made, and get the columns of
+newer software, when rows with them are first written.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import TypeVar
+
+import pyarrow as pa
+from deltalake import CommitProperties, DeltaTable, Schema, Transaction
+from deltalake.exceptions import CommitFailedError, DeltaError
+from deltalake.transaction import AddAction, RemoveAction
+
+from restock.errors import StoreError
+from restock.files import first_line
+from restock.ingest.store.data_files import AddedFile, add_action, rewrite
+from restock.ingest.store.lineage import own_path, stored_files
+from restock.ingest.store.location import TRANSITIONS
+from restock.ingest.store.reader import StoreReader
+from restock.ingest.store.summary import SUMMARY_SCHEMA
+from restock.ingest.task.schema import recording_schema
+from restock.ingest.task.signals import LIDAR_SIGNALS
+
+ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
+CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
+_JITTER = random.SystemRandom()
+T = TypeVar("T")
+
+
+class TableCommits(StoreReader):
+    """A store whose tables can be made and committed to."""
+
+    def create(self, name: str, schema: pa.Schema) -> None:
+        """See that there is a table with these columns.
+
+        Columns that newer software writes are added; rows from before hold null in them.
+        """
+        if self.path.folder is not None and self.path.folder.is_file():
+            raise StoreError("is a file, not a store", where=str(self.path), remedy="name a folder")
+
+        from restock.ingest.profile.custom_signal import refuse_other_signals
+
+        def create() -> None:
+            if not self.path.has_table(name):
+                DeltaTable.create(
+                    self.path.table(name),
+                    schema,
+                    mode="ignore",
+                    storage_options=self.path.options,
+                    configuration={"delta.checkpointInterval": str(CHECKPOINT_COMMITS)},
+                )
+            table = self.path.open_table(name)
+            have = {field.name: field for field in table.schema().fields}
+            refuse_other_signals(have, schema, str(self.path))
+            extra = [field.with_nullable(True) for field in schema if field.name not in have]
+            if extra:
+                table.alter.add_columns(Schema.from_arrow(pa.schema(extra)).fields)
+
+        self.again_on_conflict(create)
+
+    def allow_nulls(self, rows: pa.Table) -> None:
+        """Let signals be null where they are in these rows: in a store of an older Restock the
+        clearance of a robot without a lidar was a number."""
+        names = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]
+        names = [name for name in names if rows[name].null_count]
+
+        def allow() -> None:
+            table = self.path.open_table(TRANSITIONS)
+            strict = {field.name for field in table.schema().fields if not field.nullable}
+            for name in names:
+                if name in strict:
+                    table.alter.drop_column_not_null(name)
+
+        if names:
+            self.again_on_conflict(allow)
+
+    def commit(
+        self, name: str, added: Sequence[AddedFile], instead_of: Mapping[str, str]
+    ) -> tuple[int, list[str]]:
+        """Add files, all or nothing; to `transitions`, remove the same recordings' others with it.
+
+        Returns the table's version and the files removed from it.
+        """
+        recordings = sorted({file.recording_id for file in added})
+        replaced: list[str] = []
+
+        def attempt() -> int:
+            table = self.path.open_table(name)
+            active = stored_files(self.path, name, table)
+            if {file.path for file in added} <= {file.path for file in active}:
+                return table.version()  # by the attempt before, whose answer was lost
+            self._still(instead_of)
+            now_ms = time.time_ns() // 1_000_000
+            actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
+            turns = []
+            if name == TRANSITIONS:
+                replaced.clear()
+                for file in active:
+                    gone = [one for one in file.ingests if one.recording_id in recordings]
+                    if not gone:
+                        continue
+                    replaced.extend(own_path(one.recording_id, one.ingest_id) for one in gone)
+                    actions.append(RemoveAction(file.path, True, now_ms))
+                    kept = [one for one in file.ingests if one.recording_id not in recordings]
+                    if kept:
+                        actions.append(add_action(rewrite(self.path, file, kept), now_ms))
+                # Two first ingests of one recording add without removing, which is no conflict by
+                # itself: the transaction id makes it one.
+                turns = [
+                    Transaction(app, (table.transaction_version(app) or 0) + 1)
+                    for app in (f"restock/{recording}" for recording in recordings)
+                ]
+            self.transact(table, actions, turns)
+            table.update_incremental()
+            return table.version()
+
+        return self.again_on_conflict(attempt), replaced
+
+    def remove(self, name: str, paths: Collection[str]) -> None:
+        """Take files out of a table, those that are still in it."""
+
+        def attempt() -> None:
+            table = self.path.open_table(name)
+            now_ms = time.time_ns() // 1_000_000
+            actions = [
+                RemoveAction(file.path, True, now_ms)
+                for file in stored_files(self.path, name, table)
+                if file.path in paths
+            ]
+            if actions:
+                self.transact(table, actions, [])
+
+        if paths:
+            self.again_on_conflict(attempt)
+
+    def transact(
+        self,
+        table: DeltaTable,
+        actions: Sequence[AddAction | RemoveAction],
+        turns: Sequence[Transaction],
+        operation: str = "restock ingest",
+    ) -> None:
+        """Commit to a table. Raises CommitFailedError where another writer was faster."""
+        table.create_write_transaction(
+            list(actions),
+            mode="append",
+            schema=table.schema(),
+            commit_properties=CommitProperties(
+                custom_metadata={"operation_name": operation}, app_transactions=list(turns)
+            ),
+        )
+
+    def _still(self, instead_of: Mapping[str, str]) -> None:
+        """Check that these ingests are the ones in the store."""
+        if not instead_of:
+            return
+        shown = {one.recording_id: one.ingest_id for one in self.shown()}
+        for recording, ingest in instead_of.items():
+            if shown.get(recording) != ingest:
+                raise StoreError(
+                    f"recording {recording} was ingested again meanwhile",
+                    where=str(self.path),
+                    remedy="try again; the store is as that ingest left it",
+                )
+
+    def again_on_conflict(self, work: Callable[[], T]) -> T:
+        """Do it again, from a fresh look at the table, while other writers are faster."""
+        for attempt in range(ATTEMPTS):
+            try:
+                with self.path.translate_errors():
+                    return work()
+            except CommitFailedError as error:
+                conflict = error
+                # Writers that collided wait for different times, and longer each time.
+                time.sleep(0.02 * 2 ** min(attempt, 6) * (1 + _JITTER.random()))
+            except (DeltaError, OSError) as error:
+                raise StoreError(
+                    f"cannot be written: {first_line(error)}", where=str(self.path)
+                ) from error
+        raise StoreError(
+            f"other writers were faster {ATTEMPTS} times: {first_line(conflict)}",
+            where=str(self.path),
+            remedy="try again when they are done; the store is as it was",
+        )
+
+
+def recording_columns() -> pa.Schema:
+    """The columns of `recordings`: the manifest's, and the summary's."""
+    return pa.schema([*recording_schema(), *SUMMARY_SCHEMA])
+
+
+def delta_columns(schema: pa.Schema) -> pa.Schema:
+    """The same columns without lists of fixed size, which Delta does not know."""
+    return pa.schema(
+        [
+            field.with_type(pa.list_(field.type.value_type))
+            if pa.types.is_fixed_size_list(field.type)
+            else field
+            for field in schema
+        ]
+    )

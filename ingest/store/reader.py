@@ -1,0 +1,178 @@
+"""What a store holds, for who writes to it: ingests, manifests, rows, the ends of episodes.
+
+Which files and ingests there are is in Delta's log, the rest in the manifests; nothing is asked of
+the rows but one recording's. Questions in SQL are for `restock.replay.store`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import pyarrow as pa
+
+from restock.ingest.store.lineage import READERS, Ingest, StoredFile, own_path, stored_files
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.repeated import (
+    SKETCH,
+    UNREADABLE,
+    RepeatedDrive,
+    Sketch,
+    find_repeat,
+    read_sketch,
+)
+from restock.ingest.store.summary import with_ends
+from restock.ingest.store.version import Version
+from restock.ingest.task.schema import recording_schema
+
+_SKETCHES: dict[tuple[Location, str], Sketch] = {}  # by ingest, which never changes; 2 kB each
+
+
+class StoreReader:
+    """What is in a store, at its newest version or at an older one."""
+
+    def __init__(self, path: str | Path | Location) -> None:
+        self.path = Location.of(path)
+
+    def reach(self) -> None:
+        """Check that the place can be reached. Raises StoreError where it cannot."""
+        self.path.has_table(TRANSITIONS)
+
+    def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
+        """The manifest rows whose transitions are in the store (of one recording, or of all).
+
+        Of a version, or as it is now.
+        """
+        schema = recording_schema()
+        if not self.path.has_table(TRANSITIONS):
+            return schema.empty_table()
+        shown = self.shown(version)
+        return self.manifests(
+            [one for one in shown if recording_id in (None, one.recording_id)], schema
+        )
+
+    def manifests(
+        self,
+        ingests: Sequence[Ingest],
+        schema: pa.Schema,
+        *,
+        skip: tuple[type[Exception], ...] = (),
+    ) -> pa.Table:
+        """These columns of the manifests of ingests; null where an older store has them not.
+
+        A file at which one of `skip` is raised is left out.
+        """
+        parts = [schema.empty_table()]
+        if ingests:
+            at = {
+                one.ingest_id: file.path for file in self.files(RECORDINGS) for one in file.ingests
+            }
+            paths = {
+                at.get(one.ingest_id, own_path(one.recording_id, one.ingest_id)): None
+                for one in ingests
+            }
+
+            def read(path: str) -> pa.Table:
+                with suppress(*skip):
+                    part = self.path.read(f"{RECORDINGS}/{path}", columns=schema.names)
+                    return _with_sketch(part) if "sketch" in schema.names else part
+                return schema.empty_table()
+
+            with ThreadPoolExecutor(READERS) as pool:
+                parts += pool.map(read, paths)
+        import pyarrow.compute as pc  # slow to import
+
+        wanted = pa.array([one.ingest_id for one in ingests], pa.string())
+        found = pa.concat_tables(
+            [part.replace_schema_metadata(None) for part in parts], promote_options="default"
+        )
+        return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
+
+    def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
+        """One recording's transitions, as they were written."""
+        with suppress(FileNotFoundError):
+            return self.path.read(f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}")
+        import pyarrow.compute as pc  # slow to import
+
+        parts = [
+            self.path.read(f"{TRANSITIONS}/{file.path}", where=pc.field("ingest_id") == ingest_id)
+            for file in self.files(TRANSITIONS)
+            if ingest_id in {one.ingest_id for one in file.ingests}
+        ]
+        if not parts:
+            raise FileNotFoundError(own_path(recording_id, ingest_id))
+        rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
+        told = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
+        return with_ends(rows, told.get(ingest_id))
+
+    def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
+        """The recording of each of these ingests and the ends of its episodes, as `episode_ends`
+        gives them; without those that have none."""
+        from restock.ingest.store.episode_rows import episode_ends
+
+        told = self._packed_ends(ingests)
+        for one in ingests:
+            bare = with_ends(pa.table({}), told.get(one.ingest_id))
+            if not told.get(one.ingest_id):
+                with suppress(FileNotFoundError):  # of an older store they lie with its rows
+                    path = own_path(one.recording_id, one.ingest_id)
+                    bare = self.path.read_schema(f"{TRANSITIONS}/{path}").empty_table()
+            ends = episode_ends(bare)
+            if ends is not None:
+                yield one.recording_id, ends
+
+    def _packed_ends(self, ingests: Sequence[Ingest]) -> dict[str, str | None]:
+        """What manifests keep of the ends of episodes, by ingest."""
+        schema = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
+        told = self.manifests(ingests, schema)
+        return dict(zip(*(told[name].to_pylist() for name in schema.names), strict=True))
+
+    def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
+        """The active files of one of its tables, and which ingests they hold."""
+        return stored_files(self.path, name, self.path.open_table(name, version))
+
+    def shown(self, version: Version | None = None) -> list[Ingest]:
+        """The ingests whose transitions are in the store."""
+        held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
+        return list({one.ingest_id: one for one in held}.values())
+
+    def repeated(self, rows: pa.Table, period_s: float) -> RepeatedDrive | None:
+        """The recording that holds most of these rows under other ids, if one largely does.
+
+        `period_s` is the control period: rows further apart than half of it do not count.
+        Recordings that older software wrote are not looked at; the audit `repeated_steps` does.
+        """
+        if not self.path.has_table(TRANSITIONS):
+            return None
+        own = rows["recording_id"][0].as_py()
+        others = [one for one in self.shown() if one.recording_id != own]
+        return find_repeat(rows, self._sketches(others), self.rows, period_s)
+
+    def _sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
+        """Their sketches, each read once: many recordings would read all others' as many times."""
+        names = ("recording_id", "ingest_id", "sketch")
+        schema = pa.schema([(name, pa.string()) for name in names])
+        new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]
+        # What cannot be read is another recording's, which `restock sql` reports.
+        for told in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
+            hashes = read_sketch({SKETCH: (told["sketch"] or "").encode()})
+            sketch = Sketch(told["recording_id"], told["ingest_id"], hashes)
+            _SKETCHES[self.path, sketch.ingest_id] = sketch
+        keys = [(self.path, one.ingest_id) for one in ingests]
+        return [_SKETCHES[key] for key in keys if key in _SKETCHES]
+
+
+def frame_files(manifests: pa.Table) -> list[str]:
+    """The files of `frames` that manifests name."""
+    rows = manifests["cameras"].to_pylist() if "cameras" in manifests.column_names else []
+    return sorted({camera["file"] for cameras in rows for camera in cameras or ()} - {""})
+
+
+def _with_sketch(manifests: pa.Table) -> pa.Table:
+    """Manifests of an earlier version have their sketch in their metadata."""
+    said = (manifests.schema.metadata or {}).get(SKETCH)
+    if said and "sketch" not in manifests.column_names:
+        manifests = manifests.append_column("sketch", pa.array([said.decode()] * len(manifests)))
+    return manifests

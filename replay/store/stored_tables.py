@@ -1,0 +1,144 @@
+"""The files of a store's tables at one version, as DuckDB's views and as Arrow's tables.
+
+A folder's files DuckDB reads itself; those on S3 it reads through Arrow. Their columns are those of
+Delta's log: no file is looked at before it is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import duckdb
+import pyarrow as pa
+from deltalake import DeltaTable
+
+from restock.errors import StoreError
+from restock.files import first_line
+from restock.ingest.store.lineage import StoredFile, own_path, stored_files
+from restock.ingest.store.location import RECORDINGS, Location
+from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
+from restock.replay.store.parquet_views import column_types, read_parquet
+
+if TYPE_CHECKING:
+    from pyarrow.dataset import Dataset
+
+FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
+
+
+@dataclass(frozen=True)
+class StoredTable:
+    """The files of one table at the version that is open, and what is read of them."""
+
+    place: Location
+    view: str
+    table: str
+    schema: pa.Schema
+    paths: Sequence[str]  # in the table
+
+    def addresses(self) -> list[str]:
+        """The files, as a reader of files names them."""
+        return [f"{self.place.table(self.table)}/{path}" for path in self.paths]
+
+    def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
+        """The view; files on S3 are read at each query.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        if self.paths and self.place.folder is not None:
+            kinds, files = column_types(connection, self.schema), self.addresses()
+            read_parquet(connection, self.view, files, schema=schema, kinds=kinds)
+            return
+        with self.place.translate_errors():
+            register(connection, self.view, self._dataset(), schema=schema)
+
+    def read(self) -> pa.Table:
+        """All of its rows, in memory; what a file has not is null.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        try:
+            with self.place.translate_errors():
+                if len(self.paths) <= FEW_FILES and self.place.folder is not None:
+                    return self._read_each()
+                rows = self._dataset()
+                return rows if isinstance(rows, pa.Table) else rows.to_table()
+        except (OSError, pa.ArrowException) as error:
+            raise StoreError(
+                f"its manifests cannot be read: {first_line(error)}",
+                where=str(self.place),
+                remedy="restore the file from a copy, or ingest its recording again",
+            ) from error
+
+    def _dataset(self) -> pa.Table | Dataset:
+        if not self.paths:
+            return self.schema.empty_table()
+        from pyarrow import dataset
+
+        parquet = dataset.ParquetFileFormat(
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(pre_buffer=True)
+        )
+        fragments = [
+            parquet.make_fragment(f"{self.table}/{path}", self.place.files) for path in self.paths
+        ]
+        return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
+
+    def _read_each(self) -> pa.Table:
+        """File by file."""
+        wanted = {field.name: field for field in self.schema}
+        bare = []
+        for path in self.paths:
+            part = self.place.read(f"{self.table}/{path}", columns=self.schema.names)
+            kinds = pa.schema([wanted[name] for name in part.column_names])
+            if part.schema.types != kinds.types:  # other tools write text as views or large strings
+                part = part.cast(kinds)
+            bare.append(part.replace_schema_metadata(None))
+        return pa.concat_tables([self.schema.empty_table(), *bare], promote_options="default")
+
+
+def manifest_tables(
+    place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
+) -> tuple[StoredTable, StoredTable]:
+    """The manifests of these files of transitions without their summaries (but for its version),
+    `stored_recordings`, and the summaries, `stored_summaries`."""
+    paths = _manifests(place, recordings, held)
+    columns = pa.schema(recordings.schema().to_arrow())
+    told = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
+    brief = pa.schema([*told, SUMMARY_SCHEMA.field("summary_version")])
+    kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
+    return (
+        StoredTable(place, "stored_recordings", RECORDINGS, brief, paths),
+        StoredTable(place, "stored_summaries", RECORDINGS, pa.schema(kept), paths),
+    )
+
+
+def register(
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    rows: pa.Table | Dataset,
+    *,
+    schema: str = "main",
+) -> None:
+    """An Arrow table or data set as a view of a schema, which must be there."""
+    name = view if schema == "main" else f"{schema}_{view}"
+    connection.register(name, rows)
+    if name != view:
+        connection.execute(f'CREATE VIEW "{schema}".{view} AS FROM "{name}"')
+
+
+def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
+    """The files of the manifests, those of an older version's rows included.
+
+    A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
+    were before, by version or because the writer was between two commits, finds it by its name.
+    """
+    active = stored_files(place, RECORDINGS, recordings)
+    here = {one.ingest_id for file in active for one in file.ingests}
+    ingests = (one for file in held for one in file.ingests if one.ingest_id not in here)
+    gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
+    infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
+    found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]
+    return [file.path for file in active] + found
