@@ -146,7 +146,7 @@ class _Opening:
         else:
             from restock.ingest.containers.ros1_file import Ros1File
 
-            self._add("ros1", Ros1File(file))
+            self._add("ros1", Ros1File(file, salvage=self.salvage, watch=self.watch))
 
     def _open_compressed(self, file: Path) -> None:
         folder = tempfile.TemporaryDirectory(prefix="restock-")

@@ -1,4 +1,8 @@
-"""ROS 1 bags: `rosbags` reads their index; each chunk is read once, in the order of the file."""
+"""ROS 1 bags: `rosbags` reads their index; each chunk is read once, in the order of the file.
+
+A bag that was cut short has no index: what it holds is found by walking its chunks, which carry
+their own message definitions.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +11,46 @@ import io
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import lz4.frame
 import numpy as np
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
 from rosbags.rosbag1 import Reader, ReaderError
-from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType
+from rosbags.rosbag1.reader import (
+    Chunk,
+    Header,
+    IndexData,
+    RecordType,
+    normalize,
+)
+from rosbags.typesys.msg import normalize_msgtype
 
 from restock.errors import RecordingError
-from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata, Packed
+from restock.ingest.containers.storage import (
+    Damage,
+    Extra,
+    Integrity,
+    Metadata,
+    Packed,
+    Watch,
+    unwatched,
+)
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
 # A chunk's size is the file's claim: what decompresses to more than both is refused.
 PLAUSIBLE_SIZE = 64 << 20
 PLAUSIBLE_RATIO = 1000
+# Of chunks that are read again: who proposes a profile reads topic after topic, and bz2 is slow.
+KEPT_BYTES = 128 << 20
 
+_KNOWN = frozenset(int(kind) for kind in RecordType)
 _MESSAGE, _CONNECTION = bytes([RecordType.MSGDATA]), bytes([RecordType.CONNECTION])
 _BROKEN = (
     *(ReaderError, AssertionError, ValueError, KeyError, IndexError, struct.error),
@@ -33,10 +62,11 @@ class Ros1File:
     """One ROS 1 bag of format 2.0, read only. The format has no checksums: never verified.
 
     Raises:
-        RecordingError: it cannot be opened; a bag that was cut short has no index.
+        RecordingError: it cannot be opened; a bag that was cut short has no index, and is read
+            only with `salvage`.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
         self.integrity: Integrity = "unverified"
         self.damage: list[Damage] = []
         self.notes: list[str] = []
@@ -46,12 +76,17 @@ class Ros1File:
         self._reader = _Bag(path)
         try:
             self._reader.open()
+            walked = None
         except _BROKEN as error:
-            raise RecordingError(
-                f"ROS 1 bag cannot be read: {error}",
-                where=str(path),
-                remedy="`rosbag reindex` repairs a bag whose recording was cut short",
-            ) from error
+            if not salvage:
+                raise RecordingError(
+                    f"ROS 1 bag cannot be read: {error}",
+                    where=str(path),
+                    remedy="`--salvage` reads what can still be read of it; or `rosbag reindex`"
+                    " repairs a bag whose recording was cut short",
+                ) from error
+            self._reader = _Bag(path)
+            walked = self._salvaged(path, error, watch)
         self.channels = {
             connection.id: Channel(
                 connection.id,
@@ -64,7 +99,8 @@ class Ros1File:
             for connection in self._reader.connections
         }
         self.packed = self._reader.packed()
-        self._counts = self._by_index()  # messages of each channel in each chunk
+        # Messages of each channel in each chunk.
+        self._counts = self._by_index() if walked is None else walked.counts
         self.counts = dict.fromkeys(self.channels, 0)
         for counts in self._counts.values():
             for channel in counts.keys() & self.channels.keys():
@@ -74,9 +110,38 @@ class Ros1File:
             for info in self._reader.chunk_infos
             if info.connection_counts
         ] + [(index[0].time, index[-1].time) for index in self._reader.indexes.values() if index]
+        stamps += [] if walked is None else walked.spans
         self.span_ns = (
             (min(low for low, _ in stamps), max(high for _, high in stamps)) if stamps else None
         )
+
+    def _salvaged(self, path: Path, error: Exception, watch: Watch) -> _Walked:
+        """What its chunks hold, where it has no index.
+
+        Raises:
+            RecordingError: nothing.
+        """
+        try:
+            walked = self._reader.open_without_index(watch)
+        except _BROKEN as broken:
+            raise RecordingError(f"ROS 1 bag cannot be read: {broken}", where=str(path)) from broken
+        if not walked.counts:
+            self._reader.close()
+            raise RecordingError(
+                f"ROS 1 bag cannot be read: {error}; and no chunk of it is whole enough to read",
+                where=str(path),
+                remedy="copy or record it again: nothing of it can be salvaged",
+            ) from error
+        self.integrity = "damaged"
+        size = path.stat().st_size
+        beyond = f"; nothing after byte {walked.stop:,} of {size:,}" if walked.stop < size else ""
+        self.damage.append(
+            Damage(
+                f"no index ({error}): read chunk by chunk{beyond}, and how many messages are"
+                " lost is not known"
+            )
+        )
+        return walked
 
     def _by_index(self) -> dict[int, Counter[int]]:
         """Messages per chunk and channel, by the bag's two indexes; by walking a chunk of which
@@ -132,8 +197,22 @@ class Ros1File:
         self._reader.close()
 
 
-def _walk(data: bytes) -> tuple[dict[int, list[tuple[int, int, int]]], int | None]:
-    """Start, end and stamp of every message of a chunk, by connection; and where it is damaged."""
+@dataclass
+class _Walked:
+    """What the chunks of a bag without an index hold."""
+
+    counts: dict[int, Counter[int]] = field(default_factory=dict)  # by position and connection
+    spans: list[tuple[int, int]] = field(default_factory=list)
+    stop: int = 0  # of what was read
+
+
+def _walk(
+    data: bytes, named: dict[int, tuple[dict[bytes, bytes], dict[bytes, bytes]]] | None = None
+) -> tuple[dict[int, list[tuple[int, int, int]]], int | None]:
+    """Start, end and stamp of every message of a chunk, by connection; and where it is damaged.
+
+    `named` gets the connections that it defines, as the fields of a record's header and data.
+    """
     found: dict[int, list[tuple[int, int, int]]] = {}
     at, end = 0, len(data)
     while at < end:
@@ -150,6 +229,9 @@ def _walk(data: bytes) -> tuple[dict[int, list[tuple[int, int, int]]], int | Non
             rows.append((start + 4, stop, seconds * 1_000_000_000 + nanoseconds))
         elif kind != _CONNECTION:
             return found, at
+        elif named is not None:
+            channel = int.from_bytes(fields.get(b"conn", b""), "little")
+            named.setdefault(channel, (fields, _fields(data, start + 4, stop)))
         at = stop
     return found, None
 
@@ -179,6 +261,9 @@ class _Bag(Reader):
         self._size = path.stat().st_size
         self._entries = 0
         self._chunks: dict[int, tuple[str, int]] = {}  # position -> compression, size inside
+        self._cut: set[int] = set()  # chunks of which the file ends before they do
+        self._read: set[int] = set()
+        self._kept: dict[int, bytes] = {}
 
     def read_chunk(self) -> Chunk:
         assert self.bio
@@ -199,6 +284,70 @@ class _Bag(Reader):
         if self._entries > self._size:
             raise ReaderError("its index is larger than the bag")
 
+    def open_without_index(self, watch: Watch) -> _Walked:
+        """Find what its chunks hold, up to where the file makes no sense.
+
+        Raises:
+            ReaderError: it is no bag of format 2.0.
+        """
+        self.bio = self.path.open("rb")
+        if self.bio.readline() != b"#ROSBAG V2.0\n":
+            raise ReaderError("File magic is invalid.")
+        walked = _Walked()
+        named: dict[int, tuple[dict[bytes, bytes], dict[bytes, bytes]]] = {}
+        while (at := self.bio.tell()) < self._size:
+            watch("looking through the file, bytes", at, self._size)
+            try:
+                header = Header.read(self.bio)
+                kind = header.get_uint8("op")
+                if kind != RecordType.CHUNK:
+                    data = self.bio.tell()
+                    length = int.from_bytes(self.bio.read(4), "little")
+                    if data + 4 + length > self._size or kind not in _KNOWN:
+                        break
+                    self.bio.seek(length, 1)
+                    walked.stop = self.bio.tell()
+                    continue
+                self.bio.seek(at)
+                chunk = self.read_chunk()
+            except _BROKEN:
+                break
+            stop = chunk.datapos + chunk.datasize
+            if stop > self._size:
+                self._cut.add(at)
+            self.chunks[at] = chunk
+            try:
+                found, _ = _walk(self.inflated(at), named)
+            except _BROKEN:  # said when it is read
+                found = {}
+            walked.counts[at] = Counter({key: len(rows) for key, rows in found.items()})
+            times = [time for rows in found.values() for _, _, time in rows]
+            walked.spans += [(min(times), max(times))] if times else []
+            walked.stop = min(stop, self._size)
+            self.bio.seek(walked.stop)
+        self._read.clear()  # who reads a bag once keeps nothing of it
+        self.connections = [self._connection(key, *one) for key, one in sorted(named.items())]
+        return walked
+
+    def _connection(
+        self, key: int, outer: dict[bytes, bytes], inner: dict[bytes, bytes]
+    ) -> Connection:
+        """A connection, as a chunk defines it."""
+        texts = {
+            name: (inner.get(name) or outer.get(name) or b"").decode(errors="replace")
+            for name in (b"topic", b"type", b"md5sum", b"message_definition")
+        }
+        return Connection(
+            key,
+            normalize(outer.get(b"topic", b"").decode(errors="replace") or texts[b"topic"]),
+            normalize_msgtype(texts[b"type"]),
+            MessageDefinition(MessageDefinitionFormat.MSG, texts[b"message_definition"]),
+            texts[b"md5sum"],
+            0,
+            ConnectionExtRosbag1(None, None),
+            self,
+        )
+
     def packed(self) -> list[Packed]:
         """Its chunks, by how they are compressed."""
         by: dict[str, list[int]] = {}
@@ -215,11 +364,22 @@ class _Bag(Reader):
         ]
 
     def inflated(self, position: int) -> bytes:
-        """A chunk's records."""
+        """A chunk's records; from the second time on kept, while there is room."""
+        if (kept := self._kept.get(position)) is not None:
+            return kept
+        data = self._inflated(position)
+        room = KEPT_BYTES - sum(map(len, self._kept.values()))
+        if position in self._read and len(data) <= room and self._chunks[position][0] == "bz2":
+            self._kept[position] = data
+        self._read.add(position)
+        return data
+
+    def _inflated(self, position: int) -> bytes:
         assert self.bio
         chunk = self.chunks[position]
         compression, size = self._chunks[position]
-        if chunk.datasize > self._size:
+        cut = position in self._cut
+        if chunk.datasize > self._size and not cut:
             raise ReaderError("it is longer than the bag")
         if size > max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * chunk.datasize):
             raise ReaderError(f"{chunk.datasize:,} bytes that claim to hold {size:,}")
@@ -231,7 +391,7 @@ class _Bag(Reader):
             data = bz2.BZ2Decompressor().decompress(stored, max_length=size + 1)
         else:
             data = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
-        if len(data) != size:
+        if len(data) != size and not (cut and len(data) < size):
             raise ReaderError(f"{len(data):,} bytes, where it claims {size:,}")
         return bytes(data)
 

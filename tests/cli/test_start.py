@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, up_to_the_panel, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock import cli
@@ -216,7 +216,7 @@ def test_an_edited_profile_is_taken_and_never_replaced(
 ) -> None:
     recording = write_bag(Drive(), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), "--mixture", "no_such.toml")
+    argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
     code, document = start(capsys, *argv)
     assert code == 3
     assert document["stages"][-1]["name"] == "mix"
@@ -279,7 +279,7 @@ def test_several_topics_of_commands_are_for_a_person_to_choose_from(
 ) -> None:
     recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")
     out = tmp_path / "out"
-    argv = (str(recording), "--out", str(out), "--mixture", "no_such.toml")
+    argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
     code, document = start(capsys, *argv)
     assert code == 3
     assert document["stages"][-1]["name"] == "propose"

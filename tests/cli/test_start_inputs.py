@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import Drive, columns, scans, write_bag
+from support.driven_robot import Drive, columns, scans, up_to_the_panel, write_bag
 from support.paths import SHARED
 from support.profile_texts import WAREHOUSE
 
@@ -23,7 +23,6 @@ from restock.replay.store.store import Store
 from restock.train.twin.floors.occupancy_map import write_pgm
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
-UP_TO_THE_PANEL = ("--mixture", "no_such.toml")
 
 
 def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
@@ -127,7 +126,7 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(
     assert robot.origin_of("track_m") == "urdf"
     # Once the profile is a person's, a proposal's flags are said to change nothing.
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
-    assert cli.main(["start", *argv, *UP_TO_THE_PANEL]) == 3
+    assert cli.main(["start", *argv, *up_to_the_panel(tmp_path)]) == 3
     assert "--urdf and --footprint are for a proposal" in capsys.readouterr().out
 
 
@@ -190,7 +189,7 @@ def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on
     write_bag(Drive(), bags / "a")
     write_bag(Drive(), bags / "b")
     write_bag(OtherLidar(), bags / "c")
-    argv = (str(bags), "--out", str(out), *UP_TO_THE_PANEL)
+    argv = (str(bags), "--out", str(out), *up_to_the_panel(tmp_path))
     code, document = start(capsys, *argv)
     assert code == 3
     found = document["stages"][0]
@@ -231,9 +230,14 @@ def test_a_damaged_ros1_bag_is_not_asked_for_as_if_nothing_was_named(
 ) -> None:
     cut = tmp_path / "cut.bag"
     cut.write_bytes(b"#ROSBAG V2.0\n" + bytes(500))
-    assert cli.main(["start", str(cut), "--out", str(tmp_path / "mine")]) == 3
+    argv = ["start", str(cut), "--out", str(tmp_path / "mine")]
+    assert cli.main(argv) == 3
     said = " ".join(capsys.readouterr().out.split())
     assert "ROS 1 bag cannot be read" in said
+    assert "add --salvage to this command" in said
+    assert cli.main([*argv, "--salvage"]) == 3
+    said = " ".join(capsys.readouterr().out.split())
+    assert "nothing of it can be salvaged" in said
     assert "what can be done for each is said above" in said
 
 
@@ -244,3 +248,31 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
         file.write_text(WAREHOUSE.replace('goal = "route"', f'goal = "{goal}"'))
         assert load_profile(file).task.goal == goal
         assert practice_settings(file) == settings
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "why"),
+    [
+        ("--mixture", "coverag", "one of coverage, exposure"),
+        ("--profile", "no_such.toml", "no such profile"),
+        ("--typestore", "humbel", "no type store named 'humbel'"),
+        ("--footprint", "wide", "--footprint"),
+        ("--minutes", "nan", "--minutes"),
+        ("--out", "a_file", "name a folder with --out"),
+    ],
+)
+def test_what_is_wrong_with_an_option_is_said_before_the_first_stage(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    option: str,
+    value: str,
+    why: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a_file").touch()
+    assert cli.main(["start", "no_bag", "--out", "out", option, value]) == 2
+    said = capsys.readouterr()
+    assert why in said.err
+    assert said.out == ""
+    assert not Path("out").exists()

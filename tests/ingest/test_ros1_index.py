@@ -11,6 +11,8 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.paths import SHARED
 
+from restock.errors import RecordingError
+from restock.ingest.containers import ros1_file
 from restock.ingest.containers.open_recording import open_recording
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -94,3 +96,75 @@ def test_the_index_of_a_huskys_bag(other: int, tmp_path: Path) -> None:
     (tmp_path / "run.bag").write_bytes(content)
     counts, messages, lost = read(tmp_path / "run.bag")
     assert (sum(counts.values()), messages, lost) == (16806, 16806, 0)
+
+
+def test_a_bag_that_was_cut_short_is_read_up_to_the_cut(bag: Path) -> None:
+    whole = bag.read_bytes()
+    with open_recording(bag) as recording:
+        values = recording.read({"/number": ["data"]})["/number"].fields["data"]
+    bag.write_bytes(whole[: int(0.6 * len(whole))])
+    with pytest.raises(RecordingError, match="index") as refused:
+        open_recording(bag)
+    assert "--salvage" in (refused.value.remedy or "")
+    told: list[str] = []
+    with open_recording(bag, salvage=True, watch=lambda *how: told.append(how[0])) as recording:
+        columns = recording.read({"/number": ["data"], "/flag": []})
+        assert recording.integrity == "damaged"
+        assert recording.topics["/number"].expected == len(columns["/number"])
+        assert any("no index" in loss.what for loss in recording.damage)
+    part = columns["/number"].fields["data"]
+    assert 0.5 * ROWS < len(part) < ROWS
+    assert np.array_equal(part, values[: len(part)])
+    assert abs(len(columns["/flag"]) - len(part)) <= 1
+    assert "looking through the file, bytes" in told
+
+
+@pytest.mark.parametrize("keep", [0, 10, 13, 4117])
+def test_a_bag_without_a_whole_chunk_is_refused(bag: Path, keep: int) -> None:
+    bag.write_bytes(bag.read_bytes()[:keep])
+    with pytest.raises(RecordingError):
+        open_recording(bag, salvage=True)
+
+
+def test_every_cut_is_read_or_refused(bag: Path) -> None:
+    whole, before = bag.read_bytes(), 0
+    for size in range(4000, len(whole), 997):
+        bag.write_bytes(whole[:size])
+        try:
+            with open_recording(bag, salvage=True) as recording:
+                found = sum(
+                    len(one) for one in recording.read({"/flag": [], "/number": []}).values()
+                )
+        except RecordingError:
+            found = 0
+        assert before <= found <= 2 * ROWS
+        before = found
+    assert before == 2 * ROWS
+
+
+def test_a_chunk_of_bz2_that_is_read_again_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "packed.bag"
+    writer = Writer(path)
+    writer.set_compression(writer.CompressionFormat.BZ2)
+    with writer:
+        flag = writer.add_connection("/flag", "std_msgs/msg/Bool", typestore=TYPES)
+        writer.write(flag, 1, b"\x01")
+    unpacked: list[int] = []
+    original = ros1_file._Bag._inflated
+
+    def inflated(self: ros1_file._Bag, position: int) -> bytes:
+        unpacked.append(position)
+        return original(self, position)
+
+    monkeypatch.setattr(ros1_file._Bag, "_inflated", inflated)
+    with open_recording(path) as recording:
+        for _ in range(5):
+            assert len(recording.read({"/flag": []})["/flag"]) == 1
+    assert len(unpacked) == 2
+    monkeypatch.setattr(ros1_file, "KEPT_BYTES", 0)
+    with open_recording(path) as recording:
+        for _ in range(5):
+            recording.read({"/flag": []})
+    assert len(unpacked) == 2 + 5

@@ -235,3 +235,10 @@ def _set(types: Any, message: Any, path: str, value: Any) -> None:
     for parent in parents:
         message = getattr(message, parent)
     setattr(message, last, value.item() if isinstance(value, np.generic) else value)
+
+
+def up_to_the_panel(folder: Path) -> tuple[str, str]:
+    """Options of `restock start` that end it at the panel: a mixture of what no log has."""
+    path = folder / "of_nothing.toml"
+    path.write_text('[[strata]]\nname = "none"\nwhere = "no_such_column = 1"\nshare = 1.0\n')
+    return "--mixture", str(path)

@@ -281,11 +281,13 @@ def windows_of(run: Run) -> list[Window]:
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
     if not rows:
-        raise RunError(
-            "has no evaluation to diagnose",
-            where=str(run.path),
-            remedy="let it run past an evaluation (evaluation.every_env_steps)",
-        )
+        remedy = "let it run past an evaluation (evaluation.every_env_steps)"
+        if not run.document["config"]["env"].get("twin", True):
+            remedy = (
+                "it learned on the logs alone, where nothing is evaluated:"
+                f" `restock eval {run.path} --on-logs own` judges it"
+            )
+        raise RunError("has no evaluation to diagnose", where=str(run.path), remedy=remedy)
     bound = _value_bound(run)
     steps = sorted({row["gradient_steps"] for row in rows})
     return [_window([row for row in rows if row["gradient_steps"] == at], bound) for at in steps]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import visible
@@ -20,6 +22,8 @@ Row = Mapping[str, Any]
 
 
 PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
+FAR = 3  # columns between two columns of a table, where there is room
+NARROW = 8  # columns that a cell of long words is left with at least, on a narrow terminal
 SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, for who searches it
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
@@ -97,8 +101,10 @@ def print_table(
     """A table on stdout, its title on a line of its own; numbers to the right.
 
     As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe names of
-    one word and cells up to SHORT are not: where columns leave too little, the table is wider.
-    Words that say how something is (fail, pass) are coloured on a terminal.
+    one word and cells up to SHORT are not: where columns leave too little, the table is wider. On a
+    narrow terminal columns stand closer, headers are wrapped at `_` and spaces, and words are cut
+    only where nothing else is left. Words that say how something is (fail, pass) are coloured on a
+    terminal.
     """
     names = list(columns if columns is not None else rows[0] if rows else ())
     if not sys.stdout.isatty() and _fits(rows, names):
@@ -109,21 +115,25 @@ def print_table(
     from rich import box
     from rich.table import Table
 
-    table, console = Table(box=box.SIMPLE_HEAD, pad_edge=False), stdout()
-    piped, least = not sys.stdout.isatty(), 0
-    for name in names:
+    console, piped, least = stdout(), not sys.stdout.isatty(), 0
+    layout = _Layout.of(rows, names, console.width)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, layout.apart - 1, 0, 0))
+    if layout.apart == FAR:
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name, header, width in zip(names, layout.headers, layout.widths, strict=True):
         numeric = any(_is_number(row[name]) for row in rows)
         texts = [name, *(cell(row[name]) for row in rows)]
         longest = max(_longest(text.split("\n")) for text in texts)
-        word = _longest([text for text in texts if len(text.split()) == 1])
+        whole = _longest([text for text in texts if len(text.split()) == 1])
         table.add_column(
-            name,
+            name if piped else header,
             justify="right" if numeric else "left",
             overflow="fold",
-            no_wrap=numeric or (piped and longest <= SHORT),
-            min_width=word if piped else None,
+            no_wrap=(numeric and width is None) or (piped and longest <= SHORT),
+            min_width=whole if piped else None,
+            width=None if piped else width,
         )
-        least += 3 + (longest if numeric else max(word, min(longest, SHORT)))
+        least += 3 + (longest if numeric else max(whole, min(longest, SHORT)))
     if piped:
         console.width = max(PIPE_WIDTH, least)
     for row in rows:
@@ -141,6 +151,75 @@ def print_table(
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
     sys.stdout.write(text.strip("\n") + "\n")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is fitted into a terminal that is too narrow for it."""
+
+    apart: int  # columns between two columns
+    headers: list[str]
+    widths: list[int | None]
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], names: Sequence[str], width: int) -> _Layout:
+        """As it is where it fits; closer, and with wrapped headers, where not."""
+        texts = [[cell(row[name]) for row in rows] for name in names]
+        lines = [[line for text in some for line in text.split("\n")] for some in texts]
+        full = [_longest([name, *some]) for name, some in zip(names, lines, strict=True)]
+        width -= 2  # its edges
+        if sum(full) + FAR * (len(names) - 1) <= width:
+            return cls(FAR, list(names), [None] * len(names))
+        headers, least = [], []
+        for name, some in zip(names, lines, strict=True):
+            numeric = any(_is_number(row[name]) for row in rows)
+            cells = _longest(some if numeric else [word for line in some for word in line.split()])
+            headers.append(_parted(name, cells))
+            least.append(max(cells, _longest(headers[-1].split("\n"))))
+        for apart in (FAR, 2, 1):
+            if (room := width - apart * (len(names) - 1)) >= sum(least):
+                break
+        # Too narrow even so: the columns with the longest words give way.
+        for place in sorted(range(len(names)), key=lambda place: -least[place]):
+            least[place] -= max(min(sum(least) - room, least[place] - NARROW), 0)
+        return cls(apart, headers, list(_filled(least, full, room)))
+
+
+def _filled(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
+    """Widths between the least and what is wanted: the columns share the room that is left."""
+    widths = list(least)
+    while (left := room - sum(widths)) > 0:
+        short = [place for place, width in enumerate(widths) if width < full[place]]
+        if not short:
+            break
+        for place in short[:left]:
+            widths[place] += max(min(left // len(short), full[place] - widths[place]), 1)
+    return widths
+
+
+def _parted(name: str, width: int) -> str:
+    """A header as lines, parted at underscores and spaces; no narrower than its longest part."""
+    parts = re.findall(r"[^_ ]+[_ ]*|[_ ]+", name)
+    width = max([width, *(len(part.rstrip()) for part in parts)])
+    lines = [""]
+    for part in parts:
+        if lines[-1] and len(lines[-1] + part.rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip(" ") for line in lines)
+
+
+def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
+    """Whether a table of these rows would have to be fitted into the terminal, or a pipe."""
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    widths = (max([len(name), *(len(cell(row[name])) for row in rows)]) + FAR for name in names)
+    return sum(widths) > table_width()
+
+
+def told(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
+    """The columns that any row has a value in, for tables whose columns often have none."""
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    return [name for name in names if any(row[name] not in (None, "") for row in rows)]
 
 
 def _longest(parts: Sequence[str]) -> int:

@@ -209,7 +209,7 @@ def show(outcome: IngestResult) -> None:
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
     used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]
     columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS, "reason"]
-    output.print_table(used, columns)
+    output.print_table(used, output.told(used, columns))
     if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
         topics = _count(len(rest), "further topic")
@@ -255,25 +255,23 @@ def show(outcome: IngestResult) -> None:
             "": score.shortfall if score else "",
         }
 
-    output.print_table(
-        [
-            {
-                "condition": name,
-                "transitions": count,
-                "named by it": outcome.named[name],
-                "share": outcome.named[name] / max(row["transitions"], 1),
-                **against_truth(name),
-            }
-            for name, count in outcome.conditions.items()
-        ]
-    )
+    labels = [
+        {
+            "condition": name,
+            "transitions": count,
+            "named by it": outcome.named[name],
+            "share": outcome.named[name] / max(row["transitions"], 1),
+            **against_truth(name),
+        }
+        for name, count in outcome.conditions.items()
+    ]
+    output.print_table(labels, output.told(labels))
     if outcome.exposures:  # whatever came of them
-        output.print_table(
-            [
-                {"exposure": name, "transitions": count, **against_truth(name)}
-                for name, count in outcome.exposures.items()
-            ]
-        )
+        labels = [
+            {"exposure": name, "transitions": count, **against_truth(name)}
+            for name, count in outcome.exposures.items()
+        ]
+        output.print_table(labels, output.told(labels))
     for line in _unknown(row):
         console.print(line, markup=False, soft_wrap=True)
     console.print(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -99,19 +100,24 @@ class ProfileCommand:
         chosen, left_out = drives_to_read([r for path in self.paths for r in recordings_in(path)])
         with ExitStack() as opened:
             recordings = self._readable(chosen, opened)
-            proposal = propose_for_drives(
-                recordings,
-                re.sub(r"\W+", "_", stem).strip("_") or "robot",
-                footprint=footprint,
-                urdf=self.urdf,
-                odometry_as_command=self.odometry_as_command,
-            )
+            with output.progress("proposing", None) as advance:
+                for recording in recordings:
+                    recording.watch = advance.part
+                proposal = propose_for_drives(
+                    recordings,
+                    re.sub(r"\W+", "_", stem).strip("_") or "robot",
+                    footprint=footprint,
+                    urdf=self.urdf,
+                    odometry_as_command=self.odometry_as_command,
+                )
         if left_out:
             output.say(
                 f"of {len(chosen) + left_out:,} recordings the {len(chosen)} largest are read"
             )
         if self.out is not None:
             write_text(self.out, proposal.toml)
+            rows = f"{proposal.transitions:,} transitions of {proposal.ticks:,} ticks"
+            output.say(f"wrote {self.out}" + (f": {rows}" if proposal.ticks else ""))
         if self.json:
             output.print_json(
                 {
@@ -133,6 +139,9 @@ class ProfileCommand:
             output.say(str(each))
         for problem in proposal.problems:
             sys.stderr.write(f"restock: {', '.join(self.paths)}: cannot be used yet: {problem}\n")
+        if self.out is not None and not proposal.problems:
+            checking = shlex.join(["profile", "check", str(self.out), str(chosen[0])])
+            output.say(f"next: restock {checking}")
         return ExitCode.LOSSY if proposal.problems else ExitCode.OK
 
     def _readable(self, paths: Sequence[Path], opened: ExitStack) -> list[Recording]:
@@ -181,12 +190,14 @@ class ProfileCommand:
         advice: list[str] = []
         if not problems:
             try:
-                outcome = ingest(
-                    *(self.paths[1], profile),
-                    store=None,
-                    typestore=self._typestore,
-                    salvage=self.salvage,
-                )
+                with output.progress("checking", None) as advance:
+                    outcome = ingest(
+                        *(self.paths[1], profile),
+                        store=None,
+                        typestore=self._typestore,
+                        salvage=self.salvage,
+                        watch=advance.part,
+                    )
             except RecordingError as error:
                 problems = [error.what]
             advice = self._advice(profile, outcome)
@@ -206,11 +217,16 @@ class ProfileCommand:
 
     def _advice(self, profile: Profile, outcome: IngestResult | None) -> list[str]:
         """What of the profile removes most rows or labels most of them, and what to try."""
+        from restock.cli import output
         from restock.ingest.propose.trial import try_profile
         from restock.ingest.steps.needs import as_recorded, read_topics
         from restock.ingest.task.conditions import NOMINAL
 
-        with self._open(self.paths[1]) as recording:
+        with (
+            self._open(self.paths[1]) as recording,
+            output.progress("looking for what would give more rows", None) as advance,
+        ):
+            recording.watch = advance.part
             as_read = as_recorded(profile, recording.topics)
             trial = try_profile(as_read, read_topics(recording, as_read))
         lines = [str(each) for each in trial.advice]

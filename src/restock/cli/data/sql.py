@@ -101,7 +101,7 @@ class SqlCommand:
         """A table, or the rows one below the other where that would not fit."""
         from restock.cli import output
 
-        if len(rows) <= EXPANDED_ROWS and _too_wide(rows, columns):
+        if len(rows) <= EXPANDED_ROWS and output.too_wide(rows, columns):
             for number, row in enumerate(rows, start=1):
                 lines = [
                     {"column": name, "value": output.cell(row[name]).replace(r"\[", "[")}
@@ -152,13 +152,3 @@ def _cut(row: dict[str, Any]) -> dict[str, Any]:
         else value
         for name, value in row.items()
     }
-
-
-def _too_wide(rows: list[dict[str, Any]], columns: list[str]) -> bool:
-    """Whether a table of these rows would not fit side by side."""
-    from restock.cli import output
-
-    widths = (
-        max([len(name), *(len(output.cell(row[name])) for row in rows)]) + 3 for name in columns
-    )
-    return sum(widths) > output.table_width()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from restock.replay.trace.origin import Origin
 
 _LONG = 6  # entries of a list that are printed
+# Of audited rows, on a terminal that is too narrow for all: with `row` one gets the rest.
+_NARROW = ("row", "source", "condition", "age_days", "action", "reward", "q", "td")
 _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
 
 
@@ -72,7 +75,11 @@ class TraceCommand:
             if self.json:
                 output.print_json(listed)
                 return
-            output.print_table(listed, title="audited rows, largest TD error first")
+            narrow = sys.stdout.isatty() and output.too_wide(listed)
+            columns = _NARROW if narrow else None
+            output.print_table(listed, columns, title="audited rows, largest TD error first")
+            if narrow:
+                output.say("their other columns go to a wider terminal, a file or a pipe")
             if listed:
                 output.say(f"`restock trace {self.place} {listed[0]['row']}` follows one")
             return

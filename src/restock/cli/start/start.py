@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -89,8 +90,8 @@ class StartCommand:
 
         if not self.paths:
             raise RecordingError("no recording given", remedy="restock start BAG --out DIR")
-        if self.minutes <= 0:
-            raise ConfigError(f"must be above 0, got {self.minutes:g}", where="--minutes")
+        if not 0 < self.minutes < math.inf:
+            raise ConfigError(f"must be a number above 0, got {self.minutes:g}", where="--minutes")
         self._check()
         console = stderr() if self.json else stdout()
 
@@ -133,10 +134,29 @@ class StartCommand:
             from restock.ingest.task.tags import parse_tags
 
             parse_tags(self.tag, empty=True)
-        if self.definitions is not None:
-            from restock.ingest.containers.open_recording import with_definitions
+        if self.out.exists() and not self.out.is_dir():
+            raise ConfigError(
+                "is a file", where=str(self.out), remedy="name a folder with --out: it may be new"
+            )
+        from restock.ingest.containers.open_recording import with_definitions
+        from restock.ingest.decoding.definitions import refuse_unknown
+        from restock.replay.mixture.mixture import load_mixture
 
-            with_definitions(self.typestore, self.definitions)
+        if (types := with_definitions(self.typestore, self.definitions)) is not None:
+            refuse_unknown(types)
+        load_mixture(self.mixture)
+        if self.profile is not None:
+            from restock.ingest.profile.profile import load_profile
+
+            load_profile(self.profile)
+        if self.footprint is not None:
+            from restock.ingest.propose.footprint import parse_footprint
+
+            parse_footprint(self.footprint)
+        if self.device != "cpu":
+            from restock.train.dqn.learner import open_device
+
+            open_device(self.device)
         if self.urdf is not None:
             from restock.ingest.propose.robot_lines import check_urdf
 
