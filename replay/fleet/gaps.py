@@ -23,6 +23,7 @@ from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.panel.plan import LOGS, PanelPlan, plan_panel
+from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
 Counted = Literal["rows", "episodes"]
@@ -160,6 +161,7 @@ def _of_audits(
             by = "audit few_effective_episodes"
             gaps.append(Gap(by, cell, "episodes", needed, episodes, met))
     least = limits["missing_cells"].get("min_rows", 0)
+    install_named(connection, "cells_below")
     cells = connection.execute("FROM cells_below(?)", [least]).fetchall() if least else []
     for condition, action, _, _, rows in cells:
         cell = {"condition": condition, "action": action}

@@ -1,8 +1,8 @@
 """The views and macros of a store: their SQL, and which of them a query needs.
 
-DuckDB binds a view when it is made, with all that it is made of: to make all of them takes longer
-than most queries over a small store. So a store's connection gets those that a text names, and
-those that they name in turn.
+DuckDB binds a macro when it is made, with all that it is made of, and lists what is there: to make
+all of them takes longer than most queries over a small store. So a store's connection gets those
+that a text names, and those that they name in turn; its views are bound where a query uses them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MACROS = (
 )
 SUMMARIES = "summaries.sql"  # in place of others of the same name, where manifests have summaries
 # What `Store.connection` has from the start, for those who ask it without `install_named`.
-COMMON = ("rows.sql", "views.sql", "labels.sql", "macros.sql", "corrections.sql")
+COMMON = ("rows.sql", "views.sql", "labels.sql", "corrections.sql")
 # Views that are held in memory where many queries follow. Of any store, those of few rows that scan
 # many and are asked for more than once; of FEW_ROWS, those that others are made of, too: to bind a
 # table takes a tenth of the time, and its columns are read once.
@@ -69,6 +69,7 @@ _LISTS = {
     "sqlite_master",
 }
 _BEGINS = re.compile(r"^CREATE OR REPLACE (?:VIEW|MACRO) (\w+)", re.MULTILINE)
+_VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 
 class Definitions:
@@ -213,7 +214,7 @@ def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> Non
 
 def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
     """Create those of COMMON, in the schema in use, over that of one store."""
-    connection.execute(_of_store(observation_type, COMMON))
+    connection.execute("\n".join(_statements(_of_store(observation_type, COMMON)).values()))
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
@@ -247,7 +248,8 @@ def _statements(text: str) -> Mapping[str, str]:
     """Each view and macro that a text makes, by its name."""
     begins = [*_BEGINS.finditer(text)]
     ends = [*(one.start() for one in begins[1:]), len(text)]
-    return {one[1]: text[one.start() : end] for one, end in zip(begins, ends, strict=True)}
+    parts = ((one[1], text[one.start() : end]) for one, end in zip(begins, ends, strict=True))
+    return {name: _VIEW.sub(r"\1 WITH (DEFER_BINDING) AS", part, count=1) for name, part in parts}
 
 
 @cache

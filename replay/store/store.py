@@ -133,7 +133,7 @@ class Store:
 
     @property
     def connection(self) -> duckdb.DuckDBPyConnection:
-        """With the common views and macros; those that take long to bind `install_named` makes."""
+        """With the common views; macros, and views of fewer uses, `install_named` makes."""
         self._definitions.make_common()
         return self.bare
 
@@ -250,9 +250,7 @@ class Store:
         return f"FLOAT[{size}]" if size else "FLOAT[]"
 
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Views and macros of this store in a schema of another connection, beside other stores'.
-
-        Those on demand are not there.
+        """The common views of this store in a schema of another connection, beside other stores'.
 
         Raises StoreError where a file is missing or damaged.
         """

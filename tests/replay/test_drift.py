@@ -12,11 +12,14 @@ import pytest
 from scipy import stats
 from support.fleets import SyntheticRobot, fleet, wander
 
+from restock.replay.store.definitions import install_named
+
 WEEKS = ["2026-03-02", "2026-03-09", "2026-03-16", "2026-03-23"]
 WORN = SyntheticRobot("b", changes={"odometry_scale": 0.94})
 
 
 def rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, Any]]:
+    install_named(connection, query)
     found: list[dict[str, Any]] = connection.sql(query).to_arrow_table().to_pylist()
     return found
 
@@ -260,6 +263,7 @@ def test_signals_that_a_robot_lacks_are_not_made_up() -> None:
 
 def test_the_signals_of_a_profile_are_compared_too() -> None:
     connection = fleet([SyntheticRobot("a"), SyntheticRobot("b")], recordings=3)
+    install_named(connection, "transitions, recordings")
     # A battery of robot b that is weaker from week three on.
     connection.execute(
         "CREATE TABLE volts AS SELECT *, (24 + sin(transition_id) - 2 * (robot = 'b' AND"

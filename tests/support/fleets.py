@@ -15,8 +15,7 @@ import pyarrow as pa
 from deltalake import write_deltalake
 from scipy.signal import lfilter
 
-from restock.replay.store.definitions import install
-from support.stores import TASK, manifest, recording_transitions
+from support.stores import TASK, manifest, recording_transitions, views_over
 
 MONDAY_NS = 1_772_409_600 * 10**9  # 2026-03-02
 WEEK_NS = 7 * 86_400 * 10**9
@@ -39,12 +38,12 @@ class SyntheticRobot:
 
 
 def fleet(robots: list[SyntheticRobot], **size: int) -> duckdb.DuckDBPyConnection:
-    """A connection with the views of a store of this fleet, of a size as `drives` has it."""
+    """A connection with the rows of a store of this fleet, of a size as `drives` has it, and those
+    of its views that `install_named` is asked for."""
     made = drives(robots, **size)
     connection = duckdb.connect()
-    connection.register("stored_transitions", pa.concat_tables(rows for rows, _ in made))
-    connection.register("stored_recordings", pa.concat_tables(row for _, row in made))
-    install(connection, "FLOAT[]")
+    transitions = pa.concat_tables(rows for rows, _ in made)
+    views_over(connection, transitions, pa.concat_tables(row for _, row in made))
     return connection
 
 

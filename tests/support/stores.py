@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from itertools import zip_longest
 from pathlib import Path
 
+import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
@@ -16,6 +17,8 @@ from restock.ingest.task.conditions import labels_version, primary, shipped
 from restock.ingest.task.scan import Body
 from restock.ingest.task.schema import STEP_BITS, recording_schema, transition_schema
 from restock.ingest.task.task import Task
+from restock.replay.store.definitions import Definitions
+from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
 TASK = Task(
@@ -166,6 +169,23 @@ def write_store(
         write_deltalake(str(path / "recordings"), row, mode="append")
         write_deltalake(str(path / "transitions"), transitions, mode="append")
     return path
+
+
+def views_over(
+    connection: duckdb.DuckDBPyConnection,
+    transitions: pa.Table,
+    recordings: pa.Table,
+    observation_type: str = "FLOAT[]",
+) -> Definitions:
+    """The views of a store over these rows, no summaries: those `install_named` is asked for."""
+    with passed_in(connection, given=transitions, manifests=recordings):
+        connection.execute(
+            "CREATE TABLE stored_transitions AS FROM given;"
+            " CREATE TABLE stored_recordings AS FROM manifests;"
+            " CREATE TABLE stored_ingests AS SELECT recording_id, ingest_id, count(*) AS rows,"
+            " recording_id || '/' || ingest_id || '.parquet' AS file FROM given GROUP BY ALL"
+        )
+    return Definitions(connection, observation_type)
 
 
 def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.Table]:
