@@ -8,6 +8,7 @@ Beside that DuckDB runs it without access to files and with its settings locked.
 
 from __future__ import annotations
 
+import atexit
 import json
 from collections.abc import Iterator
 from functools import cache, lru_cache
@@ -53,10 +54,20 @@ def select_of(columns: str, source: str = "steps") -> str:
     return f"SELECT {columns} FROM {source} {WINDOW} ORDER BY row_"
 
 
+@cache
+def sandbox() -> duckdb.DuckDBPyConnection:
+    """A database for all conditions, of which each use takes a `cursor`: opening one takes longer
+    than the labels of an episode."""
+    atexit.register(sandbox.cache_clear)  # nanobind complains of what outlives its module
+    connection = duckdb.connect(config=SANDBOX)
+    connection.execute("SET lock_configuration = true").fetchall()
+    return connection
+
+
 @lru_cache(maxsize=1024)
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
     """Why this SQL may not be a condition's, or None. Whether it binds is DuckDB's to say."""
-    with duckdb.connect(config=SANDBOX) as connection:
+    with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR)"
         text = connection.execute(query, [select_of(f"({sql}\n)")]).fetchall()[0][0]
     try:
@@ -161,7 +172,7 @@ def _constant(part: dict[str, Any] | None) -> bool:
 @cache
 def _outside() -> frozenset[str]:
     """Names of functions whose result does not follow from their arguments alone."""
-    with duckdb.connect(config=SANDBOX) as connection:
+    with sandbox().cursor() as connection:
         rows = connection.sql(
             "SELECT DISTINCT function_name, function_type, stability FROM duckdb_functions()"
         ).fetchall()

@@ -45,7 +45,7 @@ from msgspec import Meta
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.task.condition_files import settings_of
-from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, select_of
+from restock.ingest.task.condition_sql import WINDOW, refusal, sandbox, select_of
 from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.toml import Checked
 
@@ -308,10 +308,9 @@ def _evaluate(
     columns: Columns = {}
     if not asked:
         return columns
-    with duckdb.connect(config=SANDBOX) as connection:
+    with sandbox().cursor() as connection:
         numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
         connection.register("steps", numbered)
-        connection.execute("SET lock_configuration = true").fetchall()
         for several in together.values():
             try:
                 columns |= _query(connection, several)
