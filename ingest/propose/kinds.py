@@ -21,8 +21,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.inputs import MOTION
-from restock.ingest.propose.footprint import descriptions
-from restock.ingest.propose.roles import KINDS, Kind, topics_for, usable_topics
+from restock.ingest.propose.evidence.footprint import descriptions
+from restock.ingest.propose.evidence.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.urdf.description import read_description
 

@@ -4,97 +4,35 @@ from __future__ import annotations
 
 import json
 import textwrap
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from restock.arrays import F64
 from restock.errors import visible
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
-from restock.ingest.propose.cameras import CameraTopic, camera_lines
-from restock.ingest.propose.candidates import Candidate
-from restock.ingest.propose.clock_choice import ClockChoice, Gaps
-from restock.ingest.propose.command_choice import CommandChoice
-from restock.ingest.propose.driven.command_hold import CommandHold
-from restock.ingest.propose.driven.steering import DriveEvidence, TurnReading
-from restock.ingest.propose.footprint import GUESS, Footprint
-from restock.ingest.propose.goal_choice import GoalChoice
-from restock.ingest.propose.motion_choice import MotionChoice, fix_lines, fix_noise_lines
-from restock.ingest.propose.robot_lines import RobotProposal
-from restock.ingest.propose.roles import FIX, KINDS, LATCHED, REQUIRED, FrameGuess, Kind, Roles
-from restock.ingest.propose.scanned_outline import ScannedOutline, range_lines
+from restock.ingest.propose.evidence.cameras import camera_lines
+from restock.ingest.propose.evidence.clock_choice import ClockChoice
+from restock.ingest.propose.evidence.commands import Commands
+from restock.ingest.propose.evidence.footprint import GUESS
+from restock.ingest.propose.evidence.gather import Evidence
+from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
+from restock.ingest.propose.evidence.robot_lines import RobotProposal
+from restock.ingest.propose.evidence.roles import (
+    FIX,
+    KINDS,
+    LATCHED,
+    REQUIRED,
+    Kind,
+    Roles,
+)
+from restock.ingest.propose.evidence.scanned_outline import range_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.conditions import shipped, unseen
 from restock.ingest.task.robot import Robot
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
-
-
-@dataclass(frozen=True)
-class Commands:
-    """What the commands of a recording say about the robot."""
-
-    speed_mps: float = 0.5
-    yaw_rate_radps: float = 1.0
-    backs: bool = False
-    count: int = 0
-    topic: str = ""
-    measured: bool = False  # they are odometry, in place of commands
-    steered: bool = False  # by the angle of the front wheels, as a car
-    wheelbase_m: float = 0.3
-    wheelbase_known: bool = False
-    reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
-
-    def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
-        """The same for a robot that stays below these commands; None: it does what they say."""
-        return replace(
-            self,
-            speed_mps=speed_mps or self.speed_mps,
-            yaw_rate_radps=yaw_rate_radps or self.yaw_rate_radps,
-            reached=(speed_mps, yaw_rate_radps),
-        )
-
-    def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
-        """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
-        if not len(speed_mps):
-            return self
-        fast, sharp = (float(np.percentile(np.abs(c), 98)) for c in (speed_mps, yaw_rate_radps))
-        return replace(
-            self,
-            speed_mps=fast or Commands.speed_mps,
-            yaw_rate_radps=sharp or Commands.yaw_rate_radps,
-            backs=bool((speed_mps < -0.05 * fast).any()),
-        )
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What a recording says of its robot."""
-
-    recording: Recording
-    roles: Roles
-    frames: FrameGuess | None
-    poses_from_frames: bool
-    motion: MotionChoice | None  # where no topic has the wheels' speeds
-    commands: Commands
-    chosen: CommandChoice
-    hold: CommandHold
-    turned: DriveEvidence  # whether it steers as a car, where nothing describes it
-    turns: TurnReading | None  # of Twists, where the robot steers as a car
-    paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
-    clock: ClockChoice
-    gaps: Gaps
-    driven_s: float
-    footprint: Footprint
-    footprint_notes: list[str]
-    outline: ScannedOutline | None  # where its scans say something of it
-    goal: GoalChoice
-    signals: list[Candidate]
-    cameras: list[CameraTopic]
-    robot: RobotProposal
 
 
 def profile_lines(

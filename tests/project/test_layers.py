@@ -27,7 +27,10 @@ MAY_IMPORT = {
     "ingest/task": "",
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": "camera containers decoding profile propose/driven steps task urdf",
+    "ingest/propose": "containers decoding profile propose/driven propose/evidence steps task urdf",
+    "ingest/propose/evidence": (
+        "camera containers decoding profile propose/driven steps task urdf"
+    ),
     "ingest/propose/driven": "steps task",
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",
@@ -82,8 +85,8 @@ MAY_IMPORT = {
         "twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
     ),
     "train/twin/survey": (
-        "twin/floors replay/store ingest/containers ingest/decoding ingest/profile ingest/propose"
-        " ingest/steps ingest/task ingest/urdf"
+        "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
+        " ingest/propose/evidence ingest/steps ingest/task ingest/urdf"
     ),
     "train/twin/calibration": (
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
@@ -98,9 +101,10 @@ MAY_IMPORT = {
     "report/study": "look",
     "cli": "ingest/steps replay/store",
     "cli/data": (
-        "cli ingest ingest/containers ingest/profile ingest/propose ingest/steps ingest/store"
-        " ingest/task replay replay/export replay/fleet replay/mixture replay/panel replay/review"
-        " replay/store report train/comparison train/dqn train/evaluation train/twin/physics"
+        "cli ingest ingest/containers ingest/profile ingest/propose ingest/propose/evidence"
+        " ingest/steps ingest/store ingest/task replay replay/export replay/fleet replay/mixture"
+        " replay/panel replay/review replay/store report train/comparison train/dqn"
+        " train/evaluation train/twin/physics"
     ),
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace train"
@@ -114,14 +118,15 @@ MAY_IMPORT = {
     "cli/pipeline": ("cli ingest/store replay replay/fleet replay/store train/evaluation"),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
-        "cli ingest/containers ingest/profile ingest/propose ingest/task replay/panel replay/trace"
-        " train/dqn train/run train/twin/env train/twin/floors"
+        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
+        " replay/mixture replay/panel replay/trace train/dqn train/run train/twin/env"
+        " train/twin/floors"
     ),
     "cli/twin": (
-        "cli report report/run ingest/containers ingest/profile ingest/propose ingest/store"
-        " ingest/task replay/fleet replay/store train/evaluation train/twin/calibration"
-        " train/twin/env train/twin/floors train/twin/physics train/twin/recording"
-        " train/twin/survey"
+        "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"
+        " ingest/store ingest/task replay/fleet replay/store train/evaluation"
+        " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
+        " train/twin/recording train/twin/survey"
     ),
 }
 

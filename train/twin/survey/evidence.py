@@ -13,7 +13,7 @@ from restock.errors import RestockError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.footprint import Footprint, footprint_of
+from restock.ingest.propose.evidence.footprint import Footprint, footprint_of
 from restock.replay.store.store import is_store
 from restock.train.twin.floors.occupancy_grid import FREE, OccupancyGrid
 from restock.train.twin.floors.occupancy_map import read_grid

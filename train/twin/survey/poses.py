@@ -16,7 +16,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Frames, Profile
-from restock.ingest.propose.roles import (
+from restock.ingest.propose.evidence.roles import (
     FIX,
     FIX_FIELDS,
     KINDS,

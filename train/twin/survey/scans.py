@@ -16,8 +16,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.footprint import Footprint
-from restock.ingest.propose.roles import KINDS, topics_for, usable_topics
+from restock.ingest.propose.evidence.footprint import Footprint
+from restock.ingest.propose.evidence.roles import KINDS, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import FRAME_ID
 from restock.ingest.urdf.description import BASE_FRAMES

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.propose.footprint import Footprint
+from restock.ingest.propose.evidence.footprint import Footprint
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import (
     FREE,

@@ -91,7 +91,7 @@ class ProfileCommand:
         from restock.cli import output
         from restock.ingest.containers.discover import recordings_in
         from restock.ingest.propose.drives import drives_to_read, propose_for_drives
-        from restock.ingest.propose.footprint import parse_footprint
+        from restock.ingest.propose.evidence.footprint import parse_footprint
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="name another --out")

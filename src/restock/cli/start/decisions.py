@@ -22,7 +22,7 @@ DRIVERS = "behaviour_policies"  # of a row of the coverage
 
 def fullest(document: Document) -> str | None:
     """The recording that has most of what a profile needs: a command, a pose, and time."""
-    from restock.ingest.propose.roles import KINDS
+    from restock.ingest.propose.evidence.roles import KINDS
 
     def types(role: str) -> set[str]:
         return {kind.type for kind in KINDS[role]}

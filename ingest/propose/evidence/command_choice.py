@@ -21,7 +21,7 @@ from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.propose.roles import BY_HAND, NAVIGATION, Kind
+from restock.ingest.propose.evidence.roles import BY_HAND, NAVIGATION, Kind
 
 JOY = "sensor_msgs/msg/Joy"
 WITHIN_S = 0.5

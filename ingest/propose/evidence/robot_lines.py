@@ -14,7 +14,7 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.driven.steering import DriveEvidence
-from restock.ingest.propose.footprint import Footprint, descriptions, of_urdf, outline
+from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description

@@ -1,0 +1,202 @@
+"""What the commands of a recording say of its robot: how fast, which way, how long each holds.
+
+And whether the robot turned by them as a car does, and what a turn is to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from restock.arrays import F64, Ints
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.inputs import MOTION
+from restock.ingest.propose.driven.command_hold import (
+    CommandHold,
+    command_hold,
+    limit_of,
+    settled_speeds,
+)
+from restock.ingest.propose.driven.steering import (
+    DriveEvidence,
+    TurnReading,
+    drive_evidence,
+    turn_reading,
+)
+from restock.ingest.propose.evidence.clock_choice import Gaps
+from restock.ingest.propose.evidence.robot_lines import RobotProposal
+from restock.ingest.propose.evidence.roles import Kind, Roles
+from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.robot import USUAL_STEERING_RAD
+
+_ANGLES = {"yaw_rate_radps": "steering_rad"}
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What the commands of a recording say about the robot."""
+
+    speed_mps: float = 0.5
+    yaw_rate_radps: float = 1.0
+    backs: bool = False
+    count: int = 0
+    topic: str = ""
+    measured: bool = False  # they are odometry, in place of commands
+    steered: bool = False  # by the angle of the front wheels, as a car
+    wheelbase_m: float = 0.3
+    wheelbase_known: bool = False
+    reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
+
+    def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
+        """The same for a robot that stays below these commands; None: it does what they say."""
+        return replace(
+            self,
+            speed_mps=speed_mps or self.speed_mps,
+            yaw_rate_radps=yaw_rate_radps or self.yaw_rate_radps,
+            reached=(speed_mps, yaw_rate_radps),
+        )
+
+    def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
+        """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
+        if not len(speed_mps):
+            return self
+        fast, sharp = (float(np.percentile(np.abs(c), 98)) for c in (speed_mps, yaw_rate_radps))
+        return replace(
+            self,
+            speed_mps=fast or Commands.speed_mps,
+            yaw_rate_radps=sharp or Commands.yaw_rate_radps,
+            backs=bool((speed_mps < -0.05 * fast).any()),
+        )
+
+
+def read_commands(
+    recording: Recording, roles: Roles, poses: PoseSeries | None, wheelbase_m: float | None
+) -> tuple[Commands, Gaps, CommandHold]:
+    """Read the commands: how fast, which way, how often, and how long each holds."""
+    if not roles["command"]:
+        return Commands(), Gaps(), CommandHold()
+    topic, kind = roles["command"][0]
+    columns, times, speed, turn = commanded(recording, (topic, kind), wheelbase_m)
+    commands = replace(
+        Commands().fastest(speed, turn),
+        count=len(columns),
+        topic=topic.name,
+        measured=topic.type == MOTION,
+        steered="steering_rad" in kind.fields,
+        wheelbase_m=wheelbase_m or Commands.wheelbase_m,
+        wheelbase_known=wheelbase_m is not None,
+    )
+    settled = settled_at_most(recording, roles, commands, times, speed, turn)
+    commands = commands.limited(
+        limit_of(settled[0], commands.speed_mps), limit_of(settled[1], commands.yaw_rate_radps)
+    )
+    hold = CommandHold()
+    if poses is not None and len(poses) > 1 and not commands.measured:
+        order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+        seconds = (times[order] - zero) * 1e-9
+        since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+        hold = command_hold(seconds, speed[order], turn[order], since)
+    return commands, Gaps.of(columns), hold
+
+
+def commanded(
+    recording: Recording, fit: tuple[TopicInfo, Kind], wheelbase_m: float | None
+) -> tuple[TopicColumns, Ints, F64, F64]:
+    """The commands of a topic; of those that are numbers log time (N,), m/s (N,), rad/s (N,)."""
+    topic, kind = fit
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
+    if "steering_rad" in kind.fields:
+        turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
+    sane = np.isfinite(speed) & np.isfinite(turn)
+    return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
+
+
+def settled_at_most(
+    recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
+) -> tuple[F64, F64]:
+    """What odometry measured, in m/s (K,) and rad/s (L,), once the fastest commands had settled."""
+    nothing = np.zeros(0), np.zeros(0)
+    if not roles["wheels"] or commands.measured or not len(times):
+        return nothing
+    topic, kind = roles["wheels"][0]
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    order = np.argsort(times, kind="stable")
+    told_s = np.asarray((times[order] - times[order[0]]) * 1e-9, np.float64)
+    at_s = np.asarray((columns.log_time_ns - times[order[0]]) * 1e-9, np.float64)
+    fastest = commands.speed_mps, commands.yaw_rate_radps
+    found = [
+        settled_speeds(
+            told_s, told[order], at_s, np.asarray(columns.fields[path], np.float64), most
+        )
+        for told, path, most in zip((speed, turn), paths, fastest, strict=True)
+    ]
+    return found[0], found[1]
+
+
+def how_it_turned(
+    recording: Recording, roles: Roles, poses: PoseSeries | None
+) -> tuple[DriveEvidence, float | None]:
+    """How the robot turned under its Twists; and the sharpest of commands that are angles."""
+    if not roles["command"]:
+        return DriveEvidence(), None
+    topic, kind = roles["command"][0]
+    if (path := kind.fields.get("steering_rad")) is not None:
+        fields = recording.read({topic.name: [path]})[topic.name].fields
+        angles = np.abs(np.asarray(fields[path], np.float64))
+        angles = angles[np.isfinite(angles)]
+        return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
+    if topic.type == MOTION or poses is None or len(poses) < 2:
+        return DriveEvidence(), None
+    return drive_evidence(*_since(recording, roles, poses)), None
+
+
+def read_turns(
+    recording: Recording,
+    roles: Roles,
+    poses: PoseSeries | None,
+    robot: RobotProposal,
+    turned: DriveEvidence,
+) -> TurnReading | None:
+    """What the turns of Twists are to a robot that steers; None where it does not, or is driven
+    by steering angles."""
+    steers = robot.values.get("drive") == "ackermann"
+    if not (steers and roles["command"]):
+        return None
+    topic, kind = roles["command"][0]
+    if topic.type == MOTION or "steering_rad" in kind.fields:
+        return None
+    if poses is None or len(poses) < 2:
+        return TurnReading()
+    told, most = _since(recording, roles, poses), robot.values.get("max_steering_rad")
+    wheelbase_m = robot.values["wheelbase_m"]
+    if not robot.guessed_steering:
+        return turn_reading(*told, wheelbase_m, most)
+    least_m = turned.turning_m or wheelbase_m / float(np.tan(most or USUAL_STEERING_RAD))
+    reading = turn_reading(*told, None, least_m=least_m)
+    # That it steers is only a guess: that it is told in no known way is no reason to refuse it.
+    return reading if not reading.problem else TurnReading(least_m=least_m)
+
+
+def as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Kind]]:
+    """The same topics, their turns read as steering angles."""
+    return [
+        (topic, replace(kind, fields={_ANGLES.get(k, k): v for k, v in kind.fields.items()}))
+        for topic, kind in fitting
+    ]
+
+
+def _since(
+    recording: Recording, roles: Roles, poses: PoseSeries
+) -> tuple[F64, F64, F64, PoseSeries]:
+    """The commands in order, in seconds (N,), m/s and rad/s, and the poses: both since the first
+    pose."""
+    _, times, speed, turn = commanded(recording, roles["command"][0], None)
+    order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
+    since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
+    return (times[order] - zero) * 1e-9, speed[order], turn[order], since

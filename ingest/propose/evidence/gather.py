@@ -1,0 +1,233 @@
+"""All that a recording says of its robot, gathered for a proposal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.inputs import MOTION
+from restock.ingest.propose.driven.command_hold import (
+    CommandHold,
+)
+from restock.ingest.propose.driven.steering import (
+    DriveEvidence,
+    TurnReading,
+)
+from restock.ingest.propose.evidence.cameras import CameraTopic, camera_topics
+from restock.ingest.propose.evidence.candidates import Candidate, candidates
+from restock.ingest.propose.evidence.clock_choice import (
+    ClockChoice,
+    Gaps,
+    choose_clock,
+)
+from restock.ingest.propose.evidence.command_choice import CommandChoice, choose_command
+from restock.ingest.propose.evidence.commands import (
+    Commands,
+    as_angles,
+    how_it_turned,
+    read_commands,
+    read_turns,
+)
+from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
+from restock.ingest.propose.evidence.goal_choice import GoalChoice
+from restock.ingest.propose.evidence.motion_choice import (
+    MotionChoice,
+    choose_motion,
+    pose_series,
+)
+from restock.ingest.propose.evidence.robot_lines import RobotProposal, propose_robot, urdf_footprint
+from restock.ingest.propose.evidence.roles import (
+    FIX,
+    KINDS,
+    LATCHED,
+    ODOMETRY_AS_COMMAND,
+    REQUIRED,
+    SPENT,
+    FrameGuess,
+    Roles,
+    topics_for,
+    transform_frames,
+    usable_topics,
+)
+from restock.ingest.propose.evidence.scanned_outline import (
+    ScannedOutline,
+    lidar_place,
+    scanned_outline,
+    with_lidar,
+)
+from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.motion import PoseSeries
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a recording says of its robot."""
+
+    recording: Recording
+    roles: Roles
+    frames: FrameGuess | None
+    poses_from_frames: bool
+    motion: MotionChoice | None  # where no topic has the wheels' speeds
+    commands: Commands
+    chosen: CommandChoice
+    hold: CommandHold
+    turned: DriveEvidence  # whether it steers as a car, where nothing describes it
+    turns: TurnReading | None  # of Twists, where the robot steers as a car
+    paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
+    clock: ClockChoice
+    gaps: Gaps
+    driven_s: float
+    footprint: Footprint
+    footprint_notes: list[str]
+    outline: ScannedOutline | None  # where its scans say something of it
+    goal: GoalChoice
+    signals: list[Candidate]
+    cameras: list[CameraTopic]
+    robot: RobotProposal
+
+
+def gather(
+    recording: Recording,
+    footprint: Footprint | None,
+    urdf: Path | None = None,
+    *,
+    odometry_as_command: bool,
+) -> Evidence:
+    """What a recording says of its robot."""
+    topics = usable_topics(recording)
+    roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
+    chosen = CommandChoice()
+    if not roles["command"] and odometry_as_command:
+        roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)
+    else:
+        roles["command"], chosen = choose_command(recording, topics, roles["command"])
+    driven = {topic.name for topic, _ in roles["command"][:1]}
+    roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
+    if not (roles["goal"] and roles["plan"]):
+        roles["goal"] = roles["plan"] = []
+    frames = transform_frames(recording)
+    if frames is not None and all(topic.type == FIX for topic, _ in roles["pose"]):
+        roles["pose"] = []  # transforms say where it faces, too
+    # Odometry drifts: where transforms lead to a map, they are the better pose.
+    drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
+    framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
+    poses = None
+    if framed or roles["pose"]:
+        poses, _ = pose_series(recording, roles, frames if framed else None)
+    frame = _scan_frame(recording, roles)
+    scan = roles["scan"][0][0].name if roles["scan"] else None
+    notes: list[str] = []
+    if footprint is None and urdf is not None:
+        footprint = urdf_footprint(urdf, frame)
+    if footprint is None:
+        footprint, notes = footprint_of(recording, frame)
+    outline = scanned_outline(recording, scan, poses) if scan is not None else None
+    if footprint is None:
+        footprint = (outline.footprint(GUESS) if outline else None) or GUESS
+    if footprint.lidar_x_m is None and scan is not None:
+        footprint = with_lidar(footprint, lidar_place(recording, frame))
+    robot = propose_robot(recording, scan, frame, urdf)
+    turned, told_rad = how_it_turned(recording, roles, poses)
+    robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
+    turns = read_turns(recording, roles, poses, robot, turned)
+    if turns is not None and turns.is_angle:
+        roles["command"], chosen = choose_command(recording, topics, as_angles(roles["command"]))
+        if turns.wheelbase_m is not None:
+            robot = replace(robot, values=robot.values | {"wheelbase_m": turns.wheelbase_m})
+    wheelbase_m = robot.values.get("wheelbase_m")
+    commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
+    commands = replace(commands, wheelbase_known=robot.described and wheelbase_m is not None)
+    paces = _paces(recording, roles)
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
+    motion = None
+    if not roles["wheels"] and (framed or roles["pose"]):
+        motion = choose_motion(recording, roles, frames, framed=framed)
+    best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
+    return Evidence(
+        recording,
+        roles,
+        frames,
+        framed,
+        motion,
+        commands,
+        chosen,
+        hold,
+        turned,
+        turns,
+        paces,
+        choose_clock(
+            recording,
+            list(dict.fromkeys(topic.name for _, topic, _ in best)),
+            frozenset(topic.name for role, topic, _ in best if role in LATCHED),
+            gaps,
+            stamped=_stamped(recording, roles, commands),
+        ),
+        gaps,
+        _driven_s(recording, gaps),
+        footprint,
+        notes,
+        outline,
+        GoalChoice.of(logged=bool(roles["goal"])),
+        candidates(
+            recording,
+            without={topic.name for role, topic, _ in best if role in SPENT},
+            used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
+        ),
+        camera_topics(recording, _driven_s(recording, gaps)),
+        robot,
+    )
+
+
+def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
+    """Of each topic that fills an input, how far apart its messages mostly are (s, log time)."""
+    names = {fitting[0][0].name for fitting in roles.values() if fitting}
+    found = {}
+    for name, columns in recording.read({name: [] for name in sorted(names)}).items():
+        gaps = np.diff(np.sort(columns.log_time_ns)) * 1e-9
+        if len(gaps) > 1:
+            # The median, or the mean of half of them where messages come in bursts.
+            found[name] = max(float(np.median(gaps)), float(np.percentile(gaps, 90)) / 2)
+    return found
+
+
+def _seldomest(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
+    """The time between two messages of pose or wheels, whichever come less often."""
+    names = [
+        fitting[0][0].name for role in ("pose", "wheels") for fitting in [roles[role]] if fitting
+    ]
+    known = [paces[name] for name in names if name in paces]
+    if poses is not None and len(poses) > 1 and not names:
+        known.append(float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
+    return max(known, default=0.0)
+
+
+def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
+    """Whether the sensors carry header stamps."""
+    sensors = [
+        fitting[0][0] for role, fitting in roles.items() if fitting and role in (*REQUIRED, "scan")
+    ]
+    sensing = [t for t in sensors if t.name != commands.topic or commands.measured]
+    return bool(sensing) and all(STAMP in recording.leaves(t.name) for t in sensing)
+
+
+def _driven_s(recording: Recording, gaps: Gaps) -> float:
+    """How long the robot drove: recordings may pause between drives."""
+    span = recording.span_ns
+    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
+    if gaps.period_s is None:
+        return whole
+    driven = gaps.period_s * gaps.count
+    return min(driven, whole) if driven > whole / 10 else whole
+
+
+def _scan_frame(recording: Recording, roles: Roles) -> str:
+    """The frame that scans say they are in."""
+    path = "header.frame_id"
+    if not roles["scan"] or path not in recording.leaves(roles["scan"][0][0].name):
+        return ""
+    topic = roles["scan"][0][0].name
+    frames = np.asarray(recording.read({topic: [path]})[topic].fields[path], object)
+    return str(frames[0]) if len(frames) else ""
