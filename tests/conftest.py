@@ -37,18 +37,27 @@ def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "OpeConfig", partial(ope.OpeConfig, model=QUICK))
 
 
-@pytest.fixture(scope="module")
-def s3_server() -> Iterator[str]:
-    """A server with one bucket, that the environment names: its address."""
-    boto3 = pytest.importorskip("boto3")
+@pytest.fixture(scope="session")
+def s3_process() -> Iterator[str]:
+    """The address of a server, which takes seconds to start."""
+    pytest.importorskip("boto3")
     pytest.importorskip("moto")
-    with s3.s3_server() as address, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AWS_ENDPOINT_URL", address)
+    with s3.s3_server() as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def s3_server(s3_process: str) -> Iterator[str]:
+    """A server with one bucket, that the environment names: its address."""
+    import boto3
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", s3_process)
         patch.setenv("AWS_ACCESS_KEY_ID", "key")
         patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
         patch.setenv("AWS_REGION", "us-east-1")
         boto3.client("s3").create_bucket(Bucket=s3.BUCKET)
-        yield address
+        yield s3_process
 
 
 @pytest.fixture(params=["folder", "s3"])

@@ -11,7 +11,7 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.stores import one, shown
+from support.stores import one, shown, views_over
 
 from restock.errors import StoreError
 from restock.ingest.store.compaction import OPERATION, compact, fold
@@ -20,7 +20,6 @@ from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
-from restock.replay.store.definitions import definitions
 from restock.replay.store.store import Store
 
 
@@ -76,11 +75,11 @@ def same_as_scanned(path: Path | str) -> None:
     """The common views say what the views that scan the rows say, on the same store."""
     with Store(path) as store:
         scanned = duckdb.connect()
-        scanned.register("stored_recordings", store.sql("FROM stored_recordings").to_arrow_table())
-        scanned.register("stored_ingests", store.sql("FROM stored_ingests").to_arrow_table())
         rows = store.sql("FROM stored_transitions").to_arrow_table()
-        scanned.register("stored_transitions", rows)
-        scanned.execute(definitions(store.observation_type))
+        manifests = store.sql("FROM stored_recordings").to_arrow_table()
+        made = views_over(scanned, rows, manifests, store.observation_type)
+        made.make(" ".join(COMMON))
+        made.hold(["transitions"])
         for view in COMMON:
             by_summary, by_scan = store.sql(f"FROM {view}"), scanned.sql(f"FROM {view}")
             assert by_summary.columns == by_scan.columns

@@ -22,7 +22,7 @@ BUCKET = "warehouse"
 
 def address(request: pytest.FixtureRequest) -> str:
     """Where a store of this test alone may lie, with a space in it."""
-    return f"s3://{BUCKET}/site 7/" + re.sub(r"\W+", "_", request.node.name)
+    return f"s3://{BUCKET}/site 7/" + re.sub(r"\W+", "_", request.node.nodeid)
 
 
 def files_of(place: Path | str) -> list[str]:
