@@ -34,6 +34,9 @@ demo: $(VENV)/.runtime
 # A process a core, each with whole files: fixtures of a module are made once. Each computes on one
 # thread: threads of several processes on the same cores wait for each other at full load.
 test test-long test-docs: export OMP_NUM_THREADS = 1
+# Many tests start Restock in a process of its own: where the environment forbids files of bytecode,
+# each would compile it again, and each of these targets all tests.
+test test-long test-docs: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
