@@ -1,9 +1,11 @@
 """Several recordings: one after the other, in several processes, or on a Ray cluster.
 
 A process that dies (killed, or out of memory) costs the recording it was reading, by name; the
-others go on, and another process takes its place. Processes are forked from a server that has
-imported what they need once: forking this process, with its threads, would not be safe. It imports
-that while this process does, so nothing here is imported before it is needed.
+others go on, and another process takes its place. They write files; this process commits
+them, several at once, so that a fleet's recordings are not two commits each. Processes are forked
+from a server that has imported what they need once: forking this process, with its threads, would
+not be safe. It imports that while this process does, so nothing here is imported before it is
+needed.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import signal
 import threading
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
@@ -27,12 +30,13 @@ from restock.errors import RecordingError, RestockError
 
 if TYPE_CHECKING:
     from restock.ingest.containers.storage import Watch
-    from restock.ingest.pipeline import IngestResult, OnRepeat
+    from restock.ingest.prepared import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile
 
 Result = tuple[Path, Union["IngestResult", RestockError]]
 Engine = Literal["processes", "ray"]
 T = TypeVar("T")
+D = TypeVar("D")
 PATIENCE_S = 10  # for a worker that was told to stop, before it is killed
 AGAIN = "run it again: what is in the store already is left alone"
 
@@ -49,30 +53,27 @@ class IngestJob:
     repeated: OnRepeat = "keep"  # a recording that is in the store under another id
     tags: Mapping[str, str] = field(default_factory=dict)  # of every recording
 
-    def run(self, path: Path, watch: Watch | None = None) -> Result:
-        """Ingest one recording; an error is returned, so that the others continue."""
-        from restock.ingest.pipeline import ingest
+    def prepare(
+        self,
+        path: Path,
+        watch: Watch | None = None,
+        settle: Callable[[str], None] = lambda recording_id: None,
+    ) -> Prepared | RestockError:
+        """Read one recording and write its files; an error is returned: the others go on."""
+        from restock.ingest.pipeline import Reading, prepare
         from restock.ingest.store.writer import StoreWriter
 
+        how = Reading(self.force, self.salvage, self.typestore, self.repeated, self.tags)
+        store = StoreWriter(self.store) if self.store is not None else None
         try:
-            return path, ingest(
-                path,
-                self.profile,
-                store=StoreWriter(self.store) if self.store is not None else None,
-                force=self.force,
-                salvage=self.salvage,
-                typestore=self.typestore,
-                repeated=self.repeated,
-                tags=self.tags,
-                watch=watch,
-            )
+            return prepare(path, self.profile, how, store=store, watch=watch, settle=settle)
         except RestockError as error:
-            return path, error
+            return error
         except MemoryError:
-            return path, out_of_memory(path)
+            return out_of_memory(path)
         except Exception as error:  # noqa: BLE001  (a defect costs its recording, not all of them)
             at = traceback.extract_tb(error.__traceback__)[-1]
-            return path, RecordingError(
+            return RecordingError(
                 f"a defect of Restock: {type(error).__name__}: {error}"
                 f" ({Path(at.filename).name}, line {at.lineno})",
                 where=str(path),
@@ -88,25 +89,60 @@ def ingest_all(
     engine: Engine = "processes",
     watch: Watch | None = None,
 ) -> Iterator[Result]:
-    """Each recording's outcome or error, in the order of `paths`.
+    """Each recording's outcome or error, in the order of `paths`, after its commit.
 
-    With several workers each recording is read and committed by one of them; commits that collide
-    are tried again, so the store is the same as after one worker. With Ray, `workers` is how many
-    it may start at once where it starts on this machine. `watch` is told how far a recording is,
-    where they are read one after the other.
+    Each recording is read, and its files are written, by one worker; this process commits them,
+    those of some seconds together, so the store is the same as after one worker. With Ray,
+    `workers` is how many it may start at once where it starts on this machine. `watch` is told how
+    far a recording is, where they are read one after the other. What is not committed when the
+    caller stops early is not kept.
 
     Raises:
         ConfigError: Ray is to be used and is not installed, or its cluster does not answer.
     """
-    if engine == "ray":
-        from restock.ingest.on_ray import run_on_ray
+    from restock.ingest.prepared import CommitGroup
+    from restock.ingest.store.writer import StoreWriter
 
-        yield from run_on_ray(job, paths, workers=workers)
-    elif min(workers, len(paths)) <= 1:
-        for path in paths:
-            yield job.run(path, watch)
+    group = CommitGroup(StoreWriter(job.store) if job.store is not None else None)
+    some = min(workers, len(paths))
+    if engine == "ray":
+        from restock.ingest.on_ray import prepare_on_ray
+
+        read = prepare_on_ray(job, paths, workers=workers, patience_s=group.due_in_s)
+    elif some <= 1:
+        read = _one_by_one(job, paths, group, watch)
     else:
-        yield from side_by_side(job.run, paths, min(workers, len(paths)), died=_died)
+        read = side_by_side(job.prepare, paths, some, died=_died, patience_s=group.due_in_s)
+    next_up = 0
+    try:
+        with closing(read):
+            for arrived in read:
+                if arrived is None:
+                    group.commit_if_due()
+                else:
+                    group.add(*arrived)
+                while next_up in group.results:
+                    yield paths[next_up], group.results.pop(next_up)
+                    next_up += 1
+        group.commit()
+        for place in range(next_up, len(paths)):
+            yield paths[place], group.results.pop(place)
+    finally:
+        group.discard()
+
+
+def _one_by_one(
+    job: IngestJob, paths: Sequence[Path], group: CommitGroup, watch: Watch | None
+) -> Generator[tuple[int, Prepared | RestockError]]:
+    """One after the other; what waits is committed while a long one is read, too."""
+
+    def watched(what: str, done: int, of: int) -> None:
+        group.commit_if_due()
+        if watch is not None:
+            watch(what, done, of)
+
+    for place, path in enumerate(paths):
+        yield place, job.prepare(path, watched, group.settle)
 
 
 def out_of_memory(path: Path) -> RecordingError:
@@ -116,9 +152,9 @@ def out_of_memory(path: Path) -> RecordingError:
     )
 
 
-def _died(path: Path, code: int) -> Result:
+def _died(path: Path, code: int) -> RecordingError:
     how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
-    return path, RecordingError(
+    return RecordingError(
         f"the process that read it {how}",
         where=str(path),
         remedy=f"where memory ran out, take fewer --workers; {AGAIN}",
@@ -137,16 +173,17 @@ def side_by_side(
     paths: Sequence[Path],
     workers: int,
     *,
-    died: Callable[[Path, int], T],
-) -> Iterator[T]:
-    """What `work` gives for each path, in their order; `died(path, exit code)` where it died.
+    died: Callable[[Path, int], D],
+    patience_s: Callable[[], float | None] = lambda: None,
+) -> Generator[tuple[int, T | D] | None]:
+    """What `work` gives for each path, with its place, as it comes; `died(path, exit code)` where
+    it died. None where nothing came for `patience_s()` seconds, which is asked at each wait.
 
     The largest recordings are begun first, so that no process is left alone with one at the end.
     When the caller stops early, or Ctrl-C does, no work goes on.
     """
     ahead = deque(sorted(range(len(paths)), key=lambda place: -_size(paths[place])))
     pool: list[_Worker[T]] = []
-    done: dict[int, T] = {}
     context = _context()
 
     def begin(worker: _Worker[T]) -> None:
@@ -167,24 +204,25 @@ def side_by_side(
         begin(pool[-1])
 
     try:
-        for place in range(len(paths)):
-            while place not in done:
-                while ahead and len(pool) < workers:
-                    hire()
-                ready = wait([worker.pipe for worker in pool])
-                for worker in [worker for worker in pool if worker.pipe in ready]:
-                    assert worker.at_hand is not None
-                    try:
-                        done[worker.at_hand] = worker.pipe.recv()
-                    except (EOFError, ConnectionError):
-                        worker.process.join()
-                        path, code = paths[worker.at_hand], worker.process.exitcode or 0
-                        done[worker.at_hand] = died(path, code)
-                        worker.pipe.close()
-                        pool.remove(worker)
-                    else:
-                        begin(worker)
-            yield done.pop(place)
+        while ahead or pool:
+            while ahead and len(pool) < workers:
+                hire()
+            ready = wait([worker.pipe for worker in pool], patience_s())
+            if not ready:
+                yield None
+            for worker in [worker for worker in pool if worker.pipe in ready]:
+                place = worker.at_hand
+                assert place is not None
+                try:
+                    found: T | D = worker.pipe.recv()
+                except (EOFError, ConnectionError):
+                    worker.process.join()
+                    found = died(paths[place], worker.process.exitcode or 0)
+                    worker.pipe.close()
+                    pool.remove(worker)
+                else:
+                    begin(worker)
+                yield place, found
     finally:
         for worker in pool:
             worker.process.terminate()

@@ -10,47 +10,65 @@ from __future__ import annotations
 import os
 import re
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import ConfigError, RecordingError
 from restock.imports import import_extra
-from restock.ingest.batch import AGAIN, Result, out_of_memory
+from restock.ingest.batch import AGAIN, out_of_memory
 
 if TYPE_CHECKING:
+    from restock.errors import RestockError
     from restock.ingest.batch import IngestJob
+    from restock.ingest.prepared import Prepared
 
 CONNECT_S = 5
 ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
 
 
-def run_on_ray(job: IngestJob, paths: Sequence[Path], *, workers: int = 1) -> Iterator[Result]:
-    """Each recording's outcome or error, in the order of `paths`.
+def prepare_on_ray(
+    job: IngestJob,
+    paths: Sequence[Path],
+    *,
+    workers: int = 1,
+    patience_s: Callable[[], float | None] = lambda: None,
+) -> Generator[tuple[int, Prepared | RestockError] | None]:
+    """What was made of each recording, with its place in `paths`, as it comes; None where nothing
+    came for `patience_s()` seconds. Nothing of it is committed.
 
     Raises:
         ConfigError: Ray is not installed, or the cluster does not answer.
     """
     with cluster(workers) as ray:
-        # A task that died may have committed: it is not tried again unasked.
+        # A task that died may have written files: it is not tried again unasked.
         task = ray.remote(_task).options(num_cpus=1, max_retries=0)
         aws = {name: value for name, value in os.environ.items() if name.startswith(ENVIRONMENT)}
-        results = [task.remote(job, path, str(Path.cwd()), aws) for path in paths]
-        for path, result in zip(paths, results, strict=True):
-            try:
-                yield ray.get(result)
-            except ray.exceptions.OutOfMemoryError:
-                yield path, out_of_memory(path)
-            except ray.exceptions.RayError as error:
-                yield (
-                    path,
-                    RecordingError(
-                        f"the process that read it died ({type(error).__name__})",
-                        where=str(path),
-                        remedy=AGAIN,
-                    ),
-                )
+        begun = {
+            task.remote(job, path, str(Path.cwd()), aws): place for place, path in enumerate(paths)
+        }
+        while begun:
+            ready, _ = ray.wait(list(begun), timeout=patience_s())
+            if not ready:
+                yield None
+            for result in ready:
+                place = begun.pop(result)
+                yield place, _answer(ray, result, paths[place])
+
+
+def _answer(ray: Any, result: Any, path: Path) -> Prepared | RestockError:
+    try:
+        answer: Prepared | RestockError = ray.get(result)
+    except ray.exceptions.OutOfMemoryError:
+        return out_of_memory(path)
+    except ray.exceptions.RayError as error:
+        return RecordingError(
+            f"the process that read it died ({type(error).__name__})",
+            where=str(path),
+            remedy=AGAIN,
+        )
+    return answer
 
 
 @contextmanager
@@ -97,7 +115,9 @@ def _expect(address: str | None) -> None:
         ) from error
 
 
-def _task(job: IngestJob, path: Path, folder: str, environment: dict[str, str]) -> Result:
+def _task(
+    job: IngestJob, path: Path, folder: str, environment: dict[str, str]
+) -> Prepared | RestockError:
     """One recording, on whatever machine."""
     from restock.ingest.containers.mcap_group import ChunkReader
 
@@ -106,9 +126,9 @@ def _task(job: IngestJob, path: Path, folder: str, environment: dict[str, str]) 
     try:
         os.chdir(folder)
     except OSError:
-        return path, RecordingError(
+        return RecordingError(
             f"the machine that was to read it has no folder {folder}",
             where=str(path),
             remedy="put the recordings where every machine of the cluster sees them",
         )
-    return job.run(path)
+    return job.prepare(path)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +23,7 @@ from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
+from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
@@ -42,39 +43,11 @@ from restock.ingest.store.manifest import (
     recorded_facts,
     software_version,
 )
-from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
-from restock.ingest.store.writer import StoreWriter
+from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
-from restock.ingest.task.label_scores import LabelScore, label_scores
+from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
-
-Status = Literal["written", "tagged", "unchanged", "dry run"]
-OnRepeat = Literal["keep", "refuse"]
-
-
-@dataclass(frozen=True)
-class IngestResult:
-    """What became of one recording: the counts of its manifest, and its notes."""
-
-    path: str
-    status: Status
-    manifest: dict[str, Any]  # the row of `recordings`, as plain values
-    messages: dict[str, int] = field(default_factory=dict)  # of used topics; and of unused ones
-    conditions: dict[str, int] = field(default_factory=dict)  # transitions a label holds on
-    named: dict[str, int] = field(default_factory=dict)  # … and is the row's one condition
-    exposures: dict[str, int] = field(default_factory=dict)  # transitions an exposure holds on
-    scores: list[LabelScore] = field(default_factory=list)
-    endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
-    lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
-    notes: list[str] = field(default_factory=list)
-    version: int | None = None  # of the store's transitions, where they were written
-    repeats: RepeatedDrive | None = None  # one in the store with largely the same rows
-
-    @property
-    def lossy(self) -> bool:
-        """Whether data of the topics used was lost."""
-        return bool(self.lost_messages)
 
 
 def ingest(
@@ -104,22 +77,67 @@ def ingest(
             be refused. The store is as it was.
         StoreError: the store cannot be written.
     """
-    with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
+    how = Reading(force, salvage, typestore, repeated, tags or {})
+    prepared = prepare(path, profile, how, store=store, watch=watch)
+    if store is None:
+        return prepared.result
+    (outcome,) = commit_all(store, [prepared])
+    if not isinstance(outcome, IngestResult):
+        raise outcome
+    return outcome
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a recording is read: the arguments of `ingest` by these names."""
+
+    force: bool = False
+    salvage: bool = False
+    typestore: str | None = None
+    repeated: OnRepeat = "keep"
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+
+def prepare(
+    path: Path | str,
+    profile: Profile,
+    how: Reading,
+    *,
+    store: StoreWriter | None,
+    watch: Watch | None = None,
+    settle: Callable[[str], None] = lambda recording_id: None,
+) -> Prepared:
+    """Read one recording and write its files, for a commit to come (`commit_all`).
+
+    `settle(recording_id)` is called before the store is asked for the recording: what waits for its
+    commit is not seen there.
+
+    Raises as `ingest`, which does both.
+    """
+    with open_recording(
+        path, typestore=how.typestore, salvage=how.salvage, watch=watch
+    ) as recording:
         profile = as_recorded(profile, recording.topics)
+        settle(recording.recording_id)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}
-        told = resolve_tags(profile.tags, Path(path), recording.metadata, tags or {}, tagged)
-        if store is not None and before is not None and not force and _unchanged(before, profile):
+        told = resolve_tags(profile.tags, Path(path), recording.metadata, how.tags, tagged)
+        if (
+            store is not None
+            and before is not None
+            and not how.force
+            and _unchanged(before, profile)
+        ):
             new: dict[str, Any] = {"tags": told.tags}
             if _other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
             elif told.tags == (before["tags"] or {}):
-                return IngestResult(str(path), "unchanged", before)
-            version = _tag(store, before, new)
-            manifest = before | new
-            return IngestResult(str(path), "tagged", manifest, notes=told.notes, version=version)
+                return Prepared(IngestResult(str(path), "unchanged", before))
+            staged = _tag(store, before, new)
+            result = IngestResult(str(path), "tagged", before | new, notes=told.notes)
+            return Prepared(result, staged)
         try:
-            return _Ingest(str(path), recording, profile, told, repeated, before).run(store)
+            return _Ingest(str(path), recording, profile, told, how.repeated, before).run(store)
         except RecordingError as error:
             if error.where:
                 raise
@@ -150,16 +168,14 @@ def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
         return False
 
 
-def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> int:
-    """Write a recording's rows again with what is `new` in its manifest; returns the version."""
+def _tag(store: StoreWriter, before: Mapping[str, Any], new: Mapping[str, Any]) -> Staged:
+    """Write a recording's rows again with what is `new` in its manifest."""
     ingest_id = uuid.uuid4().hex[:16]
     manifest = {**before, "ingest_id": ingest_id, **new}
     rows = store.rows(before["recording_id"], before["ingest_id"])
     rows = replaced(rows, {"ingest_id": ingest_id})
-    return store.write_all(
-        [(pa.Table.from_pylist([manifest], recording_schema()), rows)],
-        instead_of={before["recording_id"]: before["ingest_id"]},
-    )
+    table = pa.Table.from_pylist([manifest], recording_schema())
+    return store.stage(table, rows, instead_of=before["ingest_id"])
 
 
 class _Ingest:
@@ -179,7 +195,7 @@ class _Ingest:
         self.corrections = corrections_in(self.before)
         self.ingest_id = uuid.uuid4().hex[:16]
 
-    def run(self, store: StoreWriter | None) -> IngestResult:
+    def run(self, store: StoreWriter | None) -> Prepared:
         profile, columns = self.profile, read_topics(self.recording, self.profile)
         steps = steps_of(profile, columns)
         # The next stages need to know which topics had messages, not their values: free those.
@@ -217,11 +233,11 @@ class _Ingest:
         file = path if sum(len(one.row) for one in kept) else ""
         facts["cameras"] = [one.manifest_row(self.recording, file) for one in kept]
         manifest = manifest_row(profile, provenance, table, scores, episodes.dropped, **facts)
-        at, repeats = self._write(store, manifest, table, kept) if store else (None, None)
+        staged = self._stage(store, manifest, table, kept) if store else None
         holding = held(table["conditions"], list(rows.labels))
         counts = {name: int(holds.sum()) for name, holds in holding.items()}
         counts[NOMINAL] = first[NOMINAL]
-        return IngestResult(
+        result = IngestResult(
             self.path,
             "written" if store else "dry run",
             manifest,
@@ -232,33 +248,22 @@ class _Ingest:
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._lost_messages(steps),
-            self._notes(steps, table, repeats),
-            at,
-            repeats,
+            self._notes(steps, table),
         )
+        return Prepared(result, staged, self.repeated, profile.task.control_period_s)
 
-    def _write(
+    def _stage(
         self,
         store: StoreWriter,
         manifest: dict[str, Any],
         table: pa.Table,
         kept: Sequence[KeptFrames],
-    ) -> tuple[int, RepeatedDrive | None]:
-        """The store's version with these rows, and a recording that has them under other ids."""
-        period_s = self.profile.task.control_period_s
-        if self.repeated == "refuse" and (found := store.repeated(table, period_s)):
-            raise RecordingError(
-                str(found),
-                where=self.path,
-                remedy="leave it out; --repeated keep ingests it all the same",
-            )
-        made = (pa.Table.from_pylist([manifest], recording_schema()), table)
+    ) -> Staged:
         # What another process corrects meanwhile is not written over.
-        read = {manifest["recording_id"]: self.before["ingest_id"]} if self.corrections else {}
+        read = self.before["ingest_id"] if self.corrections else None
         with self._frames_written(store, manifest, kept):
-            at = store.write_all([made], instead_of=read)
-        # Looked for after the commit: another process may have written the same drive meanwhile.
-        return at, store.repeated(table, period_s)
+            row = pa.Table.from_pylist([manifest], recording_schema())
+            return store.stage(row, table, instead_of=read)
 
     @contextmanager
     def _frames_written(
@@ -314,7 +319,7 @@ class _Ingest:
             for topic, count in steps.clock.off_clock.items()
         ]
 
-    def _notes(self, steps: Steps, table: pa.Table, repeats: RepeatedDrive | None) -> list[str]:
+    def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *self.told.notes, *steps.notes]
         if clock.pace is not None:
@@ -347,8 +352,6 @@ class _Ingest:
                 f"{len(self.corrections)} corrections of its labels are kept"
                 + (f"; {idle} of them speak of conditions or steps that are gone" if idle else "")
             )
-        if repeats is not None:
-            notes.append(f"{repeats}; the audit `repeated_steps` fails until one is taken out")
         return notes
 
 

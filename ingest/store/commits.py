@@ -25,7 +25,6 @@ from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.task.schema import recording_schema
-from restock.ingest.task.signals import LIDAR_SIGNALS
 
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
@@ -41,9 +40,7 @@ class TableCommits(StoreReader):
 
         Columns that newer software writes are added; rows from before hold null in them.
         """
-        if self.path.folder is not None and self.path.folder.is_file():
-            raise StoreError("is a file, not a store", where=str(self.path), remedy="name a folder")
-
+        self.expect_folder()
         from restock.ingest.profile.custom_signal import refuse_other_signals
 
         def create() -> None:
@@ -64,16 +61,19 @@ class TableCommits(StoreReader):
 
         self.again_on_conflict(create)
 
-    def allow_nulls(self, rows: pa.Table) -> None:
-        """Let signals be null where they are in these rows: in a store of an older Restock the
-        clearance of a robot without a lidar was a number."""
-        names = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]
-        names = [name for name in names if rows[name].null_count]
+    def expect_folder(self) -> None:
+        """Raises StoreError where there is a file in place of the store."""
+        if self.path.folder is not None and self.path.folder.is_file():
+            raise StoreError("is a file, not a store", where=str(self.path), remedy="name a folder")
+
+    def allow_nulls(self, names: Collection[str]) -> None:
+        """Let these signals be null: in a store of an older Restock the clearance of a robot
+        without a lidar was a number."""
 
         def allow() -> None:
             table = self.path.open_table(TRANSITIONS)
             strict = {field.name for field in table.schema().fields if not field.nullable}
-            for name in names:
+            for name in sorted(names):
                 if name in strict:
                     table.alter.drop_column_not_null(name)
 

@@ -15,14 +15,7 @@ import pyarrow as pa
 
 from restock.ingest.store.lineage import READERS, Ingest, StoredFile, own_path, stored_files
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
-from restock.ingest.store.repeated import (
-    SKETCH,
-    UNREADABLE,
-    RepeatedDrive,
-    Sketch,
-    find_repeat,
-    read_sketch,
-)
+from restock.ingest.store.repeated import SKETCH, UNREADABLE, Hashes, Sketch, read_sketch
 from restock.ingest.store.summary import with_ends
 from restock.ingest.store.version import Version
 from restock.ingest.task.schema import recording_schema
@@ -138,19 +131,7 @@ class StoreReader:
         held = [one for file in self.files(TRANSITIONS, version) for one in file.ingests]
         return list({one.ingest_id: one for one in held}.values())
 
-    def repeated(self, rows: pa.Table, period_s: float) -> RepeatedDrive | None:
-        """The recording that holds most of these rows under other ids, if one largely does.
-
-        `period_s` is the control period: rows further apart than half of it do not count.
-        Recordings that older software wrote are not looked at; the audit `repeated_steps` does.
-        """
-        if not self.path.has_table(TRANSITIONS):
-            return None
-        own = rows["recording_id"][0].as_py()
-        others = [one for one in self.shown() if one.recording_id != own]
-        return find_repeat(rows, self._sketches(others), self.rows, period_s)
-
-    def _sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
+    def sketches(self, ingests: Sequence[Ingest]) -> list[Sketch]:
         """Their sketches, each read once: many recordings would read all others' as many times."""
         names = ("recording_id", "ingest_id", "sketch")
         schema = pa.schema([(name, pa.string()) for name in names])
@@ -162,6 +143,10 @@ class StoreReader:
             _SKETCHES[self.path, sketch.ingest_id] = sketch
         keys = [(self.path, one.ingest_id) for one in ingests]
         return [_SKETCHES[key] for key in keys if key in _SKETCHES]
+
+    def remember(self, recording_id: str, ingest_id: str, contents: Hashes) -> None:
+        """Keep the sketch of an ingest that was just written: it need not be read."""
+        _SKETCHES[self.path, ingest_id] = Sketch.of(recording_id, ingest_id, contents)
 
 
 def frame_files(manifests: pa.Table) -> list[str]:

@@ -58,6 +58,11 @@ class Sketch:
     ingest_id: str
     hashes: Hashes
 
+    @classmethod
+    def of(cls, recording_id: str, ingest_id: str, hashes: Hashes) -> Sketch:
+        """That of a recording with these `distinctive` hashes."""
+        return cls(recording_id, ingest_id, hashes[:SKETCH_HASHES])
+
 
 def sketch(hashes: Hashes) -> bytes:
     """The sketch of a recording's `distinctive` hashes, for `SKETCH`."""
@@ -132,22 +137,23 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive |
 
 
 def find_repeat(
-    rows: pa.Table,
+    mine: Hashes,
+    rows: Callable[[], pa.Table],
     sketches: Iterable[Sketch],
     read: Callable[[str, str], pa.Table],
     period_s: float,
 ) -> RepeatedDrive | None:
     """The recording that holds the most of the rows, of those that `compare` finds the same.
 
-    `read(recording_id, ingest_id)` gives the rows of one whose sketch looks alike.
+    `mine` are the rows' `distinctive` hashes; `rows()`, and `read(recording_id, ingest_id)` of one
+    whose sketch looks alike, are asked for where there is one.
     """
-    mine, _ = distinctive(rows)
     found = []
     for one in sketches:
         if looks_alike(mine, one):
             with suppress(*UNREADABLE):
                 other = read(one.recording_id, one.ingest_id)
-                found.append(compare(rows, other, period_s))
+                found.append(compare(rows(), other, period_s))
     return max(
         (repeat for repeat in found if repeat is not None),
         key=lambda repeat: (repeat.rows, repeat.recording_id),

@@ -1,4 +1,4 @@
-"""The store, for writing: two Delta tables of plain Parquet, one atomic commit a recording.
+"""The store, for writing: two Delta tables of plain Parquet, and commits that are atomic.
 
 `recordings` holds one manifest row an ingest, `transitions` the rows; `ingest_id` joins them, and
 both files of an ingest have the same name in their tables. The manifest is committed first and the
@@ -16,9 +16,12 @@ there for whom a manifest names them to. A file lives for as long as a manifest 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -27,10 +30,12 @@ from restock.files import first_line
 from restock.ingest.store.commits import TableCommits, delta_columns, recording_columns
 from restock.ingest.store.data_files import AddedFile, parquet_options
 from restock.ingest.store.lineage import own_path, stored_files
-from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS
+from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import frame_files
+from restock.ingest.store.repeated import Hashes, RepeatedDrive, Sketch, find_repeat
 from restock.ingest.store.summary import summarised
 from restock.ingest.task.schema import frame_schema
+from restock.ingest.task.signals import LIDAR_SIGNALS
 
 # Files that no version of a table needs are kept this long: a writer may be about to commit them,
 # and a reader that opened an older version may be about to read them.
@@ -38,8 +43,51 @@ RETENTION_HOURS = 7 * 24
 ROW_GROUP_ROWS = 32_768
 
 
+@dataclass(frozen=True)
+class Staged:
+    """A recording whose files are written and in no commit yet."""
+
+    recording_id: str
+    ingest_id: str
+    manifest: AddedFile
+    rows: AddedFile  # of `transitions`
+    columns: pa.Schema  # of `transitions`
+    nulls: Sequence[str]  # signals that a robot without a lidar has not
+    contents: Hashes  # of its distinctive rows, (N,) ascending
+    instead_of: str | None = None  # the ingest that was read to make it, if one was
+
+
 class StoreWriter(TableCommits):
     """Writes recordings to a store, which is made when the first one is written."""
+
+    def __init__(self, path: str | Path | Location) -> None:
+        super().__init__(path)
+        self._fitting: list[pa.Schema] = []  # columns that its tables are known to have
+
+    def repeated(
+        self,
+        recording: Staged,
+        period_s: float,
+        *,
+        ahead: Sequence[Staged] = (),
+        aside: Collection[str] = (),
+    ) -> RepeatedDrive | None:
+        """The recording that holds most of one's rows under other ids, if one largely does.
+
+        `period_s` is the control period: rows further apart than half of it do not count. Those
+        `ahead` of it are looked at as if they were in the store, ingests `aside` are not.
+        Recordings that older software wrote are not looked at; the audit `repeated_steps` does.
+        """
+        shown = self.shown() if self.path.has_table(TRANSITIONS) else []
+        others = [one for one in shown if one.ingest_id not in aside]
+        sketches = [
+            *self.sketches([one for one in others if one.recording_id != recording.recording_id]),
+            *(Sketch.of(one.recording_id, one.ingest_id, one.contents) for one in ahead),
+        ]
+        own = recording.recording_id, recording.ingest_id
+        return find_repeat(
+            recording.contents, lambda: self.rows(*own), sketches, self.rows, period_s
+        )
 
     def write_frames(self, path: str, batches: Iterable[pa.RecordBatch]) -> int:
         """Write a recording's frames to a file of `frames`; returns how many they are.
@@ -96,35 +144,87 @@ class StoreWriter(TableCommits):
         Raises:
             StoreError: as `write`, or what was to be replaced has changed.
         """
-        manifests: list[AddedFile] = []
-        transitions: list[AddedFile] = []
-        created: tuple[pa.Schema, ...] = ()
+        staged: list[Staged] = []
         try:
             for manifest, rows in recordings:
-                recording_id = manifest["recording_id"][0].as_py()
-                name = own_path(recording_id, manifest["ingest_id"][0].as_py())
-                manifest = summarised(manifest, rows)
-                schemas = recording_columns(), delta_columns(rows.schema)
-                if schemas != created:
-                    self.create(RECORDINGS, schemas[0])
-                    self.create(TRANSITIONS, schemas[1])
-                    created = schemas
-                self.allow_nulls(rows)
-                for table, what, added in (
-                    (manifest, RECORDINGS, manifests),
-                    (rows, TRANSITIONS, transitions),
-                ):
-                    added.append(AddedFile(recording_id, name, len(table)))
-                    added[-1].size = self._write(table, f"{what}/{name}")
+                staged.append(self.stage(manifest, rows))
+                self.fit(staged[-1:])
         except BaseException:  # no commit has begun, so they are not needed
-            with suppress(OSError, StoreError):
-                self.path.delete(f"{RECORDINGS}/{file.path}" for file in manifests)
-                self.path.delete(f"{TRANSITIONS}/{file.path}" for file in transitions)
+            self.discard(staged)
             raise
-        self.commit(RECORDINGS, manifests, instead_of or {})
-        version, replaced = self.commit(TRANSITIONS, transitions, instead_of or {})
+        return self._commit_files(staged, instead_of or {})
+
+    def stage(self, manifest: pa.Table, rows: pa.Table, *, instead_of: str | None = None) -> Staged:
+        """Write the files of a recording, of which nothing shows before `commit_staged`.
+
+        Raises:
+            StoreError: they cannot be written.
+        """
+        self.expect_folder()
+        ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
+        manifest = summarised(manifest, rows)
+        nulls = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]
+        contents = manifest["distinctive_rows"].combine_chunks().flatten().field("content")
+        staged = Staged(
+            *ids,
+            AddedFile(ids[0], own_path(*ids), len(manifest)),
+            AddedFile(ids[0], own_path(*ids), len(rows)),
+            delta_columns(rows.schema).remove_metadata(),
+            [name for name in nulls if rows[name].null_count],
+            np.sort(contents.to_numpy().view(np.uint64)),
+            instead_of,
+        )
+        try:
+            staged.manifest.size = self._write(manifest, f"{RECORDINGS}/{staged.manifest.path}")
+            staged.rows.size = self._write(rows, f"{TRANSITIONS}/{staged.rows.path}")
+        except BaseException:
+            self.discard([staged])
+            raise
+        return staged
+
+    def commit_staged(self, staged: Sequence[Staged]) -> int:
+        """Commit recordings that the tables `fit`, each of them once, together: all or none.
+
+        Returns the version of `transitions` that has them.
+
+        Raises:
+            StoreError: what one was to replace has changed, or other writers were faster too many
+                times. What is left is deleted when it is older than the window of `clean`.
+        """
+        read = {one.recording_id: one.instead_of for one in staged if one.instead_of}
+        version = self._commit_files(staged, read)
+        for one in staged:
+            self.remember(one.recording_id, one.ingest_id, one.contents)
+        return version
+
+    def _commit_files(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> int:
+        self.commit(RECORDINGS, [one.manifest for one in staged], instead_of)
+        version, replaced = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
         self.remove(RECORDINGS, replaced)
         return version
+
+    def fit(self, staged: Sequence[Staged]) -> None:
+        """See that the tables are there, and have the columns of these recordings.
+
+        Raises:
+            StoreError: they cannot be written, or have other columns by these names.
+        """
+        for one in staged:
+            if one.columns not in self._fitting:
+                self.create(RECORDINGS, recording_columns())
+                self.create(TRANSITIONS, one.columns)
+                self._fitting.append(one.columns)
+        self.allow_nulls({name for one in staged for name in one.nulls})
+
+    def discard(self, staged: Sequence[Staged]) -> None:
+        """Delete the files of recordings whose commit has not begun, with their frames."""
+        with suppress(OSError, StoreError):
+            for name, files in (
+                (RECORDINGS, [one.manifest for one in staged]),
+                (TRANSITIONS, [one.rows for one in staged]),
+                (FRAMES, [one.rows for one in staged]),
+            ):
+                self.path.delete(f"{name}/{file.path}" for file in files)
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
         """Delete files that no version within the retention window needs; returns their paths.

@@ -41,7 +41,8 @@ from restock.ingest.camera.images import (
     raw_layout,
 )
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.pipeline import IngestResult, ingest
+from restock.ingest.pipeline import ingest
+from restock.ingest.prepared import IngestResult
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.store.writer import StoreWriter
@@ -262,7 +263,7 @@ def test_nothing_is_left_of_frames_where_the_commit_fails(
     def fail(*_: object, **__: object) -> None:
         raise StoreError("no")
 
-    monkeypatch.setattr(StoreWriter, "write_all", fail)
+    monkeypatch.setattr(StoreWriter, "fit", fail)
     with pytest.raises(StoreError):
         ingest(bag, profile_with(), store=StoreWriter(tmp_path / "store"))
     assert list((tmp_path / "store").rglob("*.parquet")) == []

@@ -19,7 +19,8 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import MixtureError
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.pipeline import IngestResult, ingest
+from restock.ingest.pipeline import ingest
+from restock.ingest.prepared import IngestResult
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.steps import steps_of

@@ -15,7 +15,7 @@ from support.paths import ROOT
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.batch import IngestJob, ingest_all
-from restock.ingest.on_ray import run_on_ray
+from restock.ingest.on_ray import prepare_on_ray
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store
 
@@ -43,10 +43,10 @@ def cluster() -> Iterator[None]:
 
 
 class _Broken(IngestJob):
-    def run(self, path):
+    def prepare(self, path):
         if path.name == "drive1":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().run(path)
+        return super().prepare(path)
 
 
 def table(store: Path):
@@ -77,7 +77,7 @@ def test_the_store_and_the_answers_are_those_of_one_process(bags, tmp_path, clus
 @pytest.mark.long  # test_workers has that of processes
 def test_a_task_that_dies_costs_its_recording_only(bags, tmp_path, cluster):
     job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
-    results = dict(run_on_ray(job, [bags / f"drive{number}" for number in range(3)]))
+    results = dict(ingest_all([bags / f"drive{number}" for number in range(3)], job, engine="ray"))
     assert "the process that read it died" in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}
 
@@ -93,7 +93,7 @@ def test_the_command(bags, tmp_path, cluster, capsys):
 def test_without_ray_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"pip install 'restock\[ray\]'"):
-        list(run_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
+        list(prepare_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
 
 
 def test_a_cluster_that_is_not_there_is_said_so(monkeypatch):
@@ -101,4 +101,4 @@ def test_a_cluster_that_is_not_there_is_said_so(monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1: .*refused"):
-        list(run_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))
+        list(prepare_on_ray(IngestJob(load_profile("warehouse_amr"), None), [Path("x.mcap")]))

@@ -90,8 +90,11 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
     for index in (1, 2):
         rows = recording_transitions(index, episodes=40)
         assert len(rows) > 2 * SKETCH_HASHES
-        assert store.repeated(rows, 0.2) is None
-        store.write(manifest(rows), rows)
+        staged = store.stage(manifest(rows), rows)
+        assert store.repeated(staged, 0.2) is None
+        store.fit([staged])
+        store.commit_staged([staged])
+        assert store.repeated(staged, 0.2) is None
 
 
 def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,8 +109,9 @@ def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(StoreWriter, "manifests", counted)
     for index in (1, 2, 3):
         rows = recording_transitions(index, episodes=5)
+        staged = writer.stage(manifest(rows), rows)
         writer.write(manifest(rows), rows)
-        assert StoreWriter(tmp_path / "s").repeated(rows, 0.1) is None
+        assert StoreWriter(tmp_path / "s").repeated(staged, 0.1) is None
     assert asked == [0, 1, 1]
 
 

@@ -40,15 +40,15 @@ def _length(path: Path) -> int:
     return len(path.name)
 
 
-def test_each_path_once_in_order_whoever_dies() -> None:
+def test_each_path_once_whoever_dies() -> None:
     names = ["slow", "a", "killed1", "bb", "ccc", "gone", "dddd", "killed2"]
     found = side_by_side(_length, [Path(name) for name in names], 2, died=lambda path, code: code)
-    assert list(found) == [4, 1, -9, 2, 3, 7, 4, -9]
+    assert sorted(found) == list(enumerate([4, 1, -9, 2, 3, 7, 4, -9]))
 
 
 def test_a_caller_that_stops_early_stops_the_work() -> None:
     found = side_by_side(_length, [Path("a"), *[Path("slow")] * 50], 2, died=lambda *_: -1)
-    assert next(found) == 1
+    assert next(found) in ((0, 1), (1, 4))
     found.close()
     assert multiprocessing.active_children() == []
 
@@ -56,10 +56,10 @@ def test_a_caller_that_stops_early_stops_the_work() -> None:
 class _Broken(IngestJob):
     """A job that fails in another way for each recording."""
 
-    def run(self, path):
+    def prepare(self, path):
         if path.name == "drive1":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().run(path)
+        return super().prepare(path)
 
 
 def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
@@ -95,14 +95,14 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
 def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):
     from restock.ingest import pipeline
 
-    ingest = pipeline.ingest
+    prepare = pipeline.prepare
 
     def failing(path, *args, **kwargs):
         if path.name == "drive1":
             raise error
-        return ingest(path, *args, **kwargs)
+        return prepare(path, *args, **kwargs)
 
-    monkeypatch.setattr(pipeline, "ingest", failing)
+    monkeypatch.setattr(pipeline, "prepare", failing)
     job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))

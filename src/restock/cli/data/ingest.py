@@ -13,12 +13,12 @@ import tyro
 from restock.errors import ConfigError, ExitCode, RecordingError, RestockError
 
 if TYPE_CHECKING:
-    from restock.ingest.pipeline import IngestResult
+    from restock.ingest.prepared import IngestResult
 
 
 @dataclass
 class IngestCommand:
-    """Turn recordings into labelled transitions in a store, one atomic commit per recording.
+    """Turn recordings into labelled transitions in a store, each whole or not at all.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
     recordings, or a quoted glob. A recording that is in the store with the same content and

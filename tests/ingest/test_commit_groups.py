@@ -1,0 +1,218 @@
+"""Several recordings are committed at once: none is lost, and one that fails costs itself alone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from deltalake import DeltaTable
+from support.driven_robot import Drive, write_bag
+from support.stores import manifest, one, recording_transitions, shown
+
+from restock.errors import RecordingError, StoreError
+from restock.ingest import prepared as prepared_module
+from restock.ingest.batch import IngestJob, ingest_all
+from restock.ingest.prepared import GROUP_S, CommitGroup, IngestResult, OnRepeat, Prepared
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.transitions import replaced
+from restock.ingest.store.writer import StoreWriter
+
+
+def waiting(
+    store: StoreWriter,
+    recording: tuple[pa.Table, pa.Table],
+    repeated: OnRepeat | None = None,
+    instead_of: str | None = None,
+) -> Prepared:
+    staged = store.stage(*recording, instead_of=instead_of)
+    return Prepared(IngestResult("x", "written", {}), staged, repeated, 0.2)
+
+
+def versions(store: Path) -> list[int]:
+    """Of both tables: how often each was committed to after it was made."""
+    return [DeltaTable(str(store / name)).version() for name in ("recordings", "transitions")]
+
+
+def files(store: Path) -> set[str]:
+    return {path.relative_to(store).as_posix() for path in store.rglob("*.parquet")}
+
+
+def test_the_first_is_committed_at_once_and_then_those_of_some_seconds_together(tmp_path):
+    store, now = StoreWriter(tmp_path / "s"), [0.0]
+    group = CommitGroup(store, clock=lambda: now[0])
+    assert group.due_in_s() is None
+    group.add(0, waiting(store, one(1)))
+    assert list(group.results) == [0]
+    for place in (1, 2, 3):
+        now[0] += 1.0
+        group.add(place, waiting(store, one(place + 1)))
+    assert list(group.results) == [0]
+    assert group.due_in_s() == GROUP_S - 3.0
+    now[0] = GROUP_S
+    group.commit_if_due()
+    assert {place: result.version for place, result in group.results.items()} == {
+        0: 1, 1: 2, 2: 2, 3: 2
+    }  # fmt: skip
+    assert versions(tmp_path / "s") == [2, 2]
+    assert len(shown(tmp_path / "s")) == 4
+
+
+def test_no_more_than_so_many_wait(tmp_path, monkeypatch):
+    monkeypatch.setattr(prepared_module, "MOST", 2)
+    store = StoreWriter(tmp_path / "s")
+    group = CommitGroup(store, clock=lambda: 0.0)
+    for place in range(5):
+        group.add(place, waiting(store, one(place + 1)))
+    assert list(group.results) == [0, 1, 2, 3, 4]
+    assert versions(tmp_path / "s") == [3, 3]
+
+
+def test_what_waits_and_is_not_wanted_leaves_no_file(tmp_path):
+    store = StoreWriter(tmp_path / "s")
+    group = CommitGroup(store, clock=lambda: 0.0)
+    group.add(0, waiting(store, one(1)))
+    before = files(tmp_path / "s")
+    group.add(1, waiting(store, one(2)))
+    assert files(tmp_path / "s") > before
+    group.discard()
+    assert files(tmp_path / "s") == before
+    assert list(shown(tmp_path / "s")) == ["0000000000000001-a"]
+
+
+def test_one_that_cannot_be_committed_costs_itself_alone(tmp_path):
+    store = StoreWriter(tmp_path / "s")
+    group = CommitGroup(store, clock=lambda: 0.0)
+    group.add(0, waiting(store, one(1, "a")))
+    group.add(1, waiting(store, one(2)))
+    group.add(2, waiting(store, one(1, "c"), instead_of="b"))  # which is not there
+    group.add(3, waiting(store, one(3)))
+    group.commit()
+    assert isinstance(group.results[2], StoreError)
+    assert "ingested again meanwhile" in str(group.results[2])
+    kept = {"0000000000000001-a", "0000000000000002-a", "0000000000000003-a"}
+    assert set(shown(tmp_path / "s")) == kept
+
+
+def test_the_later_ingest_of_a_recording_replaces_the_one_before_it_in_the_group(tmp_path):
+    store = StoreWriter(tmp_path / "s")
+    group = CommitGroup(store, clock=lambda: 0.0)
+    group.add(0, waiting(store, one(1)))
+    group.add(1, waiting(store, one(2, "a")))
+    group.add(2, waiting(store, one(2, "b", seed=9)))
+    group.commit()
+    assert {place: result.version for place, result in group.results.items()} == {0: 1, 1: 2, 2: 3}
+    assert set(shown(tmp_path / "s")) == {"0000000000000001-a", "0000000000000002-b"}
+
+
+@pytest.mark.parametrize("repeated", ["refuse", "keep"])
+def test_the_same_drive_twice_in_a_group_is_found_as_one_after_the_other(tmp_path, repeated):
+    store = StoreWriter(tmp_path / "s")
+    rows = recording_transitions(2, episodes=5)
+    copy = replaced(
+        rows,
+        {
+            "recording_id": f"{7:016x}",
+            "transition_id": rows["transition_id"].to_numpy() + (1 << 40),
+            "ingest_id": "z",
+        },
+    )
+    group = CommitGroup(store, clock=lambda: 0.0)
+    group.add(0, waiting(store, one(1), repeated))
+    group.add(1, waiting(store, (manifest(rows), rows), repeated))
+    group.add(2, waiting(store, (manifest(copy), copy), repeated))
+    group.commit()
+    first, second = group.results[1], group.results[2]
+    assert isinstance(first, IngestResult)
+    assert first.repeats is None
+    if repeated == "refuse":
+        assert isinstance(second, RecordingError)
+        assert "the same drive twice" in str(second)
+        assert not [name for name in files(tmp_path / "s") if f"{7:016x}" in name]
+    else:
+        assert isinstance(second, IngestResult)
+        assert second.repeats is not None
+        assert second.repeats.recording_id == f"{2:016x}"
+    assert len(shown(tmp_path / "s")) == (2 if repeated == "refuse" else 3)
+
+
+def test_a_recording_that_is_given_twice_is_unchanged_the_second_time(tmp_path):
+    for number in (1, 2):
+        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), tmp_path / f"bag{number}")
+    shutil.copytree(tmp_path / "bag2", tmp_path / "bag3")
+    job = IngestJob(load_profile("warehouse_amr"), tmp_path / "s")
+    paths = [tmp_path / f"bag{number}" for number in (1, 2, 3)]
+    statuses = [result.status for _, result in ingest_all(paths, job)]
+    assert statuses == ["written", "written", "unchanged"]
+
+
+KILLED = """
+import os, signal, sys
+from support.stores import one
+from restock.ingest.prepared import CommitGroup, IngestResult, Prepared
+from restock.ingest.store.writer import StoreWriter
+
+place, when = sys.argv[1:]
+store = StoreWriter(place)
+group = CommitGroup(store, clock=lambda: 0.0)
+commit, remove = StoreWriter.commit, StoreWriter.remove
+
+def killed(at):
+    if at == when and len(group.results) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+def committing(self, name, *rest):
+    killed(f"before {name}")
+    found = commit(self, name, *rest)
+    killed(f"after {name}")
+    return found
+
+StoreWriter.commit = committing
+for number in (1, 2, 3):
+    staged = store.stage(*one(number, "b", seed=number))
+    group.add(number, Prepared(IngestResult("x", "written", {}), staged))
+killed("waiting")
+group.commit()
+"""
+
+
+@pytest.mark.parametrize(
+    ("when", "there"),
+    [("waiting", 1), ("before recordings", 1), ("after recordings", 1), ("after transitions", 3)],
+)
+def test_a_killed_process_leaves_whole_groups_and_the_same_again_goes_on(tmp_path, when, there):
+    place = tmp_path / "s"
+    StoreWriter(place).write(*one(3, "old"))  # one of the second group replaces
+    child = subprocess.run([sys.executable, "-c", KILLED, str(place), when], env=os.environ.copy())
+    assert child.returncode == -signal.SIGKILL
+    before = set(shown(place))
+    assert before == (
+        {f"{number:016x}-b" for number in (1, 2, 3)}
+        if there == 3
+        else {f"{1:016x}-b", f"{3:016x}-old"}
+    )
+    store = StoreWriter(place)
+    again = CommitGroup(store, clock=lambda: 0.0)
+    for number in (1, 2, 3):
+        if f"{number:016x}-b" not in before:
+            again.add(number, waiting(store, one(number, "c", seed=number)))
+    again.commit()
+    assert [name[:16] for name in sorted(shown(place))] == [f"{n:016x}" for n in (1, 2, 3)]
+    assert store.clean() == []  # another writer may be about to commit what lies there
+    old = time.time() - 3600
+    for path in place.rglob("*.parquet"):
+        os.utime(path, (old, old))
+    store.clean(retention_hours=0)
+    named = {
+        f"{name}/{file.path}"
+        for name in ("recordings", "transitions")
+        for file in store.files(name)
+    }
+    assert {name for name in files(place) if "_delta_log" not in name} == named
+    assert len(named) == 6
