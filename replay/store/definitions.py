@@ -206,12 +206,6 @@ def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
     return made is not None
 
 
-def install(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
-    """Create all views and macros over `stored_transitions` and `stored_recordings`."""
-    connection.execute(definitions(observation_type))
-    install_columns(connection)
-
-
 def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str) -> None:
     """Create those of COMMON, in the schema in use, over that of one store."""
     connection.execute("\n".join(_statements(_of_store(observation_type, COMMON)).values()))
