@@ -17,8 +17,9 @@ help:
 	@echo "make notebook     run docs/tutorial.md, and write its outputs and docs/tutorial.ipynb"
 	@echo "make sample-logs  record sample_logs/ again from its seed"
 
-# The stamp files make each target install only what it needs, once per change of pyproject.toml.
-$(VENV)/.runtime: pyproject.toml
+# The stamp files make each target install only what it needs, once per change of pyproject.toml or of
+# the C files, which installing compiles where a compiler is.
+$(VENV)/.runtime: pyproject.toml $(wildcard src/restock/compiled/*)
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Restock needs Python 3.11 or newer: set PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -e .

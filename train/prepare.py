@@ -405,7 +405,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "config": msgspec.to_builtins(config),
         "panel": fed,
         "target": describe(config.target),
-        "update_path": update_path(config.network, config.device),
+        "update_path": update_path(config.network, config.device, config.threads),
         **profile_document(profile),
         # Conditions of logs alone, with the signals that the twin does not fill.
         "not_evaluated": conditions_in_twin(

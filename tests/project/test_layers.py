@@ -18,7 +18,10 @@ from support.paths import ROOT
 
 MOST_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
-SHARED = {"arrays", "errors", "files", "imports", "public", "state", "stats", "toml", "toml_schema"}
+SHARED = {
+    *("arrays", "errors", "files", "imports", "native", "public"),
+    *("state", "stats", "toml", "toml_schema"),
+}
 MAY_IMPORT = {
     "ingest": "camera containers profile steps store task",
     "ingest/decoding": "",

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from restock import native
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.flat_adam import FlatParameters
 from restock.train.dqn.learner import Learner
@@ -24,6 +25,7 @@ from restock.train.dqn.manual_backprop import ManualBackprop, update_path
 from restock.train.dqn.network import QNetwork, clone
 
 OBSERVATION, ACTIONS, BATCH = 7, 4, 12
+BY_HAND = ["manual", "native"] if native.is_used() else ["manual"]
 SHAPES = list(itertools.product([(3,), (16, 16), (5, 9, 4)], [False, True]))
 
 
@@ -151,7 +153,8 @@ def rows(seed: int) -> Tensor:
     ],
     ids=str,
 )
-def test_learning_by_hand_is_learning_by_autograd(sections: dict[str, Any]) -> None:
+@pytest.mark.parametrize("path", BY_HAND)
+def test_learning_by_hand_is_learning_by_autograd(path: str, sections: dict[str, Any]) -> None:
     given = {
         "weight": normal(BATCH, seed=8).abs().float(),
         "logged": 8,
@@ -159,7 +162,7 @@ def test_learning_by_hand_is_learning_by_autograd(sections: dict[str, Any]) -> N
         "return_to_go": normal(8, seed=9).float(),
         "expert": torch.arange(8) % 2 == 0 if "margin" in sections.get("loss", {}) else None,
     }
-    by_hand, by_graph = learner("manual", **sections), learner("autograd", **sections)
+    by_hand, by_graph = learner(path, **sections), learner("autograd", **sections)
     for step in range(1, 9):
         ours, theirs = (each.update(rows(step), **given) for each in (by_hand, by_graph))  # type: ignore[arg-type]
         torch.testing.assert_close(ours.value, theirs.value.detach())
@@ -176,21 +179,22 @@ def test_the_way_is_chosen_by_the_network_and_the_device() -> None:
     def of(**network: Any) -> str:
         return update_path(parse_config({"network": network}, where="test").network, "cpu")
 
-    assert of() == of(layer_norm=False, hidden=(8,)) == "manual"
+    assert of() == of(layer_norm=False, hidden=(8,)) == BY_HAND[-1]
     assert of(dueling=True) == of(quantiles=8) == of(ensemble=2) == "autograd"
     assert update_path(parse_config({}, where="test").network, "cuda") == "autograd"
-    assert learner(None).path == "manual"
+    assert learner(None).path == BY_HAND[-1]
 
 
-def test_a_learner_that_is_restored_learns_on_as_it_would_have() -> None:
-    first = learner("manual")
+@pytest.mark.parametrize("path", BY_HAND)
+def test_a_learner_that_is_restored_learns_on_as_it_would_have(path: str) -> None:
+    first = learner(path)
     for step in range(1, 4):
         first.update(rows(step))
     state = first.state_dict()
     # Moments are kept a parameter: in shape and order as an optimizer of each would.
     shapes = [parameter.shape for parameter in first.network.parameters()]
     assert [entry["exp_avg"].shape for entry in state["optimizer"]["moments"].values()] == shapes
-    second = learner("manual", seed=5)  # type: ignore[arg-type]
+    second = learner(path, seed=5)  # type: ignore[arg-type]
     second.load_state_dict(state)
     for each in (first, second):
         each.update(rows(9))

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from restock import native
 from restock.train.dqn import products
 from restock.train.dqn.flat_adam import FlatAdam
 from restock.train.dqn.products import affine, product, product_into
@@ -81,21 +82,26 @@ def test_an_operator_that_does_something_else_is_not_used(
 
 
 @pytest.mark.parametrize("max_grad_norm", [None, 0.5])
-def test_adam_moves_as_pytorchs_does(max_grad_norm: float | None) -> None:
+@pytest.mark.parametrize("compiled", [False, True] if native.is_used() else [False])
+def test_adam_moves_as_pytorchs_does(max_grad_norm: float | None, compiled: bool) -> None:
     torch.manual_seed(0)
     ours, theirs = nn.Linear(48, 16), nn.Linear(48, 16)  # sizes of whole cache lines
     theirs.load_state_dict(ours.state_dict())
-    flat = FlatAdam(ours, 1e-2, max_grad_norm)
+    flat = FlatAdam(ours, 1e-2, max_grad_norm, compiled=compiled)
+    average = flat.values.clone()
+    followed = average.clone()
     whole = torch.cat([part.detach().flatten() for part in theirs.parameters()])
     adam = torch.optim.Adam([whole], lr=1e-2, fused=True)
     for _ in range(20):
         flat.gradient.normal_()
         whole.grad = flat.gradient.clone()
-        flat.step()
+        flat.step(average, 0.1)
         if max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_([whole], max_grad_norm)
         adam.step()
+        followed.lerp_(whole, 0.1)
     assert torch.equal(flat.values, whole)
+    assert torch.equal(average, followed)
     assert float(flat.moments["0"]["step"]) == 20
     flat.forget()
     assert flat.moments == {}

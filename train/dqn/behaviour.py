@@ -20,8 +20,8 @@ from torch.nn import functional
 from restock.replay.mixture.schedules import value_at
 from restock.state import Stateful
 from restock.train.dqn.config import TeacherConfig, TrainConfig
-from restock.train.dqn.flat_adam import FlatAdam, FlatParameters
-from restock.train.dqn.manual_backprop import ManualBackprop
+from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
+from restock.train.dqn.manual_backprop import UpdatePath, make_backprop
 from restock.train.dqn.network import Network, QNetwork, clone, make_network
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
@@ -139,7 +139,7 @@ class Behaviour(Stateful):
 
     Args:
         averaging: the rate of the average of weights, as of Q's.
-        by_hand: gradients without autograd: on the CPU.
+        path: which way gradients are made.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates", "in_force")
@@ -153,15 +153,16 @@ class Behaviour(Stateful):
         seed: int,
         averaging: float,
         device: torch.device,
-        by_hand: bool,
+        path: UpdatePath,
     ) -> None:
         self.config, self._averaging = config, averaging
         generator = torch.Generator().manual_seed(_SEED + seed)
         self.network = make_behaviour(config, observation_size, actions, generator).to(device)
         self.average = clone(self.network)
-        self.optimizer = FlatAdam(self.network, config.learning_rate)
+        self.optimizer = FlatAdam(self.network, config.learning_rate, compiled=path == "native")
         self._slow = FlatParameters(self.average, learns=False).values
-        self._by_hand = ManualBackprop(self.network) if by_hand else None
+        learns = self.optimizer
+        self._by_hand = make_backprop(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.zeros((), device=device)  # shared with the networks that it filters
         self.move_to(0)
@@ -188,11 +189,8 @@ class Behaviour(Stateful):
             self.optimizer.gradient.zero_()
             loss = imitation_loss(self.network(labelled.observation), labelled.action)
             loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizer.step()
         self.updates += 1
-        with torch.no_grad():
-            rate = max(self._averaging, 1.0 / self.updates)
-            self._slow.lerp_(self.optimizer.values, rate)
+        self.optimizer.step(self._slow, averaging_rate(self._averaging, self.updates))
 
     @torch.no_grad()
     def plausible(self, observation: Tensor) -> Tensor:

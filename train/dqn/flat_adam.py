@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+from restock import native
 from restock.state import Stateful
 
 _ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
@@ -62,6 +63,17 @@ class FlatParameters:
 
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, as PyTorch names them
+_BETAS, _EPS = (0.9, 0.999), 1e-8  # Adam's
+
+
+def averaging_rate(rate: float, steps: int) -> float:
+    """At which an average of weights goes to those of step number `steps` (from 1).
+
+    The greedy policy of a single update is noisy: a small change of values turns over many
+    actions at once. The average over the last 1 / rate updates is not (Polyak and Juditsky 1992).
+    Until there are as many, it is the mean of all of them.
+    """
+    return max(rate, 1.0 / steps)
 
 
 class FlatAdam(Stateful):
@@ -74,36 +86,61 @@ class FlatAdam(Stateful):
         network: whose parameters are moved into `values`, their gradients into `gradient`.
         learning_rate: Adam's.
         max_grad_norm: to which a longer gradient is cut; None: never.
+        compiled: by the compiled step, to the same bits: one pass over memory, the average's too.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("moments",)
 
     def __init__(
-        self, network: nn.Module, learning_rate: float, max_grad_norm: float | None = None
+        self,
+        network: nn.Module,
+        learning_rate: float,
+        max_grad_norm: float | None = None,
+        *,
+        compiled: bool = False,
     ) -> None:
         self._flat = FlatParameters(network, learns=True)
         self.values, self.gradient = self._flat.values, self._flat.gradient
         self.learning_rate, self.max_grad_norm = learning_rate, max_grad_norm
+        self._compiled = compiled
         self.forget()
 
     @torch.no_grad()
-    def step(self) -> None:
-        """Move the parameters by the gradient that they have."""
+    def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:
+        """Move the parameters by the gradient that they have; then `average` to them, by `rate`."""
         if self.max_grad_norm is not None:
             torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
-        average, squares = self._moments
+        self._steps += 1
+        if self._compiled:
+            self._compiled_step(average, rate)
+            return
+        moved, squares = self._moments
         adam(
-            *([self.values], [self.gradient], [average], [squares], [], [self._step]),
+            *([self.values], [self.gradient], [moved], [squares], [], [self._step]),
             fused=True,
             amsgrad=False,
-            beta1=0.9,
-            beta2=0.999,
+            beta1=_BETAS[0],
+            beta2=_BETAS[1],
             lr=self.learning_rate,
             weight_decay=0.0,
-            eps=1e-8,
+            eps=_EPS,
             maximize=False,
         )
-        self._steps += 1
+        if average is not None:
+            average.lerp_(self.values, rate)
+
+    def _compiled_step(self, average: Tensor | None, rate: float) -> None:
+        self._step.fill_(self._steps)
+        first, second = (1 - beta**self._steps for beta in _BETAS)
+        moved, squares = self._moments
+        native.compiled.adam(
+            self.values.detach().numpy(),
+            self.gradient.numpy(),
+            moved.numpy(),
+            squares.numpy(),
+            None if average is None else average.numpy(),
+            (*_BETAS, self.learning_rate / first, second**0.5, _EPS, rate),
+        )
 
     def forget(self) -> None:
         """Begin again without moments: the parameters were replaced."""
@@ -135,4 +172,4 @@ class FlatAdam(Stateful):
         ]
 
 
-__all__ = ["FlatAdam", "FlatParameters"]
+__all__ = ["FlatAdam", "FlatParameters", "averaging_rate"]

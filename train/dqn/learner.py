@@ -14,8 +14,8 @@ from torch import Tensor
 from restock.errors import ConfigError
 from restock.state import Stateful
 from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
-from restock.train.dqn.config import LossConfig, TrainConfig
-from restock.train.dqn.flat_adam import FlatAdam, FlatParameters
+from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
+from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
 from restock.train.dqn.loss import (
     Loss,
     conservative_gradient,
@@ -30,9 +30,17 @@ from restock.train.dqn.loss import (
     quantile_target,
     td_target,
 )
-from restock.train.dqn.manual_backprop import ManualBackprop, UpdatePath, update_path
+from restock.train.dqn.manual_backprop import (
+    ManualBackprop,
+    UpdatePath,
+    make_backprop,
+    update_path,
+)
+from restock.train.dqn.native_backprop import NativeBackprop, native_td_loss
 from restock.train.dqn.network import Network, clone, make_network
 from restock.train.dqn.target import TargetUpdate
+
+_ByHand = ManualBackprop | NativeBackprop
 
 
 @dataclass(frozen=True)
@@ -82,18 +90,20 @@ class Learner(Stateful):
         ).to(self.device)
         self.target_network = clone(self.network)
         self.policy_network = clone(self.network)
+        self.path = path or update_path(config.network, config.device, config.threads)
         self.optimizer = FlatAdam(
-            self.network, config.optimizer.learning_rate, config.optimizer.max_grad_norm
+            self.network,
+            config.optimizer.learning_rate,
+            config.optimizer.max_grad_norm,
+            compiled=self.path == "native",
         )
         self._policy = FlatParameters(self.policy_network, learns=False).values
         slow = FlatParameters(self.target_network, learns=False).values
         self.target = TargetUpdate(config.target, [self.optimizer.values], [slow])
         self.averaging = config.evaluation.averaging
-        self.path = path or update_path(config.network, config.device)
-        self._backprop = ManualBackprop(self.network) if self.path == "manual" else None
-        self._target_backprop = (
-            ManualBackprop(self.target_network) if self.path == "manual" else None
-        )
+        learns = self.optimizer
+        self._backprop = make_backprop(self.path, self.network, learns.values, learns.gradient)
+        self._target_backprop = make_backprop(self.path, self.target_network, slow)
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
         self._acting: PolicyNetwork = self.network
@@ -106,7 +116,8 @@ class Learner(Stateful):
                 seed=config.seed,
                 averaging=self.averaging,
                 device=self.device,
-                by_hand=self.path == "manual" or (path is None and self.device.type == "cpu"),
+                # Its network is plain, whatever Q's is.
+                path=path or update_path(NetworkConfig(), config.device, config.threads),
             )
             ratio = self.behaviour.ratio
             self._acting = FilteredNetwork(self.network, self.behaviour.network, ratio)
@@ -140,11 +151,11 @@ class Learner(Stateful):
             loss = self._by_hand(self._backprop, self._target_backprop, rows, terms)
         else:
             loss = self._by_autograd(rows, terms)
-        self.optimizer.step()
         self.gradient_steps += 1
+        # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
+        self.optimizer.step(self._policy, averaging_rate(self.averaging, self.gradient_steps))
         if self.behaviour is not None and labelled is not None:
             self.behaviour.learn(labelled)
-        self._average()
         return loss
 
     def _by_autograd(self, rows: Tensor, terms: _Terms) -> Loss:
@@ -185,32 +196,34 @@ class Learner(Stateful):
         return loss
 
     @torch.no_grad()
-    def _by_hand(
-        self, online: ManualBackprop, slow: ManualBackprop, rows: Tensor, terms: _Terms
-    ) -> Loss:
+    def _by_hand(self, online: _ByHand, slow: _ByHand, rows: Tensor, terms: _Terms) -> Loss:
         """Fill the gradient by hand: the plain network, with every term of the loss."""
-        observation, next_observation, action, reward, discount = unpack(
-            rows, self.network.observation_size
-        )
-        settings, logged = self.loss, terms.logged
+        size, settings, logged = self.network.observation_size, self.loss, terms.logged
+        observation, next_observation, action, reward, discount = unpack(rows, size)
+        target: Tensor | None = None
         if settings.munchausen:
             (q,) = online.forward(observation)
             slow_q, slow_next_q = slow.forward(observation, next_observation)
             target = self._munchausen(reward, discount, action, slow_q, slow_next_q)
-        elif settings.double:  # s and s' through the online network together
-            q, next_q = online.forward(observation, next_observation)
-            (slow_q,) = slow.forward(next_observation)
-            plausible = self._plausible(next_observation)
-            target = td_target(reward, discount, slow_q, next_q, plausible)
         else:
-            (q,) = online.forward(observation)
+            # Of Double DQN s and s' go through the online network together.
+            inputs = (observation, next_observation) if settings.double else (observation,)
+            q, *following = online.forward(*inputs)
+            next_q = following[0] if following else None
             (slow_q,) = slow.forward(next_observation)
             plausible = self._plausible(next_observation)
-            target = td_target(reward, discount, slow_q, plausible=plausible)
-        loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=settings.huber_delta)
-        gradient = dqn_gradient(
-            loss.td, action, q.shape[1], weight=terms.weight, huber_delta=settings.huber_delta
-        )
+            if self.path != "native":
+                target = td_target(reward, discount, slow_q, next_q, plausible)
+        weight, delta = terms.weight, settings.huber_delta
+        if target is None:
+            loss, gradient = native_td_loss(
+                *(q, slow_q, next_q, plausible, rows[:, 2 * size :]),
+                weight=weight,
+                huber_delta=delta,
+            )
+        else:
+            loss = dqn_loss(q, action, target, weight=weight, huber_delta=delta)
+            gradient = dqn_gradient(loss.td, action, q.shape[1], weight=weight, huber_delta=delta)
         share = logged / len(rows)
         if terms.conservative > 0:
             term = conservative_gradient(q[:logged], action[:logged], terms.return_to_go)
@@ -275,17 +288,6 @@ class Learner(Stateful):
         if self.behaviour is not None:
             of_values.append(self.behaviour.optimizer.values)
         return all(bool(torch.isfinite(values).all()) for values in of_values)
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        """`policy_network`, the one that is evaluated and kept, follows as an average of weights.
-
-        The greedy policy of a single update is noisy: a small change of values turns over many
-        actions at once. The average over the last 1 / averaging updates is not (Polyak and
-        Juditsky 1992). Until there are as many, it is the mean of all of them.
-        """
-        rate = max(self.averaging, 1.0 / self.gradient_steps)
-        self._policy.lerp_(self.optimizer.values, rate)
 
     @torch.no_grad()
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,7 +10,8 @@ Per layer, with x the layer's input (B, I), z = x W^T + b and g the gradient tha
     dW = g^T x,  db = sum_i g_i,  g = g W       and the product
 
 `tests/train/test_manual_backprop.py` compares it with autograd in double precision. It does the
-plain network alone: dueling heads, quantiles and ensembles keep to autograd, as CUDA does.
+plain network alone: dueling heads, quantiles and ensembles keep to autograd, as CUDA does. Where
+the compiled update is (`native_backprop.py`), that does the same in its place.
 """
 
 from __future__ import annotations
@@ -20,17 +21,24 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from restock import native
 from restock.train.dqn.config import NetworkConfig
+from restock.train.dqn.native_backprop import NativeBackprop
 from restock.train.dqn.network import Network, QNetwork
 from restock.train.dqn.products import affine, product, product_into
 
-UpdatePath = Literal["manual", "autograd"]
+UpdatePath = Literal["native", "manual", "autograd"]
 
 
-def update_path(network: NetworkConfig, device: str) -> UpdatePath:
-    """Which way a run's gradients are made; `config.json` says it as `update_path`."""
+def update_path(network: NetworkConfig, device: str, threads: int = 1) -> UpdatePath:
+    """Which way a run's gradients are made; `config.json` says it as `update_path`.
+
+    The compiled way computes on one thread: a run that asks for more has PyTorch's operations.
+    """
     plain = not network.dueling and not network.quantiles and network.ensemble == 1
-    return "manual" if plain and torch.device(device).type == "cpu" else "autograd"
+    if not plain or torch.device(device).type != "cpu":
+        return "autograd"
+    return "native" if threads == 1 and native.is_used() else "manual"
 
 
 class _Affine:
@@ -120,6 +128,15 @@ class ManualBackprop:
             _fill(layer.linear, down, below)
             if index:
                 down = product(down, layer.linear.weight)
+
+
+def make_backprop(
+    path: UpdatePath, network: Network, values: Tensor, gradient: Tensor | None = None
+) -> ManualBackprop | NativeBackprop | None:
+    """What differentiates `network`, whose parameters are in `values`; None: autograd does."""
+    if path == "native":
+        return NativeBackprop(network, values, gradient)
+    return ManualBackprop(network) if path == "manual" else None
 
 
 def _fill(linear: _Affine, gradient: Tensor, given: Tensor) -> None:

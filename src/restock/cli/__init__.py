@@ -106,9 +106,9 @@ def _dispatch(args: list[str]) -> int:
         sys.stdout.write(usage() + "\n")
         return int(ExitCode.OK if args else ExitCode.USAGE)
     if args[0] in ("-V", "--version"):
-        from restock import __version__
+        from restock import __version__, native
 
-        sys.stdout.write(f"restock {__version__}\n")
+        sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
     verb = args[0]
     if verb not in VERBS:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import tyro
 
+from restock import native
 from restock.errors import ExitCode, RestockError
 from restock.files import cores
 
@@ -63,7 +64,7 @@ class DoctorCommand:
         """Print what was found; 2 where something is wrong."""
         from restock.cli import output
 
-        findings = [*_machine(), *_packages(), _torch(), _drawing(), _disk(Path.cwd())]
+        findings = [*_machine(), *_packages(), _torch(), _native(), _drawing(), _disk(Path.cwd())]
         if self.store is not None:
             findings += _store(self.store)
         if self.json:
@@ -123,6 +124,15 @@ def _torch() -> Finding:
     if torch.cuda.is_available():
         return Finding("works", "torch", "ok", f"{torch.cuda.get_device_name()}, {threads}")
     return Finding("works", "torch", "ok", f"no CUDA device, {threads}")
+
+
+def _native() -> Finding:
+    """Whether the update of a plain network is compiled; without, it takes longer."""
+    state = native.state()
+    if native.IS_THERE:
+        return Finding("works", "native code", "ok", state)
+    remedy = "install a C compiler, then restock again from its source; only training is slower"
+    return Finding("works", "native code", "missing", state, remedy)
 
 
 def _drawing() -> Finding:

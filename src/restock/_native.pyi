@@ -1,0 +1,34 @@
+"""Of `compiled/module.c`, whose docstrings say which float32 arrays are read and written."""
+
+from typing import Any
+
+INSTRUCTIONS: str  # AVX-512 or AVX2
+
+class Network:
+    def __init__(
+        self, widths: tuple[int, ...], eps: float, values: Any, gradient: Any, wide: bool = True
+    ) -> None: ...
+    def forward(self, inputs: tuple[Any, ...], out: Any, /) -> None: ...
+    def backward(self, gradient: Any, /) -> None: ...
+
+def td_loss(
+    q: Any,
+    next_target_q: Any,
+    chooses: Any,
+    plausible: Any,
+    tail: Any,
+    weight: Any,
+    delta: float,
+    gradient: Any,
+    out: Any,
+    /,
+) -> None: ...
+def adam(
+    values: Any,
+    gradient: Any,
+    exp_avg: Any,
+    exp_avg_sq: Any,
+    follower: Any,
+    settings: tuple[float, float, float, float, float, float],
+    /,
+) -> None: ...

@@ -1,0 +1,41 @@
+/* `restock._native`: an update of a plain Q network, compiled.
+ *
+ * What `restock.train.dqn` does with PyTorch's operations, in fewer calls and fewer passes over
+ * memory. Python's side is `restock/native.py` and `train/dqn/native_backprop.py`. Compiled with
+ * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
+ * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
+ * importing it fails, and PyTorch does the work. Stable ABI: one build serves Python 3.11 and later.
+ */
+#include "buffers.h"
+#include "learning.h"
+#include "network.h"
+
+static PyMethodDef module_methods[] = {
+    {"td_loss", td_loss, METH_VARARGS, td_loss_doc},
+    {"adam", adam, METH_VARARGS, adam_doc},
+    {NULL, NULL, 0, NULL},
+};
+
+static int module_exec(PyObject *module) {
+    if (!has_narrow()) {
+        PyErr_SetString(PyExc_ImportError, "this processor has no AVX2 with FMA");
+        return -1;
+    }
+    PyObject *type = PyType_FromModuleAndSpec(module, &network_spec, NULL);
+    if (!type)
+        return -1;
+    int failed = PyModule_AddObjectRef(module, "Network", type) < 0 ||
+                 PyModule_AddStringConstant(
+                     module, "INSTRUCTIONS",
+                     has_wide() ? "AVX-512" : "AVX2") < 0;
+    Py_DECREF(type);
+    return failed ? -1 : 0;
+}
+
+static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
+
+static struct PyModuleDef module_definition = {
+    PyModuleDef_HEAD_INIT, "_native", "A plain Q network's update, compiled.", 0,
+    module_methods,        module_slots, NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__native(void) { return PyModuleDef_Init(&module_definition); }

@@ -1,0 +1,44 @@
+"""Whether this installation has the compiled update (`restock/compiled/`), and whether it is used.
+
+It is built where a compiler is, and serves x86-64 processors with AVX2. Without it PyTorch's
+operations do the same, to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+SWITCH = "RESTOCK_NATIVE"
+_why_not = ""
+
+if TYPE_CHECKING:
+    from restock import _native as compiled
+
+    IS_THERE: bool
+else:
+    try:
+        compiled = import_module("restock._native")
+    except ModuleNotFoundError:
+        compiled, _why_not = None, "it was not compiled here"
+    except ImportError as error:  # not for this processor
+        compiled, _why_not = None, str(error)
+    IS_THERE = compiled is not None
+
+
+def is_used() -> bool:
+    """Whether compiled code updates plain networks on the CPU."""
+    return IS_THERE and os.environ.get(SWITCH, "1") != "0"
+
+
+def state() -> str:
+    """For people: `in use (AVX-512)`, or why it is not."""
+    if not IS_THERE:
+        return f"not in use: {_why_not}"
+    if not is_used():
+        return f"not in use: {SWITCH}={os.environ[SWITCH]}"
+    return f"in use ({compiled.INSTRUCTIONS})"
+
+
+__all__ = ["IS_THERE", "SWITCH", "compiled", "is_used", "state"]
