@@ -6,10 +6,11 @@ Equal network (2 x 256 ReLU; no LayerNorm, which the peers' MLPs do not have), e
 plain DQN targets, one thread, sampling from a full buffer included: CleanRL's logic,
 Stable-Baselines3, Tianshou, TorchRL and d3rlpy, each where it is installed (d3rlpy in a Python of
 its own, `--neighbours`) and with its own defaults; the first two once more with Restock's
-settings (a Polyak pull at every update, fused Adam: `_equal`). Then Restock's own ways: by
-autograd, with LayerNorm, its default (double DQN, LayerNorm, half of the batch from logs by
-quotas), and that with the record of what was fed. The floor is the update's matrix products by
-the faster of PyTorch's two libraries, and nothing else.
+settings (a Polyak pull at every update, fused Adam: `_equal`). Then Restock's own ways: compiled
+where `restock --version` says so, by PyTorch's operations (`_manual`), by autograd, with
+LayerNorm, its default (double DQN, LayerNorm, half of the batch from logs by quotas), and that
+with the record of what was fed. The floor is the update's matrix products by the faster of
+PyTorch's two libraries, and nothing else.
 Figures are CPU times. `--check` exits 1 where a target of the design is missed.
 """
 
@@ -228,10 +229,12 @@ def main() -> int:
             "products_by_torch_mm": products(batch, best=False),
             "restock_in_place": in_place(equal, arrays),
             "restock": Restock(equal, arrays),
+            "restock_manual": Restock(equal, arrays, path="manual"),
             "restock_autograd": Restock(equal, arrays, path="autograd"),
             **{name: peer for name, peer in peers.items() if peer is not None},
             "restock_layer_norm": Restock(normed, arrays),
             "restock_layer_norm_autograd": Restock(normed, arrays, path="autograd"),
+            "restock_default_manual": Restock(default, arrays, logs=True, path="manual"),
             "restock_default": Restock(default, arrays, logs=True),
             "restock_default_recorded": Restock(default, arrays, run=run, logs=True),
         }

@@ -9,7 +9,7 @@ import sys
 import pytest
 from support.paths import ROOT
 
-from restock import cli
+from restock import cli, native
 from restock.cli.output import print_table
 from restock.errors import ExitCode, RecordingError
 
@@ -79,6 +79,7 @@ def test_the_version_is_printed() -> None:
     done = restock("--version")
     assert done.returncode == 0
     assert done.stdout.startswith("restock 0.")
+    assert f"\nnative code {native.state()}\n" in done.stdout
 
 
 def test_a_reader_that_goes_away_is_no_error() -> None:

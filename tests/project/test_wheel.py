@@ -4,6 +4,7 @@ packages it needs."""
 from __future__ import annotations
 
 import ast
+import platform
 import re
 import shutil
 import subprocess
@@ -27,7 +28,8 @@ SHIPPED = {".py", ".sql", ".toml", ".json", ".jinja", ".css", ".js", ".typed"}
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     # A copy, so that the build leaves nothing in the tree (and no stale build/ leaks in).
     tree = tmp_path_factory.mktemp("tree") / "restock"
-    ignored = shutil.ignore_patterns(".venv", ".git", "build", "*.egg-info", "__pycache__", ".*")
+    unwanted = (".venv", ".git", "build", "*.egg-info", "__pycache__", ".*", "*.so")
+    ignored = shutil.ignore_patterns(*unwanted)
     shutil.copytree(ROOT, tree, symlinks=True, ignore=ignored)
     out = tmp_path_factory.mktemp("dist")
     done = subprocess.run(
@@ -59,6 +61,25 @@ def test_every_file_of_the_front_door_is_in_the_wheel(wheel: zipfile.ZipFile) ->
     ]
     missing = {p.relative_to(front).as_posix() for p in files} - set(wheel.namelist())
     assert not missing
+
+
+@pytest.mark.skipif(
+    platform.machine() != "x86_64" or not shutil.which("cc"), reason="nothing to compile it with"
+)
+def test_the_wheel_has_the_compiled_update_for_every_python(wheel: zipfile.ZipFile) -> None:
+    assert "restock/_native.abi3.so" in wheel.namelist()
+    (told,) = (name for name in wheel.namelist() if name.endswith(".dist-info/WHEEL"))
+    assert b"Tag: cp311-abi3-" in wheel.read(told)
+
+
+def test_every_file_that_is_compiled_is_declared() -> None:
+    """What is not is missing from the source distribution."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    (built,) = project["tool"]["setuptools"]["ext-modules"]
+    folder = ROOT / "src" / "restock" / "compiled"
+    found = {path.relative_to(ROOT).as_posix() for path in folder.iterdir()}
+    assert found == {*built["sources"], *built["depends"]}
+    assert built["optional"]
 
 
 def test_the_wheel_takes_one_top_level_name(wheel: zipfile.ZipFile) -> None:
