@@ -252,8 +252,11 @@ class Store:
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """The common views of this store in a schema of another connection, beside other stores'.
 
+        The connection's joins are done as they are written from here on.
+
         Raises StoreError where a file is missing or damaged.
         """
+        connection.execute(f"SET disabled_optimizers = '{AS_WRITTEN}'")
         connection.execute(f'CREATE SCHEMA "{schema}"; USE "{schema}"')
         try:
             self._present_all(connection, schema)

@@ -45,17 +45,22 @@ def test_transitions_are_those_that_were_written(store: Store, transitions: pa.T
     assert store.task() == TASK
 
 
-def test_no_join_holds_the_transitions_in_memory(store: Store) -> None:
+@pytest.mark.parametrize("attached", [False, True])
+def test_no_join_holds_the_transitions_in_memory(store: Store, attached: bool) -> None:
     def held(node: dict[str, Any]) -> list[str]:
         """What the joins of a plan keep: their right sides."""
         of_join = [str(node["children"][1])] if node["name"] == "HASH_JOIN" else []
         return of_join + [text for child in node["children"] for text in held(child)]
 
+    other = duckdb.connect()
+    store.attach(other, "a")
+    where, ask = ("a.", other.sql) if attached else ("", store.sql)
     for query in (
-        "SELECT sum(reward) FROM transitions",
-        "SELECT * FROM transitions WHERE recording_id IN (SELECT recording_id FROM recordings)",
+        f"SELECT sum(reward) FROM {where}transitions",
+        f"SELECT * FROM {where}transitions"
+        f" WHERE recording_id IN (SELECT recording_id FROM {where}recordings)",
     ):
-        [(_, plan)] = store.sql(f"EXPLAIN (FORMAT JSON) {query}").fetchall()
+        [(_, plan)] = ask(f"EXPLAIN (FORMAT JSON) {query}").fetchall()
         joins = held(json.loads(plan)[0])
         assert joins, query
         assert not any("transitions" in text or "reward" in text for text in joins), query
