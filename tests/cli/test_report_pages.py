@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.finished_runs import document, make_run
 from support.page_scripts import charts_of
 
 from restock.cli import main
 from restock.report import write_study_page
+from restock.report.look import charts
+from restock.report.look.live import Charts
 from restock.report.study.comparison import gate_section
 
 HOSTILE = "</script><script>alert(1)</script><!--"
@@ -145,3 +150,17 @@ def test_a_store_has_a_page_of_what_it_holds(
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
     assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
     assert "name the page with --out FILE" in capsys.readouterr().err
+
+
+def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:
+    """A run whose TD error became NaN had no page at all."""
+    values = [0.5, math.nan, np.float32("inf"), 1.0]
+    rows = [{"step": step, "td": value} for step, value in enumerate(values)]
+    drawing = charts.draw(lambda _: charts.plot(rows).mark_line().encode(x="step:Q", y="td:Q"))
+    page = Charts(charts.CONFIG)
+    for spec in drawing.spec.values():
+        page.add(spec)
+    text = re.search(r'id="charts">(.*?)</script>', page.blocks())
+    assert text is not None
+    (shown,) = json.loads(text[1])["rows"].values()
+    assert [row["td"] for row in shown] == [0.5, None, None, 1.0]

@@ -9,12 +9,14 @@ each is on a dark ground.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
 import altair as alt
+import numpy as np
 import vl_convert
 
 from restock.report.look.blocks import Drawing, words
@@ -82,8 +84,16 @@ _numbers = count()
 
 
 def plot(rows: Sequence[Row]) -> Any:
-    """A chart over rows that travel in the page itself."""
-    return alt.Chart(alt.InlineData(values=[dict(row) for row in rows]))
+    """A chart over rows that travel in the page itself: what is no number is a gap in it."""
+    values = [{name: _shown(value) for name, value in row.items()} for row in rows]
+    return alt.Chart(alt.InlineData(values=values))
+
+
+def _shown(value: Any) -> Any:
+    """JSON has no NaN and no infinity, and a page of one is none."""
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
 
 
 def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawing:

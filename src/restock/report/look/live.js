@@ -1,6 +1,9 @@
 "use strict";
 // Shows each chart drawn by Vega in the place of its SVG, once it comes into view. Whatever fails,
 // the SVG stays. Names of the page's rows only ever become text.
+addEventListener("beforeprint", () => {  // paper cannot be clicked
+  document.querySelectorAll("details.rows").forEach((folded) => { folded.open = true; });
+});
 (() => {
   if (!("DecompressionStream" in window && "IntersectionObserver" in window)) return;
   const { config, rows, charts } = JSON.parse(document.getElementById("charts").textContent);
