@@ -39,7 +39,7 @@ def profile_lines(
     seen: Evidence, name: str, problems: list[str], trial: Trial | None = None
 ) -> list[str]:
     """The TOML of a profile; with what a `trial` of it made of the recording."""
-    recording, seconds = seen.recording, seen.driven_s
+    recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
     lines = [
         f"# Proposed from {recording.path.name}: check what stands in comments, then run",
@@ -328,7 +328,7 @@ def _input_lines(
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
     topic, kind = fitting[0]
-    rate = topic.expected / seen.driven_s if seen.driven_s > 0 else 0.0
+    rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
     others = ", ".join(other.name for other, _ in fitting[1:4])
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [

@@ -139,7 +139,8 @@ class PlannedUse(Checked, frozen=True):
 class EvaluationSplit(Checked, frozen=True):
     """Episodes kept out of the panel, whole: `share` of the rows, chosen by `by`.
 
-    A store of one episode has none to spare: then, as by "within_episode", the end of it.
+    A store of one episode has none to spare, nor has one of few, where a whole one is more than
+    twice the share: then, as by "within_episode", the end of the longest.
     """
 
     by: Literal["episode", "recording", "robot", "site", "time", "within_episode", "none"] = (

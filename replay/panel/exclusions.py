@@ -21,6 +21,8 @@ from restock.replay.store.definitions import install_repeated_rows
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.
 _GROUPS = {"recording": ("recording_id", "recording")} | {n: (n, n) for n in ("robot", "site")}
+# Times the share that is asked for: where a whole episode is more, the end of one is held out.
+_WHOLE_AT_MOST = 2.0
 _GAP_AT_MOST = 0.25  # of an episode, for its end to be held out
 _LEFT_AT_LEAST = 0.2  # of an episode, to learn from
 EPISODE_REPEATS = 3  # rows that an episode shares with the evaluation split, to be left out whole
@@ -221,7 +223,9 @@ class EvaluationRows:
 
 def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     """The evaluation split: whole episodes, recordings, robots or sites, the latest episodes, or
-    the end of each episode, which is also what there is of a single one.
+    the end of each episode, which is also what there is of a single one. Of few episodes, a whole
+    one may be all there is of a condition: where it is more than twice the share that is asked
+    for, the end of the longest is held out, and the others stay whole, with how they ended.
 
     Raises:
         MixtureError: the rule would take everything, there is only one group to split, a robot that
@@ -234,21 +238,36 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     if rule.by == "within_episode" or (rule.by in ("episode", "time") and episodes == 1):
         return _ends_of_episodes(table, rule, mixture.n_step)
     held = _whole_groups(table, rule, seed)
+    if rule.by == "episode" and held.mean() > _WHOLE_AT_MOST * rule.share:
+        code = codes(table, "episode_id")
+        longest = int(np.bincount(code).argmax())
+        ends = _ends_of_episodes(table, rule, mixture.n_step, longest)
+        if len(np.unique(code[held])) == 1 and ends.held.any():
+            return ends
     return EvaluationRows(held, np.zeros(len(table), np.bool_), rule.by)
 
 
-def _ends_of_episodes(table: pa.Table, rule: EvaluationSplit, n_step: int) -> EvaluationRows:
-    """The last `share` of each episode's time, and a gap before it that no n-step return spans."""
+def _ends_of_episodes(
+    table: pa.Table, rule: EvaluationSplit, n_step: int, only: int | None = None
+) -> EvaluationRows:
+    """The last `share` of each episode's time, and a gap before it that no n-step return spans.
+
+    Of `only` one episode, about as much as `share` of all.
+    """
     episode, stamp_ns = codes(table, "episode_id"), table["stamp_ns"].to_numpy()
     step = table["step_index"].to_numpy()
-    count = int(episode.max()) + 1
+    count, share = int(episode.max()) + 1, rule.share
+    if only is not None:
+        share = min(share * len(table) / int((episode == only).sum()), 1.0)
     first_ns, last_ns = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
     np.minimum.at(first_ns, episode, stamp_ns)
     np.maximum.at(last_ns, episode, stamp_ns)
     long_s = (last_ns - first_ns) * 1e-9
     # Of a shorter one little would be left.
     split = (long_s * _GAP_AT_MOST >= rule.gap_s)[episode]
-    begin_ns = last_ns - (rule.share * (last_ns - first_ns)).astype(np.int64)
+    if only is not None:
+        split &= episode == only
+    begin_ns = last_ns - (share * (last_ns - first_ns)).astype(np.int64)
     held = split & (stamp_ns > begin_ns[episode])
     first_held = np.full(count, np.iinfo(np.int64).max)
     np.minimum.at(first_held, episode[held], step[held])
@@ -262,7 +281,9 @@ def _ends_of_episodes(table: pa.Table, rule: EvaluationSplit, n_step: int) -> Ev
             short = f"no episode is longer than {long_s.max():.1f} s"
         return EvaluationRows.none(len(table), f"nothing, as {short}: too short to split")
     whole = "each episode" if rule.by == "within_episode" else "the one episode there is"
-    note = f"the last {rule.share:.0%} of {whole}, after a gap of {rule.gap_s:g} s"
+    if only is not None:
+        whole = f"the longest of {len(np.unique(episode))} episodes"
+    note = f"the last {share:.0%} of {whole}, after a gap of {rule.gap_s:g} s"
     return EvaluationRows(held, split & near & ~held, "within_episode", note)
 
 

@@ -6,9 +6,10 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.bag_samples import write_bag as write_sample_bag
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import Drive, columns, typed_topics, write_bag, write_topics
 from support.paths import ROOT, SHARED, sample_transitions
 
 from restock.cli import main
@@ -91,6 +92,21 @@ def test_the_only_command_is_no_proposal(tmp_path):
             profile = parse_profile(propose_profile(bag, "mine").toml, where="p")
         assert profile.inputs.nav_command is None
         assert profile.inputs.command.topic == "/cmd_vel"
+
+
+def test_rates_are_of_the_time_that_was_recorded(tmp_path):
+    """Of that in which commands came often, a scan of 7 Hz was said to be one of 19."""
+    topics = typed_topics(Drive(duration_s=20))
+    often = np.append(np.arange(0, 2, 0.1), [6.0, 12.0, 18.0])
+    speed = {"linear.x": np.full(len(often), 0.4), "angular.z": np.zeros(len(often))}
+    topics["/cmd_vel"] = topics["/cmd_vel"][0], columns(often, speed, stamped=False)
+    with open_recording(write_topics(topics, tmp_path / "bag")) as bag:
+        text = propose_profile(bag, "mine").toml
+        seconds = (bag.span_ns[1] - bag.span_ns[0]) * 1e-9
+        rates = {t: topic.expected / seconds for t, topic in bag.topics.items()}
+    for topic in ("/odom", "/scan", "/cmd_vel"):
+        said = re.search(rf"^# {topic} +\S+ +([\d.]+) Hz", text, re.M)
+        assert float(said[1]) == pytest.approx(rates[topic], rel=0.05, abs=0.06)
 
 
 def test_it_says_rates_roles_clock_lidar_and_frames(capsys):

@@ -63,15 +63,8 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, caps
     n_step=st.integers(1, 8),
 )
 def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_s, n_step) -> None:
-    step = np.concatenate([np.arange(length) for length in lengths])
-    names = [f"e{number}" for number, length in enumerate(lengths) for _ in range(length)]
-    table = pa.table(
-        {
-            "episode_id": pa.array(names).dictionary_encode(),
-            "step_index": step,
-            "stamp_ns": step * 200_000_000,
-        }
-    )
+    table = table_of(*lengths)
+    step, names = table["step_index"].to_numpy(), table["episode_id"].to_pylist()
     split = f'by = "within_episode", share = {share}, gap_s = {gap_s}'
     text = (
         f"n_step = {n_step}\nevaluation_split = {{ {split} }}\n[each_condition]\nshare = 'natural'"
@@ -87,3 +80,29 @@ def test_no_return_of_a_learnt_row_reaches_what_is_held_out(lengths, share, gap_
             assert (step[learnt & of] + n_step < first).all()
             assert (first - step[learnt & of]).min(initial=10**6) * 0.2 >= gap_s - 0.2
             assert learnt[of].mean() > 0.2
+
+
+def table_of(*lengths: int) -> pa.Table:
+    """Steps of episodes that are so long."""
+    step = np.concatenate([np.arange(length) for length in lengths])
+    names = [f"e{number}" for number, length in enumerate(lengths) for _ in range(length)]
+    columns = {"step_index": step, "stamp_ns": step * 200_000_000, "admitted": step >= 0}
+    return pa.table({"episode_id": pa.array(names).dictionary_encode(), **columns})
+
+
+def test_of_few_episodes_the_end_of_the_longest_is_held_out() -> None:
+    """A whole one of two was half of the rows, and all there was of its conditions."""
+    mixture = parse_mixture("[each_condition]\nshare = 'natural'", where="test")
+    table = table_of(180, 205)
+    rows = split_for_evaluation(table, mixture)
+    assert rows.by == "within_episode"
+    assert rows.note == "the last 19% of the longest of 2 episodes, after a gap of 2 s"
+    assert 0.08 < rows.held.mean() < 0.12
+    assert not (rows.held | rows.gap)[:180].any()
+    assert rows.held[-1]
+    assert rows.gap.sum() in (10, 11)
+    for lengths in ((40,) * 12, (9, 10)):  # enough of them; and too short for a gap
+        rows = split_for_evaluation(table_of(*lengths), mixture)
+        assert rows.by == "episode"
+        assert not rows.gap.any()
+        assert rows.held.any()

@@ -19,6 +19,7 @@ from restock.ingest.propose.driven.steering import (
 from restock.ingest.propose.evidence.cameras import CameraTopic, camera_topics
 from restock.ingest.propose.evidence.candidates import Candidate, candidates
 from restock.ingest.propose.evidence.clock_choice import (
+    PAUSE,
     ClockChoice,
     Gaps,
     choose_clock,
@@ -80,6 +81,7 @@ class Evidence:
     clock: ClockChoice
     gaps: Gaps
     driven_s: float
+    recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
     outline: ScannedOutline | None  # where its scans say something of it
@@ -141,6 +143,7 @@ def gather(
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
     commands = replace(commands, wheelbase_known=robot.described and wheelbase_m is not None)
     paces = _paces(recording, roles)
+    recorded_s = _recorded_s(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
     motion = None
     if not roles["wheels"] and (framed or roles["pose"]):
@@ -167,6 +170,7 @@ def gather(
         ),
         gaps,
         _driven_s(recording, gaps),
+        recorded_s,
         footprint,
         notes,
         outline,
@@ -176,7 +180,7 @@ def gather(
             without={topic.name for role, topic, _ in best if role in SPENT},
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
-        camera_topics(recording, _driven_s(recording, gaps)),
+        camera_topics(recording, recorded_s),
         robot,
     )
 
@@ -211,6 +215,22 @@ def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
     ]
     sensing = [t for t in sensors if t.name != commands.topic or commands.measured]
     return bool(sensing) and all(STAMP in recording.leaves(t.name) for t in sensing)
+
+
+def _recorded_s(recording: Recording, roles: Roles) -> float:
+    """How long there are messages of what fills an input most often: recordings may pause."""
+    span = recording.span_ns
+    whole = (span[1] - span[0]) * 1e-9 if span else 0.0
+    filling = [fitting[0][0] for fitting in roles.values() if fitting]
+    if not filling:
+        return whole
+    busiest = max(filling, key=lambda topic: topic.expected).name
+    times = np.sort(recording.read({busiest: []})[busiest].log_time_ns)
+    gaps = np.asarray(np.diff(times), np.float64) * 1e-9
+    if len(gaps) < 2:
+        return whole
+    recorded = float(gaps[gaps <= PAUSE * max(float(np.median(gaps)), 0.02)].sum())
+    return recorded if recorded > whole / 10 else whole
 
 
 def _driven_s(recording: Recording, gaps: Gaps) -> float:
