@@ -63,6 +63,7 @@ class StoreWriter(TableCommits):
     def __init__(self, path: str | Path | Location) -> None:
         super().__init__(path)
         self._fitting: list[pa.Schema] = []  # columns that its tables are known to have
+        self._reached = False
 
     def repeated(
         self,
@@ -161,6 +162,9 @@ class StoreWriter(TableCommits):
             StoreError: they cannot be written.
         """
         self.expect_folder()
+        if not self._reached and self.path.folder is None:
+            self.reach()  # Delta's library says of S3 what is wrong; Arrow's writer says less
+            self._reached = True
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()
         manifest = summarised(manifest, rows)
         nulls = [name for name in sorted(LIDAR_SIGNALS) if name in rows.column_names]

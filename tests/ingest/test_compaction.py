@@ -11,7 +11,7 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.stores import one, shown, views_over
+from support.stores import manifest, one, shown, views_over
 
 from restock.errors import StoreError
 from restock.ingest.store.compaction import OPERATION, compact, fold
@@ -160,7 +160,8 @@ def test_a_compacted_store_goes_on(place):
     kept = writer.rows(f"{3:016x}", f"{3:016x}-a")
     assert kept.to_pylist() == one(3)[1].to_pylist()
     assert as_written.to_pylist() == one(2)[1].to_pylist()
-    assert writer.repeated(replaced(kept, {"recording_id": "f" * 16}), 0.2) is not None
+    copy = replaced(kept, {"recording_id": "f" * 16, "ingest_id": "copy"})
+    assert writer.repeated(writer.stage(manifest(copy), copy), 0.2) is not None
     same_as_scanned(place)
 
 
@@ -265,7 +266,8 @@ def test_whatever_comes_first_the_summaries_are_true(tmp_path_factory, steps):
 def test_a_damaged_manifest_does_not_hide_a_repeated_drive_in_another(tmp_path):
     writer = StoreWriter(tmp_path / "s")
     writer.write_all([one(1), one(2)])
-    again = replaced(one(2)[1], {"recording_id": "f" * 16})
+    copy = replaced(one(2)[1], {"recording_id": "f" * 16, "ingest_id": "copy"})
+    again = writer.stage(manifest(copy), copy)
     (tmp_path / "s" / RECORDINGS / f"{1:016x}" / f"{1:016x}-a.parquet").write_bytes(b"damaged")
     found = writer.repeated(again, 0.2)
     assert found is not None
