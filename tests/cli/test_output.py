@@ -32,6 +32,19 @@ def test_a_pipe_gets_all_of_a_table_in_120_columns(capsys: pytest.CaptureFixture
     assert "\x1b" not in text
 
 
+def test_a_pipe_gets_all_of_a_table_whose_words_do_not_fit(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    type_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    row = {f"count_{place}": 12_345_678 for place in range(5)}
+    row |= {"type": type_name, "clock": "2 backsteps, 1 repeated stamps, 1 zero stamps, 1 left out"}
+    output.print_table([row])
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(type_name in line for line in lines) == 1
+    at = lines[0].index("clock")
+    assert " ".join(line[at:].strip() for line in lines[2:]) == row["clock"]
+
+
 def test_prose_is_one_line_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
     output.stdout().print("a long sentence " * 30)
     assert len(capsys.readouterr().out.splitlines()) == 1

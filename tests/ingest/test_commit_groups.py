@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 from deltalake import DeltaTable
 from support.driven_robot import Drive, write_bag
+from support.paths import ROOT
 from support.stores import manifest, one, recording_transitions, shown
 
 from restock.errors import RecordingError, StoreError
@@ -189,7 +190,10 @@ group.commit()
 def test_a_killed_process_leaves_whole_groups_and_the_same_again_goes_on(tmp_path, when, there):
     place = tmp_path / "s"
     StoreWriter(place).write(*one(3, "old"))  # one of the second group replaces
-    child = subprocess.run([sys.executable, "-c", KILLED, str(place), when], env=os.environ.copy())
+    child = subprocess.run(
+        [sys.executable, "-c", KILLED, str(place), when],
+        env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
+    )
     assert child.returncode == -signal.SIGKILL
     before = set(shown(place))
     assert before == (

@@ -28,7 +28,7 @@ from restock.ingest.steps.episodes import split
 from restock.ingest.steps.steps import steps_of
 from restock.ingest.store import episode_rows
 from restock.ingest.store.transitions import Provenance, recording_table
-from restock.ingest.task.schema import recording_schema
+from restock.ingest.store.writer import Staged, StoreWriter
 
 WHOLE = 1 << 40
 PROFILE = load_profile("warehouse_amr")
@@ -133,19 +133,12 @@ def test_any_batches_of_a_sqlite_bag_give_the_same_columns(size: int, tmp_path: 
         assert expected["accounts"] == regrouped["accounts"]
 
 
-class Kept:
-    """A store that only keeps what is written."""
+class Kept(StoreWriter):
+    """A store that remembers the rows it was given."""
 
-    def write_all(self, recordings: Any, *, instead_of: Any) -> int:
-        [(self.manifest, self.rows)] = recordings
-        return 1
-
-    def repeated(self, rows: Any, period_s: float) -> None:
-        """Nothing is in it that could be repeated."""
-
-    def live(self, recording_id: str) -> pa.Table:
-        """Nothing was in it before."""
-        return recording_schema().empty_table()
+    def stage(self, manifest: pa.Table, rows: pa.Table, **more: Any) -> Staged:
+        self.rows = rows
+        return super().stage(manifest, rows, **more)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -155,11 +148,11 @@ def test_any_grouping_gives_the_same_table(storage: str, tmp_path: Path) -> None
     bag = write_drive(drive, tmp_path / "drive", storage=storage)
     tables = []
     for size, rows, group in ((WHOLE, 1, WHOLE), (1, 3, 1), (2000, 50, 20)):
-        store: Any = Kept()
+        store = Kept(tmp_path / f"store{len(tables)}")
         with pytest.MonkeyPatch.context() as patch:
             cut_by(patch, size, rows)
             patch.setattr(episode_rows, "GROUP_ROWS", group)
-            ingest(bag, PROFILE, store=store, force=True)
+            ingest(bag, PROFILE, store=store)
         tables.append(store.rows.drop_columns(["ingest_id"]))
     assert len(tables[0]) > 50
     for other in tables[1:]:

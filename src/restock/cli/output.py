@@ -115,27 +115,22 @@ def print_table(
     from rich import box
     from rich.table import Table
 
-    console, piped, least = stdout(), not sys.stdout.isatty(), 0
-    layout = _Layout.of(rows, names, console.width)
+    console, piped = stdout(), not sys.stdout.isatty()
+    layout = _Layout.piped(rows, names) if piped else _Layout.of(rows, names, console.width)
+    if piped:
+        console.width = max(PIPE_WIDTH, layout.width())
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, layout.apart - 1, 0, 0))
     if layout.apart == FAR:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name, header, width in zip(names, layout.headers, layout.widths, strict=True):
         numeric = any(_is_number(row[name]) for row in rows)
-        texts = [name, *(cell(row[name]) for row in rows)]
-        longest = max(_longest(text.split("\n")) for text in texts)
-        whole = _longest([text for text in texts if len(text.split()) == 1])
         table.add_column(
-            name if piped else header,
+            header,
             justify="right" if numeric else "left",
             overflow="fold",
-            no_wrap=(numeric and width is None) or (piped and longest <= SHORT),
-            min_width=whole if piped else None,
-            width=None if piped else width,
+            no_wrap=numeric and width is None,
+            width=width,
         )
-        least += 3 + (longest if numeric else max(whole, min(longest, SHORT)))
-    if piped:
-        console.width = max(PIPE_WIDTH, least)
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
     with console.capture() as captured:
@@ -155,11 +150,28 @@ def print_table(
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a table is fitted into a terminal that is too narrow for it."""
+    """How a table is fitted into what is too narrow for it."""
 
     apart: int  # columns between two columns
     headers: list[str]
     widths: list[int | None]
+
+    def width(self) -> int:
+        """Columns that it takes where every column's width is known, with its edges."""
+        return sum(width or 0 for width in self.widths) + self.apart * (len(self.widths) - 1) + 2
+
+    @classmethod
+    def piped(cls, rows: Sequence[Row], names: Sequence[str]) -> _Layout:
+        """For a file or a pipe: no word and no cell up to SHORT is cut, however wide that is."""
+        least, full = [], []
+        for name in names:
+            numeric = any(_is_number(row[name]) for row in rows)
+            texts = [name, *(cell(row[name]) for row in rows)]
+            full.append(_longest([line for text in texts for line in text.split("\n")]))
+            whole = _longest([text for text in texts if len(text.split()) == 1])
+            least.append(full[-1] if numeric else max(whole, min(full[-1], SHORT)))
+        room = PIPE_WIDTH - 2 - FAR * (len(names) - 1)
+        return cls(FAR, list(names), list(_filled(least, full, room)))
 
     @classmethod
     def of(cls, rows: Sequence[Row], names: Sequence[str], width: int) -> _Layout:
