@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from weakref import WeakKeyDictionary
 
@@ -18,6 +18,7 @@ import duckdb
 
 from restock.ingest.store.summary import with_included
 from restock.replay.store.column_docs import install_columns
+from restock.replay.store.same_drives import SAME_DRIVES, install_same_drives
 
 # In their order: a view may use those before it.
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
@@ -97,7 +98,9 @@ class Definitions:
         self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
-        self._computed, self._replaced = dict(computed or {}), dict(replaced or {})
+        self._computed = dict(computed or {})
+        self._replaced: dict[tuple[str, ...], Callable[[], None]] = dict(replaced or {})
+        self._replaced[SAME_DRIVES] = partial(install_same_drives, connection)
         self._made: set[str] = set()
         self._held: list[str] = []
         _OF[connection] = self

@@ -1,0 +1,158 @@
+"""Recordings that hold one drive, by what the robot did: commands and wheel speeds, step by step.
+
+A drive that was replayed, or read by another profile, has other poses, goals, actions and stamps;
+what was commanded and what the wheels did is as it was, at one constant shift of the clocks. What
+several rows of a recording have in common proves nothing and is left aside. Whatever two recordings
+share by chance is little beside what one drive has in common with itself, so that only pairs that
+share much are looked at row by row: contents are sorted in NumPy, one number a row, as DuckDB would
+count each in a table of all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.arrays import Ints
+
+SAME_DRIVES = ("same_drives",)
+LEAST_ROWS = 2
+LEAST_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
+WITHIN_NS = 100_000_000  # of the shift
+FEW = 5  # recordings of one content, up to which all pairs are compared
+_BATCH_ROWS = 100_000
+_MOVING = """
+    SELECT
+        recording_id,
+        stamp_ns,
+        hash(
+            round(command_speed_mps, 3),
+            round(command_yaw_rate_radps, 3),
+            round(wheel_speed_mps, 4),
+            round(wheel_yaw_rate_radps, 4)
+        ) AS content
+    FROM transitions
+    WHERE wheel_speed_mps <> 0 OR wheel_yaw_rate_radps <> 0
+"""
+
+
+@dataclass(frozen=True)
+class MovingRows:
+    """Rows in which the robot moves, in any order."""
+
+    names: list[str]  # of recordings, (R,) ascending
+    recording: NDArray[np.int32]  # (N,) index into them
+    content: NDArray[np.uint64]  # (N,) hash of command and wheel speeds
+    stamp_ns: Ints  # (N,)
+
+
+def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
+    """The table `same_drives` over the connection's `transitions`: see `same_drives`."""
+    connection.register(*SAME_DRIVES, same_drives(_moving_rows(connection)))
+
+
+def same_drives(rows: MovingRows) -> pa.Table:
+    """Pairs of recordings with LEAST_ROWS distinctive rows, and LEAST_SHARE of them, in common.
+
+    Columns: `recording_id`, `same_as` (the later name), `rows` of both within WITHIN_NS of the
+    shift, `share` of the distinctive rows of the smaller one, and `later_s`, the shift. A content
+    of more than FEW recordings is compared with the first of them only: pairs grow with the square.
+    """
+    recording, content, stamp = _distinctive(rows)
+    distinctive = np.bincount(recording, minlength=len(rows.names))
+    first, second = (np.concatenate(parts) for parts in zip(*_pairs(content), strict=True))
+    count = max(len(rows.names), 1)
+    pair = recording[first].astype(np.int64) * count + recording[second]
+    later = stamp[second] - stamp[first]
+    # By chance two recordings share little: only pairs that share enough are gone on with.
+    keys, each = np.unique(pair, return_counts=True)
+    least = np.maximum(LEAST_SHARE * _smaller(keys, count, distinctive), LEAST_ROWS)
+    kept = np.isin(pair, keys[each >= least])
+    pair, later = pair[kept], later[kept]
+    order = np.lexsort((later, pair))
+    pair, later = pair[order], later[order]
+    keys, begin, each = np.unique(pair, return_index=True, return_counts=True)
+    shift = later[begin + (each - 1) // 2]
+    near = np.abs(later - np.repeat(shift, each)) <= WITHIN_NS
+    same = np.add.reduceat(near, begin, dtype=np.int64) if len(begin) else each
+    share = same / np.maximum(_smaller(keys, count, distinctive), 1)
+    told = (same >= LEAST_ROWS) & (share >= LEAST_SHARE)
+    names = pa.array(rows.names, pa.string())
+    return pa.table(
+        {
+            "recording_id": names.take(pa.array(keys[told] // count)),
+            "same_as": names.take(pa.array(keys[told] % count)),
+            "rows": same[told],
+            "share": share[told],
+            "later_s": shift[told] / 1e9,
+        }
+    )
+
+
+def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
+    codes: dict[str, int] = {}
+    recording, content, stamp = [], [], []
+    for batch in connection.sql(_MOVING).to_arrow_reader(_BATCH_ROWS):
+        named = batch.column("recording_id").dictionary_encode()
+        names = named.dictionary.to_pylist()
+        of_name = np.array([codes.setdefault(name, len(codes)) for name in names], np.int32)
+        recording.append(of_name[named.indices.to_numpy()])
+        content.append(batch.column("content").to_numpy())
+        stamp.append(batch.column("stamp_ns").to_numpy())
+    names = sorted(codes)
+    rank = np.empty(len(codes), np.int32)
+    rank[[codes[name] for name in names]] = np.arange(len(names))
+    return MovingRows(
+        names,
+        rank[np.concatenate([np.empty(0, np.int32), *recording])],
+        np.concatenate([np.empty(0, np.uint64), *content]),
+        np.concatenate([np.empty(0, np.int64), *stamp]),
+    )
+
+
+def _distinctive(
+    rows: MovingRows,
+) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints]:
+    """Recording, content and stamp (M,) of rows whose content is their recording's only one, by
+    content and recording."""
+    order = np.argsort(rows.content, kind="stable")
+    content, recording = rows.content[order], rows.recording[order]
+    alike = content[1:] == content[:-1]
+    if (alike & (recording[1:] < recording[:-1])).any():  # a recording in several files
+        order = np.lexsort((rows.recording, rows.content))
+        content, recording = rows.content[order], rows.recording[order]
+    begins = np.concatenate([[True], ~alike | (recording[1:] != recording[:-1]), [True]])
+    single = begins[1:] & begins[:-1] if len(order) else np.empty(0, np.bool_)
+    return recording[single], content[single], rows.stamp_ns[order[single]]
+
+
+def _pairs(content: NDArray[np.uint64]) -> Iterator[tuple[Ints, Ints]]:
+    """Places of two rows that have one content (M,), which is ascending."""
+    begins = np.flatnonzero(np.concatenate([[True], content[1:] != content[:-1]]))
+    begins = begins if len(content) else np.empty(0, np.int64)
+    size = np.diff(begins, append=len(content))
+    begins, size = begins[size > 1], size[size > 1]
+    yield np.repeat(begins, size - 1), _ranges(begins + 1, size - 1)
+    begins, size = begins[size <= FEW], size[size <= FEW]
+    for one in range(1, FEW - 1):
+        for other in range(one + 1, FEW):
+            inside = begins[size > other]
+            yield inside + one, inside + other
+
+
+def _ranges(begin: Ints, length: Ints) -> Ints:
+    """begin, begin + 1, … of each, one after the other."""
+    ends = np.cumsum(length)
+    places: Ints = np.repeat(begin - (ends - length), length)
+    places += np.arange(len(places))
+    return places
+
+
+def _smaller(keys: Ints, count: int, distinctive: Ints) -> Ints:
+    least: Ints = np.minimum(distinctive[keys // count], distinctive[keys % count])
+    return least

@@ -1,0 +1,72 @@
+"""Pairs of recordings that hold one drive, against the definition in plain loops."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import combinations
+from statistics import median_low
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.replay.store.same_drives import (
+    FEW,
+    LEAST_ROWS,
+    LEAST_SHARE,
+    WITHIN_NS,
+    MovingRows,
+    same_drives,
+)
+
+Row = tuple[int, int, int]  # recording, content, stamp
+
+
+def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
+    found: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for recording, content, stamp in rows:
+        found[recording, content].append(stamp)
+    single = {key: stamps[0] for key, stamps in found.items() if len(stamps) == 1}
+    distinctive: dict[int, int] = defaultdict(int)
+    holders: dict[int, list[int]] = defaultdict(list)
+    for recording, content in sorted(single):
+        distinctive[recording] += 1
+        holders[content].append(recording)
+    later: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for content, recordings in holders.items():
+        for one, other in combinations(recordings, 2):
+            if one == recordings[0] or len(recordings) <= FEW:
+                later[one, other].append(single[other, content] - single[one, content])
+    pairs = set()
+    for (one, other), gaps in later.items():
+        shift = median_low(gaps)
+        same = sum(abs(gap - shift) <= WITHIN_NS for gap in gaps)
+        share = same / min(distinctive[one], distinctive[other])
+        if same >= LEAST_ROWS and share >= LEAST_SHARE:
+            pairs.add((f"r{one}", f"r{other}", same, share, shift / 1e9))
+    return pairs
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 7), st.integers(0, 12), st.integers(0, 6).map(lambda n: n * 10**8 // 2)
+        ),
+        max_size=60,
+    )
+)
+def test_they_are_those_of_the_definition(rows: list[Row]) -> None:
+    recording, content, stamp = np.array(rows, np.int64).reshape(-1, 3).T
+    table = same_drives(
+        MovingRows(
+            [f"r{index}" for index in range(8)],
+            recording.astype(np.int32),
+            content.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15),
+            stamp,
+        )
+    )
+    columns = ("recording_id", "same_as", "rows", "share", "later_s")
+    found = list(zip(*(table[name].to_pylist() for name in columns), strict=True))
+    assert len(found) == len(set(found))
+    assert set(found) == looped(rows)
