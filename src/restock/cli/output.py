@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -133,19 +134,21 @@ def print_table(
         )
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
+    if title is not None:  # rich's own would be wrapped to the table's width
+        style = _STYLES.get(title.split(":")[0], "table.title")
+        console.print(visible(title), style=style, markup=False, soft_wrap=True)
     with console.capture() as captured:
-        if title is not None:  # rich's own would be wrapped to the table's width
-            console.print(
-                visible(title),
-                style=_STYLES.get(title.split(":")[0], "table.title"),
-                markup=False,
-                soft_wrap=True,
-            )
         console.print(table, soft_wrap=False)
     # rich pads every line to the table's width; a pipe has no use for that.
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
     sys.stdout.write(text.strip("\n") + "\n")
+
+
+def print_wrapped(text: str) -> None:
+    """A paragraph after an empty line, wrapped as tables are: to the terminal, or PIPE_WIDTH."""
+    lines = textwrap.wrap(text, table_width(), break_on_hyphens=False, subsequent_indent="  ")
+    stdout().print("\n".join(["", *lines]), markup=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -182,19 +185,20 @@ class _Layout:
         width -= 2  # its edges
         if sum(full) + FAR * (len(names) - 1) <= width:
             return cls(FAR, list(names), [None] * len(names))
-        headers, least = [], []
+        least = []
         for name, some in zip(names, lines, strict=True):
             numeric = any(_is_number(row[name]) for row in rows)
             cells = _longest(some if numeric else [word for line in some for word in line.split()])
-            headers.append(_parted(name, cells))
-            least.append(max(cells, _longest(headers[-1].split("\n"))))
+            least.append(max(cells, _longest(_parted(name, cells).split("\n"))))
         for apart in (FAR, 2, 1):
             if (room := width - apart * (len(names) - 1)) >= sum(least):
                 break
         # Too narrow even so: the columns with the longest words give way.
         for place in sorted(range(len(names)), key=lambda place: -least[place]):
             least[place] -= max(min(sum(least) - room, least[place] - NARROW), 0)
-        return cls(apart, headers, list(_filled(least, full, room)))
+        widths = list(_filled(least, full, room))
+        headers = [_parted(name, width) for name, width in zip(names, widths, strict=True)]
+        return cls(apart, headers, widths)
 
 
 def _filled(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:

@@ -206,27 +206,32 @@ def _document(finding: Finding) -> dict[str, Any]:
 
 
 def _print(findings: list[Finding], shown: int) -> None:
+    """What was found, each with its first rows and advice; then what found nothing, by name."""
     from restock.cli import output
 
-    output.print_table(
-        [
-            {
-                "audit": finding.audit.name,
-                "status": finding.status,
-                "rows": finding.rows,
-                "what it looks for": finding.audit.doc,
-            }
-            for finding in findings
-        ]
-    )
-    for finding in findings:
-        if not finding.rows:
-            continue
+    told = [finding for finding in findings if finding.rows]
+    if told:
+        output.print_table(
+            [
+                {
+                    "audit": finding.audit.name,
+                    "status": finding.status,
+                    "rows": finding.rows,
+                    "what it looks for": finding.audit.doc,
+                }
+                for finding in told
+            ]
+        )
+    for finding in told:
         output.stdout().print()
         more = finding.rows - min(shown, len(finding.sample))
         title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
         output.print_table(finding.sample[:shown], finding.columns, title=title)
         output.stdout().print(f"  {finding.audit.advice}", markup=False)
+    for status in ("pass", "skipped"):
+        names = [finding.audit.name for finding in findings if finding.status == status]
+        if names:
+            output.print_wrapped(f"{status}: {', '.join(names)}")
     output.stdout().print(f"\n{_summary(findings)}")
 
 
