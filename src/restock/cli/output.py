@@ -156,8 +156,8 @@ class _Layout:
     """How a table is fitted into what is too narrow for it."""
 
     apart: int  # columns between two columns
-    headers: list[str]
-    widths: list[int | None]
+    headers: Sequence[str]
+    widths: Sequence[int | None]
 
     def width(self) -> int:
         """Columns that it takes where every column's width is known, with its edges."""

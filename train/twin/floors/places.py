@@ -51,7 +51,8 @@ def find_places(
         notes.append(
             f"{1 - fits.sum() / len(visited_m):.0%} of the poses are nearer to obstacles than the"
             f" {room_m:.2f} m that this robot needs, or in another part of the floor: no mission"
-            " goes there"
+            " goes there. Where it does drive there, it is smaller than the profile has it: give"
+            " --footprint LxW"
         )
     best: dict[tuple[int, int], tuple[float, tuple[float, float]]] = {}
     for i, j in np.unique(cells[wide], axis=0).tolist():

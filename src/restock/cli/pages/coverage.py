@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -50,13 +51,15 @@ class CoverageCommand:
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             if self.out is not None:
-                output.say(f"wrote {self._write(store, self.out)}")
+                with output.progress("page", 3) as advance:
+                    page = self._write(store, self.out, advance)
+                output.say(f"wrote {page}")
         if self.json:
             output.print_json(rows)
         else:
             output.print_table([_line(row) for row in rows], title="the shelves")
 
-    def _write(self, store: Any, out: Path) -> Path:
+    def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import ConfigError, RestockError
         from restock.replay.fleet.drift import Drift, measure_drift
         from restock.replay.fleet.gaps import find_gaps
@@ -66,6 +69,7 @@ class CoverageCommand:
         from restock.report import write_coverage_page
         from restock.train.twin.physics.episode import KINDS
 
+        advance(0, "what is missing")
         yields, gaps = find_gaps(
             store,
             load_mixture(self.mixture),
@@ -80,6 +84,7 @@ class CoverageCommand:
             "mixture": self.mixture,
             **document(shopping_list(yields, gaps)),
         }
+        advance(1, "drift")
         drift: Drift | str
         try:
             drift = measure_drift(store, every=self.every)
@@ -87,7 +92,10 @@ class CoverageCommand:
             raise
         except RestockError as error:  # what is logged tells nothing of it
             drift = str(error)
-        return write_coverage_page(store, missing, drift, out, self.figures)
+        advance(1, "charts")
+        page = write_coverage_page(store, missing, drift, out, self.figures)
+        advance(1, "")
+        return page
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:

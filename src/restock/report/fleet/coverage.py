@@ -219,7 +219,7 @@ def _shopping(gaps: dict[str, Any]) -> Section:
             if gap["amount"] is None
             else f"{_amount(gap['amount'])} [{_amount(gap['amount_low'])},"
             f" {_amount(gap['amount_high'])}]",
-            "best": "never seen: no rate is known" if gap["best"] is None else words(gap["best"]),
+            "best": "no rate is known" if gap["best"] is None else words(gap["best"]),
             "asked by": gap["asked_by"],
         }
         for gap in ordered[:MOST_GAPS]

@@ -170,8 +170,7 @@ def _age_rows(facts: Facts) -> Rows:
     rows: Rows = []
     for row in facts.ages:
         unit = "d" if row["unit"] == "days" else "steps"
-        low = 2 ** row["bucket"] if row["bucket"] >= 0 else 0
-        text = f"< 1 {unit}" if row["bucket"] < 0 else f"{_short(low)} to {_short(2 * low)} {unit}"
+        text = f"< 1 {unit}" if row["bucket"] < 0 else _span(2 ** row["bucket"], unit)
         rows.append(
             {
                 "source": row["source"],
@@ -181,6 +180,13 @@ def _age_rows(facts: Facts) -> Rows:
             }
         )
     return rows
+
+
+def _span(low: int, unit: str) -> str:
+    """From `low` to twice that, as a label: days of years as those."""
+    if unit == "d" and low >= 512:
+        return f"{low / 365.25:.1f} to {2 * low / 365.25:.1f} y"
+    return f"{_short(low)} to {_short(2 * low)} {unit}"
 
 
 def _short(value: int) -> str:
