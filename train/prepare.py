@@ -382,8 +382,9 @@ def _describe_teacher(config: TrainConfig, panel: Panel | None) -> str:
         return ""
     rows = 0 if panel is None else sum(_policies(panel)[name] for name in teacher.policies)
     cloned = f"{rows:,} logged rows of {', '.join(teacher.policies)} are cloned first"
+    mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
     return f"\nteacher {teacher.source}: Q chooses among what is plausible to it; " + (
-        cloned if rows else "no logged rows to clone, so at first everything is"
+        (cloned if rows else "no logged rows to clone, so at first everything is") + mirrored
     )
 
 

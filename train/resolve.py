@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import msgspec
 
+from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
+from restock.ingest.task.task import Mirror, Task
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
-from restock.train.dqn.config import TrainConfig
+from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.missions import mission_orders
 from restock.train.twin.env.interface import AFTER_LOGS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
@@ -41,7 +43,10 @@ def planned_draws(config: TrainConfig) -> PlannedDraws:
 
 
 def resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
-    """What the config leaves open: the operator drives to goals; where there are none, nobody."""
+    """What the config leaves open: the operator drives to goals; where there are none, nobody.
+
+    Raises ConfigError where rows are to be mirrored, and an action has no opposite.
+    """
     teacher = config.teacher
     if teacher.source is None:
         soft = config.loss.munchausen > 0 and teacher.target == "filtered"
@@ -50,4 +55,21 @@ def resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
     if teacher.offline_updates is None:
         count = config.schedule.offline_updates
         teacher = msgspec.structs.replace(teacher, offline_updates=count)
+    if teacher.mirror is not False:
+        teacher = msgspec.structs.replace(teacher, mirror=_mirrors(teacher, profile.task))
     return msgspec.structs.replace(config, teacher=teacher)
+
+
+def _mirrors(teacher: TeacherConfig, task: Task) -> bool:
+    """Whether the behaviour network learns from mirror images, where that is asked or left open."""
+    try:
+        Mirror.of(task)
+    except ValueError as error:
+        if teacher.mirror is None:
+            return False
+        raise ConfigError(
+            f"rows cannot be mirrored: {error}",
+            where="teacher.mirror",
+            remedy="leave it out, or give the profile's action table each turn both ways",
+        ) from error
+    return teacher.mirror is True or teacher.source == "operator"

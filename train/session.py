@@ -18,7 +18,7 @@ import torch
 from restock.arrays import F32, Ints
 from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.behaviour import PolicyNetwork
@@ -325,6 +325,7 @@ def open_session(
             batch_size=config.replay.batch_size,
             seed=seed,
             device=learner.device,
+            mirror=Mirror.of(task) if config.teacher.mirror else None,
         )
         if config.teacher.filters
         else None,

@@ -9,6 +9,7 @@ makes an observation sees `after`; reward and termination are what happened in [
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -102,6 +103,47 @@ class Task(Checked, frozen=True):
         """Names the definition, its parameters and the version of this code: 12 hex digits."""
         content = msgspec.json.encode([TASK_CODE_VERSION, self])
         return hashlib.blake2b(content, digest_size=6).hexdigest()
+
+
+# Entries of an observation that change their sign where left and right are exchanged.
+_ODD = ("near_sin", "far_sin", "gyro_yaw_rate", "slip_yaw_rate", "lateral_speed", "nav_yaw_rate")
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Observations and actions of a task with left and right exchanged."""
+
+    source: Ints  # (D,) the entry that takes this one's place
+    sign: F32  # (D,)
+    opposite: Ints  # (A,) the action at the same speed, turning as fast the other way
+
+    @classmethod
+    def of(cls, task: Task) -> Mirror:
+        """Raises ValueError where an action turns one way, and none turns as fast the other way."""
+        table = np.asarray(task.actions, np.float64)
+        gap = np.abs(table[:, None] - table[None] * (1, -1)).max(axis=2)
+        opposite = gap.argmin(axis=1)
+        for index in np.flatnonzero(gap.min(axis=1) > 1e-6).tolist():
+            name = task.action_names[index]
+            raise ValueError(f"action {index}, {name}, has no opposite among the task's actions")
+        names = task.observation_names
+        source = np.arange(len(names))
+        at = names.index("previous_action_0")
+        source[at : at + len(table)] = at + opposite
+        at += len(table)
+        for begin in (at, at + task.sectors):  # clearance and closing, from behind right to left
+            source[begin : begin + task.sectors] = source[begin : begin + task.sectors][::-1]
+        sign = np.where(np.isin(names, _ODD), -1.0, 1.0).astype(np.float32)
+        return cls(source, sign, opposite)
+
+    def observation(self, observation: F32) -> F32:
+        """What would be observed, (..., D), where all is mirrored."""
+        mirrored: F32 = observation[..., self.source] * self.sign
+        return mirrored
+
+    def action(self, action: Ints) -> Ints:
+        """The actions (N,) that do the same there; what is negative, for none, stays."""
+        return np.where(action < 0, action, self.opposite[action])
 
 
 def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:

@@ -13,6 +13,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import SIGNALS, localised_velocity, wrap_angle
 from restock.ingest.task.task import (
+    Mirror,
     Rewards,
     Task,
     clearance_ahead,
@@ -74,6 +75,49 @@ def test_the_observation_by_hand():
     assert found[0, 12:17].tolist() == [0, 0, 1, 0, 0]
     assert found[0, 17:21] == pytest.approx([1.0, 0.5, 0.25, 1.0])
     assert found[0, 21:25] == pytest.approx([0.0, -0.5, 0.0, 0.0])
+
+
+# Signals of the observation that change their sign where left and right are exchanged.
+TO_THE_SIDE = (
+    "waypoint_near_y_m",
+    "waypoint_far_y_m",
+    "wheel_yaw_rate_radps",
+    "gyro_yaw_rate_radps",
+    "localised_lateral_mps",
+    "nav_yaw_rate_radps",
+)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["warehouse_amr", "turtlebot3"]))
+def test_the_mirror_image_is_what_is_observed_in_a_mirrored_world(seed, profile):
+    task = load_profile(profile).task
+    rng = np.random.default_rng(seed)
+
+    def drawn() -> dict[str, np.ndarray]:
+        shape = {True: (6, task.sectors), False: (6,)}
+        return {s.name: rng.normal(size=shape[s.per_sector]) * 2 for s in SIGNALS}
+
+    def turned(of: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        mirrored = {**of, **{name: -of[name] for name in TO_THE_SIDE}}
+        return {**mirrored, "sector_clearance_m": of["sector_clearance_m"][:, ::-1]}
+
+    now, before = drawn(), drawn()
+    now["nav_speed_mps"][:2] = np.nan
+    previous = rng.integers(len(task.actions), size=6)
+    mirror = Mirror.of(task)
+    table = np.asarray(task.actions)
+    assert np.allclose(table[mirror.action(previous)], table[previous] * (1, -1))
+    found = mirror.observation(observe(task, now, before, previous))
+    expected = observe(task, turned(now), turned(before), mirror.action(previous))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.array_equal(mirror.action(np.array([-1, 0])), [-1, 0])
+
+
+def test_an_action_without_its_opposite_has_no_mirror_image():
+    lopsided = msgspec.structs.replace(TASK, actions=((0.0, 0.0), (0.5, 0.0), (0.0, 1.0)))
+    with pytest.raises(ValueError, match=r"action 2, turn left 1, has no opposite"):
+        Mirror.of(lopsided)
 
 
 def test_the_names_are_those_of_the_entries():

@@ -20,7 +20,9 @@ from torch import Tensor, tensor
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.task import Mirror
 from restock.replay.mixture.schedules import Linear
+from restock.replay.ring.ring import FreshRing
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import Facts
 from restock.state import restored, saved
@@ -38,6 +40,7 @@ from restock.train.dqn.config import TeacherConfig, parse_config
 from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import quantile_target, td_target
+from restock.train.feed.imitation import Imitation
 from restock.train.feed.teacher import open_teacher
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new
@@ -268,6 +271,71 @@ def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> 
     live.close()
 
 
+def test_half_of_the_rows_are_drawn_mirrored_with_the_opposite_action(tmp_path: Path) -> None:
+    task = load_profile("warehouse_amr").task
+    ring = FreshRing(
+        4,
+        1,
+        task.observation_size,
+        discount=0.9,
+        n_step=1,
+        conditions=["nominal"],
+        behaviour_policies=["agent"],
+    )
+    rng = np.random.default_rng(0)
+    observed = rng.normal(size=(4, task.observation_size)).astype(np.float32)
+    answers = np.array([3, UNKNOWN, 8, 0])
+    ring.rows[:, ring.columns["observation"]] = observed
+    ring.meta["teacher_action"][:] = answers
+    ring.appended = 4
+    mirror = Mirror.of(task)
+    imitation = Imitation(
+        TeacherConfig(source="operator"),
+        None,
+        ring,
+        batch_size=400,
+        seed=0,
+        device=torch.device("cpu"),
+        mirror=mirror,
+    )
+    drawn = imitation.draw_online()
+    seen = {
+        **{row.tobytes(): (False, action) for row, action in zip(observed, answers, strict=True)},
+        **{
+            row.tobytes(): (True, action)
+            for row, action in zip(
+                mirror.observation(observed), mirror.action(answers), strict=True
+            )
+        },
+    }
+    assert len(seen) == 8
+    turned = 0
+    for row, action in zip(drawn.observation.numpy(), drawn.action.tolist(), strict=True):
+        mirrored, expected = seen[row.tobytes()]
+        assert action == expected
+        turned += mirrored
+    assert 150 < turned < 250
+    assert np.array_equal(ring.rows[:, ring.columns["observation"]], observed)
+
+
+def test_rows_are_mirrored_where_the_operator_teaches_and_turns_have_their_opposite(
+    tmp_path: Path,
+) -> None:
+    def mirror(*settings: str) -> bool | None:
+        return prepare_new(tmp_path / "run", None, None, settings).config.teacher.mirror
+
+    assert mirror() is True
+    assert mirror("teacher.mirror=false") is False
+    assert mirror("teacher.source=none") is False
+    text = (ROOT / "ingest/profile/profiles/warehouse_amr.toml").read_text("utf-8")
+    lopsided = tmp_path / "lopsided.toml"
+    assert "[0.8, -0.7]" in text
+    lopsided.write_text(text.replace("[0.8, -0.7]", "[0.8, -0.6]"))
+    assert mirror(f"profile={lopsided}") is False
+    with pytest.raises(ConfigError, match=r"drive 0\.8 left 0\.7, has no opposite"):
+        mirror(f"profile={lopsided}", "teacher.mirror=true")
+
+
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
@@ -380,6 +448,9 @@ def test_the_replay_card_names_the_teacher(taught: Any) -> None:
     page = as_markdown(card)
     assert "given; logged rows of operator cloned; an action is plausible from 0.5 of" in page
     assert "| fresh | nominal |" in page.split("## What the teacher's filter did at the end")[1]
+    known["config"]["config"]["teacher"]["mirror"] = True
+    mirrored = as_markdown(replay_card(Facts(**known)))
+    assert "rows of operator cloned, half of its rows mirrored; an action" in mirrored
 
 
 def test_a_teacher_is_part_of_the_algorithm(taught: Any, tmp_path: Path) -> None:

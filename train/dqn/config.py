@@ -126,6 +126,9 @@ class TeacherConfig(Checked, frozen=True):
     offline_updates: NonNegativeInt | None = None
     learning_rate: Positive = 1e-3
     hidden: tuple[Count, ...] = (256, 256)  # widths of the behaviour network
+    # It learns from each row's mirror image as often as from the row: of a teacher who keeps to no
+    # side. None: where the twin's operator is asked and each action has its opposite.
+    mirror: bool | None = None
 
     @property
     def filters(self) -> bool:

@@ -2,6 +2,8 @@
 
 Logged rows are drawn by the shares of their strata, as the critic's are: a network that clones the
 majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn alike.
+Of a teacher who keeps to no side, each row says as much of its mirror image: half of them are drawn
+as that.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import torch
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError
+from restock.ingest.task.task import Mirror
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
@@ -30,6 +33,7 @@ class Imitation(Stateful):
     Args:
         batch_size: M.
         device: where the batches are wanted.
+        mirror: of the task, where rows are mirrored.
 
     Raises:
         ConfigError: the teacher is `logs`, and they have no row of its policies.
@@ -46,8 +50,9 @@ class Imitation(Stateful):
         batch_size: int,
         seed: int,
         device: torch.device,
+        mirror: Mirror | None = None,
     ) -> None:
-        self.logs, self.ring, self.device = logs, ring, device
+        self.logs, self.ring, self.device, self._mirror = logs, ring, device, mirror
         self.batch_size, self._seed = batch_size, seed
         self._rng = np.random.default_rng([seed, 7])
         self.cloned: Ints = np.empty(0, np.int64)  # rows of the logs
@@ -77,6 +82,10 @@ class Imitation(Stateful):
         slots = self.ring.sample(fresh, self._rng) if fresh else np.empty(0, np.int64)
         parts = [self._logged_states(rows), self._fresh_states(slots)]
         observation, action = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        if self._mirror is not None:
+            turned = self._rng.random(len(observation)) < 0.5
+            observation[turned] = self._mirror.observation(observation[turned])
+            action[turned] = self._mirror.action(action[turned])
         return Labelled(
             torch.from_numpy(observation).to(self.device), torch.from_numpy(action).to(self.device)
         )

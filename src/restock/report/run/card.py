@@ -67,7 +67,10 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             ),
         },
         "teacher": {
-            **{name: teacher.get(name) for name in ("source", "ratio", "target", "policies")},
+            **{
+                name: teacher.get(name)
+                for name in ("source", "ratio", "target", "policies", "mirror")
+            },
             "states": _columns(
                 facts.teacher,
                 *("source", "condition", "asked_rows", "agreement", "plausible_actions"),
@@ -224,9 +227,11 @@ def _teacher(teacher: dict[str, Any] | None) -> str:
     ratio = teacher["ratio"]
     ratio = f"{ratio:g}" if isinstance(ratio, int | float) else f"a schedule ({_words(ratio)})"
     cloned = ", ".join(teacher["policies"]) or "nobody"
+    mirrored = ", half of its rows mirrored" if teacher["mirror"] else ""
     return (
-        f"{teacher['source']}; logged rows of {cloned} cloned; an action is plausible from {ratio}"
-        f" of the likeliest's probability on; the target looks at {teacher['target']} actions"
+        f"{teacher['source']}; logged rows of {cloned} cloned{mirrored}; an action is plausible"
+        f" from {ratio} of the likeliest's probability on; the target looks at"
+        f" {teacher['target']} actions"
     )
 
 
