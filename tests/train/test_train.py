@@ -144,7 +144,10 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     assert whole["exploration"] == parts["exploration"]
 
 
-def test_ctrl_c_writes_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_or_a_kill_writes_a_checkpoint_and_says_how_to_go_on(
+    ended_by: signal.Signals, tmp_path: Path
+) -> None:
     path = tmp_path / "a"
     command = [sys.executable, "-m", "restock", "train", "--out", str(path), *TINY]
     process = subprocess.Popen(
@@ -157,7 +160,7 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> Non
             if progress.exists() and pq.read_metadata(progress).num_rows > 1:
                 break
             time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(ended_by)
         _, complaint = process.communicate(timeout=120)
     finally:
         process.kill()

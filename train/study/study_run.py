@@ -20,6 +20,7 @@ import msgspec
 
 from restock.errors import RestockError, RunError
 from restock.files import write_text
+from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.study.study import ArmConfig, StudyEvaluation, StudyJob, StudyPlan
@@ -75,6 +76,9 @@ def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say)
         try:
             for future in futures:
                 future.result()
+        except KeyboardInterrupt:
+            interrupt_running()
+            raise
         finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
             for future in futures:
                 future.cancel()
@@ -236,23 +240,25 @@ def restock_verb(arguments: Sequence[str], log: Path) -> None:
 def _command(module: str, arguments: Sequence[str], log: Path) -> None:
     what = f"{module} {arguments[0]}" if module == "restock" else module
     log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a", encoding="utf-8") as file:
+    with kill_as_interrupt(), log.open("a", encoding="utf-8") as file:
         file.write(f"$ {module} {' '.join(arguments)}\n")
         file.flush()
-        ended = subprocess.run(
+        process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdout=file,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             env={**os.environ, "NO_COLOR": "1"},
-            check=False,
+            start_new_session=True,  # Ctrl-C reaches it through here alone: twice is "at once"
         )
-    if ended.returncode == 130:
+        with ended_with_us(process):
+            process.wait()
+    if process.returncode == 130:
         raise KeyboardInterrupt
-    if ended.returncode not in (0, 3):
+    if process.returncode not in (0, 3):
         last = [line for line in log.read_text(encoding="utf-8").splitlines() if line.strip()][-3:]
         raise RestockError(
-            f"`{what}` failed with exit code {ended.returncode}: " + " / ".join(last),
+            f"`{what}` failed with exit code {process.returncode}: " + " / ".join(last),
             where=str(log),
             remedy="mend it and run the study again: what is done is kept",
         )

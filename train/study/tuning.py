@@ -16,8 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ import pyarrow.parquet as pq
 from restock.errors import RestockError, RunError
 from restock.files import write_text
 from restock.imports import import_extra
+from restock.interrupts import ended_with_us, kill_as_interrupt
 from restock.stats import wilson
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
@@ -222,7 +222,7 @@ def _train(
     log.parent.mkdir(parents=True, exist_ok=True)
     told: set[int] = set()
     stopped = False
-    with _ended_with_us(), log.open("a", encoding="utf-8") as file:
+    with kill_as_interrupt(), log.open("a", encoding="utf-8") as file:
         file.write(f"$ restock {' '.join(words)}\n")
         file.flush()
         process = subprocess.Popen(
@@ -233,16 +233,12 @@ def _train(
             env={**os.environ, "NO_COLOR": "1"},
             start_new_session=True,  # Ctrl-C reaches it through here alone: twice is "at once"
         )
-        try:
+        with ended_with_us(process):
             while process.poll() is None:
                 time.sleep(_POLL_S)
                 if trial is not None and not stopped and _falls_behind(trial, path, told, index):
                     process.send_signal(signal.SIGINT)  # it checkpoints and ends
                     stopped = True
-        except BaseException:  # it does not outlive what watches it
-            process.send_signal(signal.SIGINT)
-            process.wait()
-            raise
     if process.returncode == 130 and not stopped:
         raise KeyboardInterrupt
     if process.returncode not in (0, 3, 130):
@@ -255,21 +251,6 @@ def _train(
     if trial is not None and not stopped:  # what it evaluated since it was last looked at
         _falls_behind(trial, path, told, index)
     return not stopped
-
-
-@contextmanager
-def _ended_with_us() -> Iterator[None]:
-    """A kill and the end of the terminal as Ctrl-C: a training in a session of its own hears of
-    none, and would go on alone. What is ignored (`nohup`) stays so."""
-    named = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [number for number in named if signal.getsignal(number) == signal.SIG_DFL]
-    for number in ours:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
 
 
 def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:

@@ -15,6 +15,7 @@ from typing import Any
 
 from restock.errors import ExitCode, RestockError
 from restock.imports import hidden, when_imported
+from restock.interrupts import kill_as_interrupt
 
 # verb -> what it does, in the order of the work
 VERBS = {
@@ -83,7 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     try:
-        code = _dispatch(args)
+        with kill_as_interrupt():
+            code = _dispatch(args)
         sys.stdout.flush()  # here, where a reader that went away is no error
         return code
     except KeyboardInterrupt:
