@@ -17,16 +17,16 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.profile.camera import Camera, camera_name_problem
-from restock.ingest.profile.custom_signal import CustomSignal, name_problem
+from restock.ingest.profile.camera import Camera
+from restock.ingest.profile.checks import check_profile
+from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
     COMMAND_SOURCES,
@@ -43,90 +43,26 @@ from restock.ingest.profile.inputs import (
     WHEELS_FALLBACK,
     Input,
     Inputs,
-    check_command_source,
-    check_input,
 )
 from restock.ingest.profile.robot_file import with_robot_file
+from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
 from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import with_files
 from restock.ingest.task.conditions import (
     Condition,
     Kind,
     Noise,
-    label_with_probabilities,
     labels_version,
     of_kind,
     shipped,
 )
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.limiter import Limiter
-from restock.ingest.task.robot import Robot, beyond_limits, refuse_beyond_steering
-from restock.ingest.task.schema import steps_schema
+from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
 
 ELSEWHERE = "elsewhere"
-
-
-class Clock(Checked, frozen=True):
-    """The `[clock]` of a profile: what time is, and when the steps are."""
-
-    alignment: Literal["header.stamp", "log_time"] = "header.stamp"
-    steps: Literal["rate", "command"] = "rate"
-    max_gap_s: float = 0.5  # between two steps of an episode
-    jump_s: float = 1.0  # a change of (log time - stamp) that means the clock was set
-
-
-class Episodes(Checked, frozen=True):
-    """The `[episodes]` of a profile: what ends one, beside goals, gaps and clock jumps."""
-
-    max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
-    goal_moved_m: float = 0.01  # a goal further than this from the last one is a new one
-    plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another
-
-
-class Frames(Checked, frozen=True):
-    """The `[frames]` of a profile: poses are of `base` in `fixed`."""
-
-    fixed: str = "map"
-    base: str = "base_link"
-    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # of a transform of `topic`, at the step
-    topic: str = "/tf"
-    static_topic: str = "/tf_static"
-
-    def check(self) -> None:
-        if self.fixed.strip("/") == self.base.strip("/"):
-            raise ValueError(f"fixed and base are the same frame: {self.base!r}")
-
-
-class Motion(Checked, frozen=True):
-    """The `[motion]` of a profile: how its speeds are known where there is no odometry."""
-
-    window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
-
-
-class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
-    """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`, turned about its middle by
-    `yaw_rad`, counter-clockwise."""
-
-    name: str
-    box_m: tuple[float, float, float, float]
-    yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None  # defaults are known by identity
-
-    def check(self) -> None:
-        x0, y0, x1, y1 = self.box_m
-        if not (x0 < x1 and y0 < y1):
-            raise ValueError(f"box_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1: {self}")
-
-    def holds(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points (N,) lie in it, its edges included."""
-        x0, y0, x1, y1 = self.box_m
-        if self.yaw_rad:
-            middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
-            cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
-            dx, dy = x_m - middle_x, y_m - middle_y
-            x_m, y_m = middle_x + cos * dx + sin * dy, middle_y + cos * dy - sin * dx
-        return np.asarray((x_m >= x0) & (x_m <= x1) & (y_m >= y0) & (y_m <= y1), np.bool_)
 
 
 class Profile(Checked, frozen=True):
@@ -332,7 +268,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     profile = typed(document, Profile, where=where)
     if profile.inputs.scan is None:
         profile = without_lidar(profile)  # whatever number of sectors it gives
-    _check(profile, where)
+    check_profile(profile, where)
     return profile
 
 
@@ -343,142 +279,3 @@ def without_lidar(profile: Profile) -> Profile:
         inputs=msgspec.structs.replace(profile.inputs, scan=None),
         task=msgspec.structs.replace(profile.task, sectors=0),
     )
-
-
-def _check(profile: Profile, where: str) -> None:
-    """What the types alone do not say."""
-    kinds: tuple[tuple[Kind, str, Sequence[str]], ...] = (
-        ("outcome", "conditions", profile.shipped_conditions),
-        ("exposure", "exposures", profile.shipped_exposures),
-    )
-    for kind, key, given in kinds:
-        known = shipped(kind=kind)
-        for name in given:
-            if name not in known:
-                raise ConfigError(
-                    f"`{key}`: no {'condition' if kind == 'outcome' else kind} named {name!r}",
-                    where=where,
-                    remedy=f"shipped are {', '.join(known)}; write your own as [[condition]]"
-                    + (' with kind = "exposure"' if kind == "exposure" else ""),
-                )
-    names = [condition.name for condition in profile.definitions]
-    if doubled := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
-    for name, source in profile.inputs.items():
-        check_input(name, source, where, framed=profile.frames is not None)
-    if profile.inputs.scan is not None and not profile.task.sectors:
-        raise ConfigError(
-            "`task.sectors` is 0, which is of a robot without a lidar, and `inputs.scan` is given",
-            where=where,
-            remedy="give the number of sectors (36 by default), or leave [inputs.scan] out",
-        )
-    for name, source in profile.command_sources.items():
-        check_command_source(f"{COMMAND_SOURCES}.{name}", source, profile.inputs.command, where)
-    if profile.command_through is not None:
-        if not profile.command_sources:
-            raise ConfigError(
-                "`command_through` is given and no `command_sources`: it says by whom nothing is",
-                where=where,
-                remedy="name the topics that it chooses among, or leave it out",
-            )
-        check_command_source(
-            COMMAND_THROUGH, profile.command_through, profile.inputs.command, where
-        )
-    pose = profile.inputs.pose
-    if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
-        raise ConfigError(
-            "`inputs.heading` is of a pose by latitude and longitude, which has none of its own",
-            where=where,
-            remedy="leave it out: other poses say where they face",
-        )
-    if pose is None and profile.frames is None:
-        raise ConfigError(
-            "`inputs.pose` is missing, and there is no `frames`",
-            where=where,
-            remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
-        )
-    if (profile.inputs.wheels is None) == (profile.motion is None):
-        both = profile.motion is not None
-        raise ConfigError(
-            "`inputs.wheels` and `motion` are both given"
-            if both
-            else "`inputs.wheels` is missing, and there is no `motion`",
-            where=where,
-            remedy="keep one: wheels where odometry is recorded, motion for speeds from poses"
-            if both
-            else "name the topic of the odometry, or take speeds from poses: [motion] window_s",
-        )
-    if profile.motion is not None and "wheel_slip" in profile.shipped_conditions:
-        raise ConfigError(
-            "`conditions`: wheel_slip cannot be seen where speeds come from poses ([motion])",
-            where=where,
-            remedy="leave wheel_slip out, or name the odometry under [inputs.wheels]",
-        )
-    _check_goal(profile, where)
-    proposed = profile.inputs.nav_command
-    if proposed is not None and proposed.topic == profile.inputs.command.topic:
-        raise ConfigError(
-            f"`inputs.nav_command.topic` is the command's own, {proposed.topic}: an observation"
-            " would hold the action that is chosen after it",
-            where=where,
-            remedy="name the topic on which the navigation stack proposes, ahead of whoever"
-            " decides, or leave [inputs.nav_command] out",
-        )
-    robot, actions = profile.robot, profile.task.actions
-    if robot is not None and (problem := beyond_limits(robot, actions)):
-        raise ConfigError(
-            f"`task.actions`: {problem}",
-            where=where,
-            remedy="slow the action down, or correct the limit: the robot would not follow it",
-        )
-    for name in profile.signals:
-        if problem := name_problem(name):
-            raise ConfigError(f"`signals.{name}`: {problem}", where=where)
-    for name in profile.cameras:
-        if problem := camera_name_problem(name):
-            raise ConfigError(f"`cameras.{name}`: {problem}", where=where)
-    _check_conditions(profile, where)
-
-
-def _check_goal(profile: Profile, where: str) -> None:
-    """That goals and plans come from somewhere, and from one place alone."""
-    if profile.task.goal == "none":
-        if profile.goal.source == "hindsight":
-            raise ConfigError(
-                "`goal.source` is 'hindsight', and `task.goal` is 'none'",
-                where=where,
-                remedy='set task.goal = "route", or leave goal.source out',
-            )
-        return
-    by_hindsight = profile.goal.source == "hindsight"
-    for name in ("goal", "plan"):
-        given = getattr(profile.inputs, name) is not None
-        if by_hindsight and given:
-            raise ConfigError(
-                f"`inputs.{name}` is given, and `goal.source` is 'hindsight': it would not be used",
-                where=where,
-                remedy=f'leave inputs.{name} out, or set goal.source = "logged"',
-            )
-        if not by_hindsight and not given:
-            raise ConfigError(
-                f"`inputs.{name}` is missing, and `task.goal` is 'route'",
-                where=where,
-                remedy=f"name the topic of the {name}; or take goals by hindsight, [goal]"
-                ' source = "hindsight"; or set task.goal = "none"',
-            )
-
-
-def _check_conditions(profile: Profile, where: str) -> None:
-    """That every condition of the profile's own binds to the steps that there will be."""
-    fields = [signal.field(name) for name, signal in profile.signals.items()]
-    steps = steps_schema(fields).empty_table()
-    for place, condition in enumerate(profile.own_conditions):
-        condition = condition.with_constants(profile.noise.constants)
-        try:
-            label_with_probabilities(steps, [condition])
-        except ConfigError as error:
-            raise ConfigError(
-                f"`condition[{place}].sql` ({condition.name!r}): {error.what}",
-                where=where,
-                remedy=error.remedy,
-            ) from error

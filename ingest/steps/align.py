@@ -30,7 +30,7 @@ from restock.ingest.steps.clock_map import ClockMap, drift_ns, residual_ns, spre
 from restock.ingest.steps.clocks import STAMP, jumps, median
 
 if TYPE_CHECKING:
-    from restock.ingest.profile.profile import Clock
+    from restock.ingest.profile.tables import Clock
 
 NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
 from restock.ingest.decoding.columns import Ragged, TopicColumns
-from restock.ingest.profile.profile import Frames
+from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
 

@@ -10,7 +10,7 @@ from support.driven_robot import START_NS, columns
 
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Clock
+from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, Samples, align, ticks_of
 
 stamps = st.lists(st.integers(0, 10_000), max_size=30).map(sorted)

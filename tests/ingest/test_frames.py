@@ -13,7 +13,8 @@ from support.profile_texts import framed
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
-from restock.ingest.profile.profile import Clock, Frames, load_profile, parse_profile
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.frames import FIELDS, Edges, Tree, rotations
 from restock.ingest.steps.steps import steps_of

@@ -22,7 +22,8 @@ from restock.ingest.live.pilot import Pilot
 from restock.ingest.live.played import play
 from restock.ingest.live.policy_file import PolicyFile
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import Frames, load_profile
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Frames
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.evaluation.policies import GreedyPolicy

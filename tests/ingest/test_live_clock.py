@@ -12,7 +12,7 @@ from support.paths import SHARED
 from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.clock import LiveClock
-from restock.ingest.profile.profile import Clock
+from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, STAMP, align
 
 HUSKY, ODOMETRY = SHARED / "sim-time-husky", "/husky_velocity_controller/odom"

@@ -73,7 +73,7 @@ def test_every_key_of_a_signal_and_every_reduction_is_on_the_page():
     from typing import get_args
 
     from restock.ingest.profile.custom_signal import CustomSignal, Reduce
-    from restock.ingest.profile.profile import Frames
+    from restock.ingest.profile.tables import Frames
 
     for name in (*CustomSignal.__struct_fields__, *get_args(Reduce)):
         assert f"`{name}`" in PAGE or f"`{name} = " in PAGE, name

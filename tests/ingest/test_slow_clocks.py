@@ -16,7 +16,8 @@ from support.paths import SHARED
 from restock import cli
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Clock, load_profile
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.steps import steps_of
 

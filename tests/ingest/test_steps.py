@@ -15,7 +15,8 @@ from support.driven_robot import (
     without,
 )
 
-from restock.ingest.profile.profile import Clock, load_profile
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.steps import parse_policy, steps_of
 
 PROFILE = load_profile("warehouse_amr")

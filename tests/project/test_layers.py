@@ -19,7 +19,7 @@ from support.paths import ROOT
 MOST_MODULES = 15
 ROOMS = ["ingest", "replay", "train", "report", "cli"]
 SHARED = {
-    *("arrays", "errors", "files", "imports", "native", "public"),
+    *("arrays", "errors", "files", "imports", "interrupts", "native", "public"),
     *("state", "stats", "toml", "toml_schema"),
 }
 MAY_IMPORT = {

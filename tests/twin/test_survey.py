@@ -18,7 +18,7 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
-from restock.ingest.profile.profile import Zone
+from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.evidence.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
 from restock.train.twin.env.floor_report import describe_floor

@@ -16,7 +16,7 @@ import numpy as np
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Clock
+from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, ClockReport, align
 from restock.ingest.steps.clocks import STAMP, odd, topic_clock
 

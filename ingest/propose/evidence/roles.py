@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.profile import Frames
+from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.frames import FIELDS, Edges, upward
 from restock.ingest.urdf.description import BASE_FRAMES
 

@@ -17,7 +17,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
-from restock.ingest.profile.profile import Clock, Frames
+from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.roles import named_frames, transform_edges
 from restock.ingest.steps.align import align

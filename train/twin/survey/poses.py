@@ -15,7 +15,8 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Frames, Profile
+from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.tables import Frames
 from restock.ingest.propose.evidence.roles import (
     FIX,
     FIX_FIELDS,

@@ -1,0 +1,161 @@
+"""What a profile must say beyond its types: keys that fit, names that exist, SQL that binds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from restock.errors import ConfigError
+from restock.ingest.profile.camera import camera_name_problem
+from restock.ingest.profile.custom_signal import name_problem
+from restock.ingest.profile.inputs import (
+    COMMAND_SOURCES,
+    COMMAND_THROUGH,
+    check_command_source,
+    check_input,
+)
+from restock.ingest.task.conditions import Kind, label_with_probabilities, shipped
+from restock.ingest.task.robot import beyond_limits
+from restock.ingest.task.schema import steps_schema
+
+if TYPE_CHECKING:
+    from restock.ingest.profile.profile import Profile
+
+
+def check_profile(profile: Profile, where: str) -> None:
+    """Raises ConfigError, naming the key, where a profile says what cannot be."""
+    kinds: tuple[tuple[Kind, str, Sequence[str]], ...] = (
+        ("outcome", "conditions", profile.shipped_conditions),
+        ("exposure", "exposures", profile.shipped_exposures),
+    )
+    for kind, key, given in kinds:
+        known = shipped(kind=kind)
+        for name in given:
+            if name not in known:
+                raise ConfigError(
+                    f"`{key}`: no {'condition' if kind == 'outcome' else kind} named {name!r}",
+                    where=where,
+                    remedy=f"shipped are {', '.join(known)}; write your own as [[condition]]"
+                    + (' with kind = "exposure"' if kind == "exposure" else ""),
+                )
+    names = [condition.name for condition in profile.definitions]
+    if doubled := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
+    for name, source in profile.inputs.items():
+        check_input(name, source, where, framed=profile.frames is not None)
+    if profile.inputs.scan is not None and not profile.task.sectors:
+        raise ConfigError(
+            "`task.sectors` is 0, which is of a robot without a lidar, and `inputs.scan` is given",
+            where=where,
+            remedy="give the number of sectors (36 by default), or leave [inputs.scan] out",
+        )
+    for name, source in profile.command_sources.items():
+        check_command_source(f"{COMMAND_SOURCES}.{name}", source, profile.inputs.command, where)
+    if profile.command_through is not None:
+        if not profile.command_sources:
+            raise ConfigError(
+                "`command_through` is given and no `command_sources`: it says by whom nothing is",
+                where=where,
+                remedy="name the topics that it chooses among, or leave it out",
+            )
+        check_command_source(
+            COMMAND_THROUGH, profile.command_through, profile.inputs.command, where
+        )
+    pose = profile.inputs.pose
+    if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
+        raise ConfigError(
+            "`inputs.heading` is of a pose by latitude and longitude, which has none of its own",
+            where=where,
+            remedy="leave it out: other poses say where they face",
+        )
+    if pose is None and profile.frames is None:
+        raise ConfigError(
+            "`inputs.pose` is missing, and there is no `frames`",
+            where=where,
+            remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
+        )
+    if (profile.inputs.wheels is None) == (profile.motion is None):
+        both = profile.motion is not None
+        raise ConfigError(
+            "`inputs.wheels` and `motion` are both given"
+            if both
+            else "`inputs.wheels` is missing, and there is no `motion`",
+            where=where,
+            remedy="keep one: wheels where odometry is recorded, motion for speeds from poses"
+            if both
+            else "name the topic of the odometry, or take speeds from poses: [motion] window_s",
+        )
+    if profile.motion is not None and "wheel_slip" in profile.shipped_conditions:
+        raise ConfigError(
+            "`conditions`: wheel_slip cannot be seen where speeds come from poses ([motion])",
+            where=where,
+            remedy="leave wheel_slip out, or name the odometry under [inputs.wheels]",
+        )
+    _check_goal(profile, where)
+    proposed = profile.inputs.nav_command
+    if proposed is not None and proposed.topic == profile.inputs.command.topic:
+        raise ConfigError(
+            f"`inputs.nav_command.topic` is the command's own, {proposed.topic}: an observation"
+            " would hold the action that is chosen after it",
+            where=where,
+            remedy="name the topic on which the navigation stack proposes, ahead of whoever"
+            " decides, or leave [inputs.nav_command] out",
+        )
+    robot, actions = profile.robot, profile.task.actions
+    if robot is not None and (problem := beyond_limits(robot, actions)):
+        raise ConfigError(
+            f"`task.actions`: {problem}",
+            where=where,
+            remedy="slow the action down, or correct the limit: the robot would not follow it",
+        )
+    for name in profile.signals:
+        if problem := name_problem(name):
+            raise ConfigError(f"`signals.{name}`: {problem}", where=where)
+    for name in profile.cameras:
+        if problem := camera_name_problem(name):
+            raise ConfigError(f"`cameras.{name}`: {problem}", where=where)
+    _check_conditions(profile, where)
+
+
+def _check_goal(profile: Profile, where: str) -> None:
+    """That goals and plans come from somewhere, and from one place alone."""
+    if profile.task.goal == "none":
+        if profile.goal.source == "hindsight":
+            raise ConfigError(
+                "`goal.source` is 'hindsight', and `task.goal` is 'none'",
+                where=where,
+                remedy='set task.goal = "route", or leave goal.source out',
+            )
+        return
+    by_hindsight = profile.goal.source == "hindsight"
+    for name in ("goal", "plan"):
+        given = getattr(profile.inputs, name) is not None
+        if by_hindsight and given:
+            raise ConfigError(
+                f"`inputs.{name}` is given, and `goal.source` is 'hindsight': it would not be used",
+                where=where,
+                remedy=f'leave inputs.{name} out, or set goal.source = "logged"',
+            )
+        if not by_hindsight and not given:
+            raise ConfigError(
+                f"`inputs.{name}` is missing, and `task.goal` is 'route'",
+                where=where,
+                remedy=f"name the topic of the {name}; or take goals by hindsight, [goal]"
+                ' source = "hindsight"; or set task.goal = "none"',
+            )
+
+
+def _check_conditions(profile: Profile, where: str) -> None:
+    """That every condition of the profile's own binds to the steps that there will be."""
+    fields = [signal.field(name) for name, signal in profile.signals.items()]
+    steps = steps_schema(fields).empty_table()
+    for place, condition in enumerate(profile.own_conditions):
+        condition = condition.with_constants(profile.noise.constants)
+        try:
+            label_with_probabilities(steps, [condition])
+        except ConfigError as error:
+            raise ConfigError(
+                f"`condition[{place}].sql` ({condition.name!r}): {error.what}",
+                where=where,
+                remedy=error.remedy,
+            ) from error
