@@ -95,7 +95,7 @@ class Store:
             pa.schema(transitions.schema().to_arrow()),
             [file.path for file in held],
         )
-        self.files = {one.view: one.addresses() for one in (self._recordings, self._transitions)}
+        self.files = {one.view: one.addresses for one in (self._recordings, self._transitions)}
         try:
             self._manifests = self._recordings.read()
             self._present_all(self.bare, "main")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import duckdb
@@ -37,9 +38,11 @@ class StoredTable:
     schema: pa.Schema
     paths: Sequence[str]  # in the table
 
+    @cached_property
     def addresses(self) -> list[str]:
         """The files, as a reader of files names them."""
-        return [f"{self.place.table(self.table)}/{path}" for path in self.paths]
+        folder = self.place.table(self.table)
+        return [f"{folder}/{path}" for path in self.paths]
 
     def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
         """The view; files on S3 are read at each query.
@@ -48,7 +51,7 @@ class StoredTable:
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
         if self.paths and self.place.folder is not None:
-            kinds, files = column_types(connection, self.schema), self.addresses()
+            kinds, files = column_types(connection, self.schema), self.addresses
             read_parquet(connection, self.view, files, schema=schema, kinds=kinds)
             return
         with self.place.translate_errors():
