@@ -202,8 +202,11 @@ class Location:
         *,
         columns: Sequence[str] | None = None,
         where: pc.Expression | None = None,
+        repeated: Sequence[str] = (),
     ) -> pa.Table:
         """A Parquet file's rows, as they were written: of these columns, those that it has.
+
+        Text of `repeated` columns comes as Arrow's dictionaries, once for all rows that have it.
 
         Raises:
             FileNotFoundError: it is not there.
@@ -212,7 +215,8 @@ class Location:
         with self.reading(path) as file:
             if where is not None:
                 return pq.read_table(file, partitioning=None, filters=where)
-            whole = pq.ParquetFile(file)  # `read_table` imports Arrow's data sets
+            # `read_table` imports Arrow's data sets.
+            whole = pq.ParquetFile(file, read_dictionary=list(repeated))
             names = whole.schema_arrow.names
             return whole.read([name for name in names if columns is None or name in columns])
 

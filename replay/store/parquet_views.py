@@ -44,7 +44,7 @@ def read_parquet(
         if kinds is None:
             connection.execute(parquet_view(view, files, schema=schema, absent=absent))
         else:
-            connection.execute(_known_parquet_view(view, files, kinds, schema=schema))
+            _view_of_known(connection, view, files, kinds, schema=schema)
     except duckdb.Error as error:
         where = str(files[0]) if len(files) == 1 else os.path.commonpath([str(f) for f in files])
         raise StoreError(
@@ -71,22 +71,27 @@ def parquet_view(
     )
 
 
-def _known_parquet_view(
-    view: str, files: Sequence[str | os.PathLike[str]], kinds: Mapping[str, str], *, schema: str
-) -> str:
-    """The statements that make a view of columns of these types. The lists are variables of the
-    connection: as part of the view they would be read again wherever a query names it."""
+def _view_of_known(
+    connection: duckdb.DuckDBPyConnection,
+    view: str,
+    files: Sequence[str | os.PathLike[str]],
+    kinds: Mapping[str, str],
+    *,
+    schema: str,
+) -> None:
+    """Make a view of columns of these types. Files and types are variables of the connection: as
+    part of the view they would be read again wherever a query names it."""
     fields = ", ".join(
         f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
         " default_value: NULL}"
         for column, kind in kinds.items()
     )
-    named = {f"{schema}_{view}_files": _list(files), f"{schema}_{view}_types": f"MAP {{{fields}}}"}
-    variables = [f'SET VARIABLE "{name}" = {value};' for name, value in named.items()]
-    files_name, types_name = map(_literal, named)
-    return (
-        f'{" ".join(variables)} CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM'
-        f" read_parquet(getvariable({files_name}), schema = getvariable({types_name}))"
+    files_name, types_name = f"{schema}_{view}_files", f"{schema}_{view}_types"
+    connection.execute(f'SET VARIABLE "{files_name}" = $1', [[str(file) for file in files]])
+    connection.execute(
+        f'SET VARIABLE "{types_name}" = MAP {{{fields}}};'
+        f' CREATE OR REPLACE VIEW "{schema}"."{view}" AS FROM read_parquet('
+        f"getvariable({_literal(files_name)}), schema = getvariable({_literal(types_name)}))"
     )
 
 

@@ -25,6 +25,8 @@ from restock.replay.store.parquet_views import column_types, read_parquet
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
+DOCUMENTS = ("task_json", "conditions_json", "exposures_json", "profile_toml")
+_TEXT = pa.dictionary(pa.int32(), pa.string())
 FEW_FILES = 64  # are read sooner one by one than Arrow's data sets are imported
 
 
@@ -90,16 +92,19 @@ class StoredTable:
         return dataset.FileSystemDataset(fragments, self.schema, parquet, self.place.files)
 
     def _read_each(self) -> pa.Table:
-        """File by file."""
-        wanted = {field.name: field for field in self.schema}
+        """File by file; a text that many recordings have stands once."""
+        schema = pa.schema(
+            [field.with_type(_TEXT) if field.name in DOCUMENTS else field for field in self.schema]
+        )
         bare = []
         for path in self.paths:
-            part = self.place.read(f"{self.table}/{path}", columns=self.schema.names)
-            kinds = pa.schema([wanted[name] for name in part.column_names])
+            place = f"{self.table}/{path}"
+            part = self.place.read(place, columns=schema.names, repeated=DOCUMENTS)
+            kinds = pa.schema([schema.field(name) for name in part.column_names])
             if part.schema.types != kinds.types:  # other tools write text as views or large strings
                 part = part.cast(kinds)
             bare.append(part.replace_schema_metadata(None))
-        return pa.concat_tables([self.schema.empty_table(), *bare], promote_options="default")
+        return pa.concat_tables([schema.empty_table(), *bare], promote_options="default")
 
 
 def manifest_tables(
