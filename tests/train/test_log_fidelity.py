@@ -40,6 +40,17 @@ def test_good_rows_look_like_their_condition_and_follow() -> None:
     assert set(logs.unexplained) == set(CONDITIONS)
 
 
+def test_steps_of_several_sources_confirm_together() -> None:
+    """An evaluation that shows few of a condition, and a ring that has it."""
+    logs = LogFidelity(probe(levels(0)), SIZE)
+    nominal, slip, blocked = levels(1)
+    few = probe([nominal, slip, blocked[:40]])
+    assert set(logs.agreement(few)) == {"nominal", "wheel_slip"}
+    found = logs.agreement(few, probe([nominal[:60], slip[:60], blocked[40:80]]))
+    assert found.keys() == set(CONDITIONS)
+    assert all(share > 0.9 for share in found.values())
+
+
 def test_wrong_labels_are_not_confirmed() -> None:
     nominal, slip, blocked = levels(0)
     logs = LogFidelity(probe([np.concatenate([nominal[:100], blocked]), slip, nominal[100:]]), SIZE)

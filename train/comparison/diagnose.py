@@ -41,7 +41,6 @@ Cause = Literal[
 ]
 WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be diagnosed
-_LEAST_ALIKE = 50  # … for its look to be known
 _LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
 
 
@@ -74,7 +73,7 @@ class Symptom:
     outlier: float  # O_k
     replay_share: float
     met_share: float | None  # of the evaluations' steps
-    agreement: float | None  # of its logged rows with its held-out ones
+    agreement: float | None  # of its logged rows with fresh ones
     unexplained: float | None  # of the variance of its logged rows' next observations
     quota_met: float | None
 
@@ -303,7 +302,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
             row["evaluation_td"] / max(middle, 1e-12),
             row["replay_share"] or 0.0,
             row["met_share"],
-            row["agreement"] if row["evaluation_rows"] >= _LEAST_ALIKE else None,
+            row["agreement"],
             row["unexplained"],
             row["quota_met"],
         )

@@ -39,11 +39,12 @@ class EvaluationBuffer:
         env: Twin,
         task: Task,
         conditions: Sequence[Condition],
-        like: FreshRing,
+        ring: FreshRing,
         logs: LogFidelity | None,
     ) -> None:
         self.env = env
-        self._task, self._conditions, self._like, self._logs = task, conditions, like, logs
+        self._task, self._conditions, self._logs = task, conditions, logs
+        self._training_ring = ring
         self._collector = self._empty()
 
     def drive(
@@ -79,8 +80,12 @@ class EvaluationBuffer:
         probe = Probe.of_ring(ring, _ROWS)
         if probe is None:
             return []
-        agreement = self._logs.agreement(probe) if self._logs is not None else {}
-        unexplained = self._logs.unexplained if self._logs is not None else {}
+        agreement: dict[str, float] = {}
+        unexplained: dict[str, float] = {}
+        if self._logs is not None:
+            fresh = Probe.of_ring(self._training_ring, _ROWS)
+            agreement = self._logs.agreement(*([probe] if fresh is None else [probe, fresh]))
+            unexplained = self._logs.unexplained
         rows = probe.rows.to(learner.device)
         td, q, slow = learner.td_error(rows)
         online = learner.td_error(rows, online=True)[0]
@@ -105,7 +110,7 @@ class EvaluationBuffer:
         return measured
 
     def _empty(self) -> Collector:
-        like = self._like
+        like = self._training_ring
         ring = FreshRing(
             _CAPACITY,
             self.env.num_envs,

@@ -5,7 +5,8 @@ observations are not what followed, may be memorised like any others. Two questi
 rows themselves do, for each condition of the logs:
 
 - *agreement*: how many of its rows a linear discriminant (Fisher 1936), trained on the conditions
-  and observations of fresh, held-out steps, assigns to it;
+  and observations of fresh steps, assigns to it: those of the evaluation and those of the ring,
+  for a good policy's evaluation may show few of a rare condition, and not those that logs have;
 - *unexplained*: how much of the variance of its next observations a linear model of observation
   and action, fitted on half of the logs' rows, leaves unexplained on the other half. Above 1, the
   mean would be a better guess.
@@ -46,16 +47,21 @@ class LogFidelity:
         rows = Probe.of_logs(logs, ROWS)
         return cls(rows, observation_size) if rows is not None else None
 
-    def agreement(self, fresh: Probe) -> dict[str, float]:
-        """The share of each condition's rows that held-out steps of known condition confirm."""
+    def agreement(self, *fresh: Probe) -> dict[str, float]:
+        """The share of each condition's rows that fresh steps of known condition confirm."""
         size = self._observation.shape[1]
-        observation = np.asarray(fresh.rows.numpy(), np.float64)[:, :size]
-        counts = np.diff(fresh.bounds)
-        kept = [code for code, count in enumerate(counts) if count >= _LEAST_ROWS]
-        if len(kept) < 2:
+        steps: dict[str, list[F64]] = {}
+        for probe in fresh:
+            observation = np.asarray(probe.rows.numpy(), np.float64)[:, :size]
+            for name, begin, end in zip(
+                probe.conditions, probe.bounds, probe.bounds[1:], strict=False
+            ):
+                steps.setdefault(name, []).append(observation[begin:end])
+        every = {name: np.concatenate(parts) for name, parts in sorted(steps.items())}
+        names = [name for name, rows in every.items() if len(rows) >= _LEAST_ROWS]
+        if len(names) < 2:
             return {}
-        parts = [observation[fresh.bounds[code] : fresh.bounds[code + 1]] for code in kept]
-        names = [fresh.conditions[code] for code in kept]
+        parts = [every[name] for name in names]
         predicted = discriminant(parts, self._observation)
         return {
             name: float(np.mean(predicted[part] == names.index(name)))

@@ -175,7 +175,11 @@ TABLES: dict[str, pa.Schema] = {
         ("explained", _F, "1 - Var(TD) / Var(target): below 0 a constant would be nearer"),
         ("q_abs_mean", _F, "mean |Q| of the actions taken"),
         ("q_lag", _F, "mean |Q - Q_target| / mean |Q|"),
-        ("logs_agreement", _F, "share of the logs' rows of the condition that these steps confirm"),
+        (
+            "logs_agreement",
+            _F,
+            "share of the logs' rows of the condition that these steps and the ring's confirm",
+        ),
         (
             "logs_unexplained",
             _F,
