@@ -11,7 +11,7 @@ import functools
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ def markdown() -> str:
             homes["RestockError"] = "restock.errors"
         for name in sorted(homes, key=str.lower):
             node = next(n for n in _tree(homes[name]).body if getattr(n, "name", "") == name)
-            parts.append(_entry(node))
+            parts.append(_entry(node, homes[name]))
     return "\n".join(parts)
 
 
@@ -88,17 +88,42 @@ def _tree(module: str) -> ast.Module:
     return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
 
 
-def _entry(node: ast.AST) -> str:
+def _lineage(node: ast.ClassDef, module: str) -> Iterator[ast.ClassDef]:
+    """A class and those of Restock that it inherits from; `Stateful` is told by what it gives."""
+    yield node
+    came_from = {
+        alias.asname or alias.name: imports.module
+        for imports in ast.walk(_tree(module))
+        if isinstance(imports, ast.ImportFrom) and imports.module
+        for alias in imports.names
+    }
+    for base in map(ast.unparse, node.bases):
+        home = came_from.get(base, module)
+        if base in ("Stateful", "Checked") or not home.startswith("restock."):
+            continue
+        found = [one for one in _tree(home).body if isinstance(one, ast.ClassDef)]
+        for one in found:
+            if one.name == base:
+                yield from _lineage(one, home)
+
+
+def _entry(node: ast.AST, module: str) -> str:
     text = _first_paragraph(node)
     if isinstance(node, ast.FunctionDef):
         return f"### {node.name}\n\n```py\n{_signature(node)}\n```\n\n{text}\n"
     assert isinstance(node, ast.ClassDef)
-    made = _constructor(node)
+    lineage = list(_lineage(node, module))
+    made = next(filter(None, map(_constructor, lineage)), "").replace(lineage[-1].name, node.name)
     signature = f"```py\n{made}\n```\n\n" if made else ""
+    members: dict[str, ast.FunctionDef] = {}
+    for one in lineage:
+        for member in one.body:
+            if isinstance(member, ast.FunctionDef):
+                members.setdefault(member.name, member)
     methods = "".join(
         f"- `{_signature(member, short=True)}`: {_first_paragraph(member)}\n"
-        for member in node.body
-        if isinstance(member, ast.FunctionDef) and _is_public(member)
+        for member in members.values()
+        if _is_public(member)
     )
     inherits = any(ast.unparse(base) == "Stateful" for base in node.bases)
     if inherits and "`state_dict()`" not in methods:
@@ -110,7 +135,7 @@ def _entry(node: ast.AST) -> str:
 
 
 def _constructor(node: ast.ClassDef) -> str:
-    """How a class is made: by its `__init__`, or of its fields."""
+    """How a class is made: by its `__init__`, or of its fields; "" where neither is its own."""
     for member in node.body:
         if isinstance(member, ast.FunctionDef) and member.name == "__init__":
             return _signature(member, name=node.name)
