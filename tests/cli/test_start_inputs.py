@@ -16,7 +16,7 @@ from support.profile_texts import WAREHOUSE
 from restock import cli
 from restock.cli.start import stages
 from restock.cli.start.decisions import practice_settings, updates_settings
-from restock.cli.start.stages import Settings
+from restock.cli.start.settings import Settings
 from restock.cli.start.work import Work
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store

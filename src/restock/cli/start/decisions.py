@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from restock.cli.start.outcomes import of_nominal
+from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Document, Stop
-from restock.cli.start.stages import Settings
 from restock.cli.start.work import FOLDER, Ended
 from restock.files import read_json
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from restock.cli.start import outcomes
+from restock.cli.start.settings import Settings, own_file
 from restock.cli.start.stage import Stage
 
 COVERAGE = (
@@ -14,98 +15,6 @@ COVERAGE = (
 )
 
 UPDATES = 2000  # of a policy from the logs alone: as many as one has that goes on in the twin
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the stages share."""
-
-    logs: tuple[str, ...]
-    out: Path
-    profile: Path | str | None = None  # None: the one of the robot that comes with Restock
-    seconds: float = 150.0  # of training
-    episodes: int = 20  # of evaluation, per kind, policy and perturbation
-    device: str = "cpu"
-    mixture: str = "coverage"
-    typestore: str | None = None
-    definitions: Path | None = None
-    salvage: bool = False
-    tags: tuple[str, ...] = ()  # each KEY=VALUE
-    map: Path | None = None
-    train: tuple[str, ...] = ()  # further settings, each key=value
-
-    @property
-    def store(self) -> Path:
-        return self.out / "store"
-
-    @property
-    def panel(self) -> Path:
-        return self.out / "panel"
-
-    @property
-    def run(self) -> Path:
-        return self.out / "run"
-
-    @property
-    def logs_alone(self) -> Path:
-        """The run that never drives: what fine-tuning is compared with."""
-        return self.out / "logs-alone"
-
-    @property
-    def uniform_panel(self) -> Path:
-        return self.out / "panel-uniform"
-
-    @property
-    def uniform(self) -> Path:
-        """The run that is fed the logs as they come."""
-        return self.out / "uniform"
-
-    @property
-    def fitted(self) -> Path:
-        return self.out / "fitted.toml"
-
-    @property
-    def floor(self) -> Path:
-        return self.out / "floor.toml"
-
-    @property
-    def recordings(self) -> tuple[Path, ...]:
-        """The user's files and folders."""
-        return tuple(Path(path) for path in self.logs)
-
-    @property
-    def with_profile(self) -> list[str]:
-        return [] if self.profile is None else ["--profile", str(self.profile)]
-
-    @property
-    def with_definitions(self) -> list[str]:
-        """Where the definitions of a recording's types are that it does not carry itself."""
-        distribution = [] if self.typestore is None else ["--typestore", self.typestore]
-        folder = [] if self.definitions is None else ["--definitions", str(self.definitions)]
-        return distribution + folder
-
-    @property
-    def reading(self) -> list[str]:
-        """How recordings are read."""
-        return self.with_definitions + ["--salvage"] * self.salvage
-
-    @property
-    def read(self) -> tuple[Path, ...]:
-        """What is read of the user's wherever a recording is."""
-        return (*self.recordings, *([] if self.definitions is None else [self.definitions]))
-
-    @property
-    def profile_file(self) -> tuple[Path, ...]:
-        return _file(self.profile)
-
-    @property
-    def mixture_file(self) -> tuple[Path, ...]:
-        return _file(self.mixture)
-
-
-def _file(name: Path | str | None) -> tuple[Path, ...]:
-    """The file of this name, unless it is that of a shipped one."""
-    return () if name is None or not Path(name).is_file() else (Path(name),)
 
 
 def info(to: Settings) -> Stage:
@@ -130,7 +39,7 @@ def propose(
         "How do its topics become observation, action and reward?",
         "A first profile is proposed from what is in the recordings.",
         ["profile", "new", *recordings, "--out", str(to.profile), *flags, *to.reading],
-        reads=(*to.read, *_file(urdf)),
+        reads=(*to.read, *own_file(urdf)),
         writes=(Path(to.profile),),
         expected=(0, 3),
         outcome=outcomes.propose,
@@ -229,7 +138,7 @@ def floor(to: Settings) -> Stage:
             *("twin", "layout", "--from", str(to.store), *given, *to.with_definitions),
             *("--out", str(to.floor), "--png", str(picture)),
         ],
-        reads=() if to.map is None else _file(to.map),
+        reads=() if to.map is None else own_file(to.map),
         writes=(to.floor, picture),
         outcome=outcomes.floor,
     )

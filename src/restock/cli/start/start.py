@@ -185,8 +185,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         several_kinds,
         updates_settings,
     )
+    from restock.cli.start.settings import Settings
     from restock.cli.start.stage import Stop
-    from restock.cli.start.stages import Settings
     from restock.cli.start.work import escape
 
     again = f"then run the same command again: what is done is kept in {asked.out}"

@@ -12,7 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from restock.cli.start.stages import Settings, fed_uniformly
+from restock.cli.start.settings import Settings
+from restock.cli.start.stages import fed_uniformly
 from restock.stats import wilson
 
 if TYPE_CHECKING:
