@@ -1,15 +1,16 @@
 """Packing: a plan's rows into one file of float32 rows, with metadata beside, in bounded memory.
 
-Whatever the size of the store, memory holds the plan and a batch: rows are written through a memory
-map, whose pages are given back. Observations are read in the order in which the files have them
-and put where they belong, because sorting rows this wide would spill all of them to disk first: a
-recording's rows lie together in both, so what is written together lies together.
+Whatever the size of the store, memory holds the plan, a batch and some blocks of packed rows.
+Observations are read in the order in which the files have them and put where they belong, because
+sorting rows this wide would spill all of them to disk first: a recording's rows lie together in
+both, so what is written together lies together, and a block is full soon after it was begun.
 """
 
 from __future__ import annotations
 
 import hashlib
-import mmap
+import itertools
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ from restock.replay.panel.strata import NO_STRATUM
 
 ROW_GROUP_ROWS = 65_536
 BATCH_ROWS = 16_384  # of what stands beside the rows, in memory at a time
-KEPT_BYTES = 64 << 20  # of packed rows, in this process' memory before they are given back
+BLOCK_ROWS = 512  # of packed rows, written together
+HELD_BYTES = 128 << 20  # of blocks that are not full, in memory at a time
 BATCH_BYTES = 4 << 20  # of observations, in memory at a time
 FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
@@ -110,28 +112,22 @@ class Packer:
         at_a_time = max(BATCH_BYTES // (8 * size), 1)
         names = "transition_id, recording_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
-        shape = (len(self.chosen), row_width(size))
-        rows = np.memmap(path, np.dtype("<f4"), "w+", shape=shape)
         places = self.steps.places()
-        filled = kept_bytes = 0
-        with any_order(self.connection):  # each row knows where it belongs
+        # Two halves of a row: what is observed and done, and what comes of it.
+        with (
+            _PackedRows(path, len(self.chosen), row_width(size), parts=2) as rows,
+            any_order(self.connection),  # each row knows where it belongs
+        ):
             for batch in self.connection.sql(query).to_arrow_reader(at_a_time):
                 place = places.of(batch.column("transition_id").to_numpy())
-                filled += self._write(rows, size, batch, place)
-                kept_bytes += len(batch) * rows.strides[0]
-                if kept_bytes > KEPT_BYTES:
-                    _give_back(rows)
-                    kept_bytes = 0
+                self._write(rows, size, batch, place)
                 advance(len(batch))
-        if filled != 2 * len(self.chosen):
-            raise PanelError("the source changed while it was read", where=str(path.parent))
-        rows.flush()
+            if not rows.is_full:
+                raise PanelError("the source changed while it was read", where=str(path.parent))
         return size
 
-    def _write(
-        self, rows: NDArray[np.float32], size: int, batch: pa.RecordBatch, place: Ints
-    ) -> int:
-        """Put a batch's values where they belong; returns how many halves of rows were filled."""
+    def _write(self, rows: _PackedRows, size: int, batch: pa.RecordBatch, place: Ints) -> None:
+        """Put a batch's values where they belong."""
         part = row_columns(size)
         target = np.searchsorted(self.chosen, place)
         packed = np.flatnonzero(_at(self.chosen, target) == place)
@@ -144,31 +140,30 @@ class Packer:
             reach = np.flatnonzero(horizon > ahead)
             reward = self.steps.reward[place[packed[reach]] + ahead]
             returns[reach] += self.mixture.discount**ahead * reward
-        to = _span(target)
-        rows[to, part["observation"]] = observation
-        rows[to, part["action"]] = batch.column("action").to_numpy()[packed, None]
-        rows[to, part["reward"]] = returns[:, None]
+        action = batch.column("action").to_numpy()[packed, None]
+        rows.put(
+            target,
+            (part["observation"], observation),
+            (part["action"], action),
+            (part["reward"], returns[:, None]),
+        )
         # Returns that end with a row of this batch take its next observation.
         first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
         next_observation = _chosen(next_observation, source)
-        to = _span(ends)
-        rows[to, part["next_observation"]] = next_observation
         not_terminated = ~np.asarray(
             batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_
         )
         spanned = self.last[ends] - self.chosen[ends] + 1
-        rows[to, part["discount"]] = (self.mixture.discount**spanned * not_terminated[source])[
-            :, None
-        ]
+        discount = (self.mixture.discount**spanned * not_terminated[source])[:, None]
+        rows.put(ends, (part["next_observation"], next_observation), (part["discount"], discount))
         if not all(np.isfinite(one).all() for one in (observation, next_observation, returns)):
             raise PanelError(
                 "an observation or a reward is NaN or infinite, which no network survives",
                 where=f"recording {batch.column('recording_id')[0].as_py()}",
                 remedy=f"`restock audit` names them; a mixture leaves them out with {FINITE}",
             )
-        return len(target) + len(ends)
 
     def write_meta(self, meta: Path, evaluation_split: Path) -> None:
         """Write what stands beside the rows, and the evaluation split, in the same order."""
@@ -209,6 +204,73 @@ class Packer:
                 at += len(rows)
 
 
+class _PackedRows:
+    """Rows (n, W) float32 of a file, put there part by part, in any order, each part once.
+
+    Blocks are written when they are full; those that wait for the rest of their rows are held, and
+    where they are too many, written as they are and read again.
+    """
+
+    def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
+        self._rows, self._width, self._parts = rows, width, parts
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts of rows, of each block
+        self._held: dict[int, NDArray[np.float32]] = {}
+
+    def __enter__(self) -> _PackedRows:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._file)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every part of every row was put."""
+        return int(self._put.sum()) == self._rows * self._parts
+
+    def put(self, rows: Ints, *values: tuple[slice, NDArray[Any]]) -> None:
+        """One part of rows (m,): some of their columns, with what they hold, (m, c)."""
+        if (np.diff(rows) < 0).any():
+            order = np.argsort(rows, kind="stable")
+            rows, values = rows[order], tuple((columns, held[order]) for columns, held in values)
+        block = rows // BLOCK_ROWS
+        for begin, end in itertools.pairwise([0, *np.flatnonzero(np.diff(block)) + 1, len(rows)]):
+            if begin == end:
+                continue
+            number = int(block[begin])
+            packed = self._block(number)
+            inside = rows[begin:end] - number * BLOCK_ROWS
+            to: Ints | slice = inside
+            if inside[-1] - inside[0] == end - begin - 1 and (np.diff(inside) == 1).all():
+                to = slice(int(inside[0]), int(inside[-1]) + 1)
+            for columns, held in values:
+                packed[to, columns] = held[begin:end]
+            self._put[number] += end - begin
+            if self._put[number] == len(packed) * self._parts:
+                self._write(number)
+        while len(self._held) * BLOCK_ROWS * self._width * 4 > HELD_BYTES:
+            self._write(next(iter(self._held)))
+
+    def _block(self, number: int) -> NDArray[np.float32]:
+        if (held := self._held.get(number)) is None:
+            count = min(BLOCK_ROWS, self._rows - number * BLOCK_ROWS)
+            held = np.zeros((count, self._width), "<f4")
+            if self._put[number]:
+                os.preadv(self._file, [held.data.cast("B")], self._place(number))
+            self._held[number] = held
+        return held
+
+    def _write(self, number: int) -> None:
+        rest = self._held.pop(number).data.cast("B")
+        place = self._place(number)
+        while rest:  # a full disk is an OSError; what is written short goes on
+            written = os.pwrite(self._file, rest, place)
+            rest, place = rest[written:], place + written
+
+    def _place(self, number: int) -> int:
+        return number * BLOCK_ROWS * self._width * 4
+
+
 class _Table:
     """A Parquet file, written a row group at a time."""
 
@@ -238,13 +300,6 @@ class _Table:
             self._writer.write_table(table.unify_dictionaries())
 
 
-def _give_back(rows: NDArray[np.float32]) -> None:
-    """Take a memory map's pages out of this process' memory; the system writes them when it may."""
-    mapped: object = rows.base
-    if isinstance(mapped, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
-        mapped.madvise(mmap.MADV_DONTNEED)
-
-
 def _compact(table: pa.Table) -> pa.Table:
     """Text as codes of what these rows have alone: readers keep them so."""
     for place, field in enumerate(table.schema):
@@ -258,13 +313,6 @@ def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:
     """matrix[rows], without a copy where these are all of them, in order."""
     whole = len(rows) == len(matrix) and np.array_equal(rows, np.arange(len(rows)))
     return matrix if whole else matrix[rows]
-
-
-def _span(rows: Ints) -> Ints | slice:
-    """The same rows, as a slice where they lie one behind the other."""
-    if len(rows) and (np.diff(rows) == 1).all():
-        return slice(int(rows[0]), int(rows[-1]) + 1)
-    return rows
 
 
 def _at(values: Ints, place: Ints) -> Ints:

@@ -25,7 +25,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
 from restock.replay.mixture.n_step import n_step_horizon, n_step_return
-from restock.replay.mixture.packed_row import PACKING_VERSION
+from restock.replay.mixture.packed_row import PACKING_VERSION, row_width
 from restock.replay.panel import build, pack, scratch
 from restock.replay.panel import panel as panel_module
 from restock.replay.panel.build import build_panel
@@ -155,6 +155,8 @@ def test_small_stretches_and_batches_pack_the_same_bytes(
         (pack, "BATCH_ROWS", 2048),
         (pack, "BATCH_BYTES", 2048 * 8 * TASK.observation_size),
         (pack, "ROW_GROUP_ROWS", 1000),
+        (pack, "BLOCK_ROWS", 64),
+        (pack, "HELD_BYTES", 3 * 64 * row_width(TASK.observation_size) * 4),
     ):
         monkeypatch.setattr(module, name, value)
     by_parts = build_panel(table, mixture, tmp_path / "b", task=TASK)
