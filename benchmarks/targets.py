@@ -206,7 +206,10 @@ def _as_markdown(rows: Sequence[dict[str, Any]]) -> str:
             "{:.1f}, {:.1f}, {:.1f}".format(
                 *(row[f"{name}_bumps_per_km"] for name in ("agent", *REFERENCES))
             ),
-            *(f"{row[f'seconds_less_than_{name}']:+.1f}" for name in REFERENCES),
+            *(
+                "it never does" if np.isnan(less) else f"{less:+.1f}"
+                for less in (row[f"seconds_less_than_{name}"] for name in REFERENCES)
+            ),
         ]
         for row in rows
         for ahead in [row["ahead_of_planner_interval"]]
