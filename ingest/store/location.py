@@ -215,9 +215,10 @@ class Location:
         with self.reading(path) as file:
             if where is not None:
                 return pq.read_table(file, partitioning=None, filters=where)
-            # `read_table` imports Arrow's data sets.
-            whole = pq.ParquetFile(file, read_dictionary=list(repeated))
+            whole = pq.ParquetFile(file)  # `read_table` imports Arrow's data sets
             names = whole.schema_arrow.names
+            if shared := [name for name in repeated if name in names]:
+                whole = pq.ParquetFile(file, metadata=whole.metadata, read_dictionary=shared)
             return whole.read([name for name in names if columns is None or name in columns])
 
     def read_schema(self, path: str) -> pa.Schema:
