@@ -123,8 +123,9 @@ class Mirror:
         table = np.asarray(task.actions, np.float64)
         gap = np.abs(table[:, None] - table[None] * (1, -1)).max(axis=2)
         opposite = gap.argmin(axis=1)
-        for index in np.flatnonzero(gap.min(axis=1) > 1e-6).tolist():
-            name = task.action_names[index]
+        lonely = np.flatnonzero(gap.min(axis=1) > 1e-6)
+        if len(lonely):
+            index, name = lonely[0], task.action_names[lonely[0]]
             raise ValueError(f"action {index}, {name}, has no opposite among the task's actions")
         names = task.observation_names
         source = np.arange(len(names))

@@ -29,6 +29,7 @@ from restock.replay.panel.candidates import any_order, as_stored, matrix
 from restock.replay.panel.plan import PanelPlan
 from restock.replay.panel.scratch import STRETCH, SourceSteps
 from restock.replay.panel.strata import NO_STRATUM
+from restock.replay.sampling.row_file import read_into
 
 ROW_GROUP_ROWS = 65_536
 BATCH_ROWS = 16_384  # of what stands beside the rows, in memory at a time
@@ -213,6 +214,7 @@ class _PackedRows:
 
     def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
         self._rows, self._width, self._parts = rows, width, parts
+        self._path = str(path)
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts of rows, of each block
         self._held: dict[int, NDArray[np.float32]] = {}
@@ -255,8 +257,8 @@ class _PackedRows:
         if (held := self._held.get(number)) is None:
             count = min(BLOCK_ROWS, self._rows - number * BLOCK_ROWS)
             held = np.zeros((count, self._width), "<f4")
-            if self._put[number]:
-                os.preadv(self._file, [held.data.cast("B")], self._place(number))
+            if self._put[number] and not read_into(held, self._file, self._place(number)):
+                raise PanelError("what was written of it is gone", where=self._path)
             self._held[number] = held
         return held
 

@@ -82,16 +82,10 @@ class RowFile:
             self._advise_rows(rows, "POSIX_FADV_WILLNEED")
 
     def _read_span(self, first: int, out: F32) -> None:
-        view = memoryview(out).cast("B")  # type: ignore[arg-type]
-        at = self._offset + first * self._stride
-        done = 0
-        while done < len(view):
-            got = os.preadv(self._fd, [view[done:]], at + done)
-            if got <= 0:
-                raise PanelError(
-                    f"ends before row {first + len(out)} of {self.count}", where=self._path
-                )
-            done += got
+        if not read_into(out, self._fd, self._offset + first * self._stride):
+            raise PanelError(
+                f"ends before row {first + len(out)} of {self.count}", where=self._path
+            )
 
     def _advise_rows(self, rows: Ints, advice: str) -> None:
         # Of rows far apart the range between is not theirs to read or to give back.
@@ -116,6 +110,17 @@ class RowFile:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def read_into(out: F32, file: int, at: int) -> bool:
+    """Fill `out` with what a file has from byte `at` on; False where it ends before that."""
+    rest = out.data.cast("B")
+    while rest:
+        got = os.preadv(file, [rest], at)
+        if got <= 0:
+            return False
+        rest, at = rest[got:], at + got
+    return True
 
 
 def _advise(fd: int, offset: int, length: int, advice: str) -> None:

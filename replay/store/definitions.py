@@ -18,7 +18,7 @@ import duckdb
 
 from restock.ingest.store.summary import with_included
 from restock.replay.store.column_docs import install_columns
-from restock.replay.store.same_drives import SAME_DRIVES, install_same_drives
+from restock.replay.store.same_drives import install_same_drives
 
 # In their order: a view may use those before it.
 VIEWS = ("rows.sql", "views.sql", "labels.sql", "events.sql", "fleet.sql", "exposure.sql")
@@ -82,7 +82,8 @@ class Definitions:
         observation_type: what observations are cast to.
         summaries: take the common views from `stored_summaries`.
         computed: names of macros -> what makes them, where a text names one.
-        replaced: the same of tables in place of views, which take too long to make for a list.
+        replaced: the same of tables in place of views, which take too long to make for a list;
+            with the table `same_drives`, in place of none.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Definitions:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
         self._computed = dict(computed or {})
         self._replaced: dict[tuple[str, ...], Callable[[], None]] = dict(replaced or {})
-        self._replaced[SAME_DRIVES] = partial(install_same_drives, connection)
+        self._replaced[("same_drives",)] = partial(install_same_drives, connection)
         self._made: set[str] = set()
         self._held: list[str] = []
         _OF[connection] = self

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 
-SAME_DRIVES = ("same_drives",)
 LEAST_ROWS = 2
 LEAST_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
 WITHIN_NS = 100_000_000  # of the shift
@@ -53,7 +52,7 @@ class MovingRows:
 
 def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
     """The table `same_drives` over the connection's `transitions`: see `same_drives`."""
-    connection.register(*SAME_DRIVES, same_drives(_moving_rows(connection)))
+    connection.register("same_drives", same_drives(_moving_rows(connection)))
 
 
 def same_drives(rows: MovingRows) -> pa.Table:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # slow to import, and every command imports this
+    import subprocess
 
 _running: set[subprocess.Popen[bytes]] = set()
 

@@ -113,7 +113,7 @@ def _entry(node: ast.AST, module: str) -> str:
         return f"### {node.name}\n\n```py\n{_signature(node)}\n```\n\n{text}\n"
     assert isinstance(node, ast.ClassDef)
     lineage = list(_lineage(node, module))
-    made = next(filter(None, map(_constructor, lineage)), "").replace(lineage[-1].name, node.name)
+    made = next(filter(None, (_constructor(one, node.name) for one in lineage)), "")
     signature = f"```py\n{made}\n```\n\n" if made else ""
     members: dict[str, ast.FunctionDef] = {}
     for one in lineage:
@@ -134,17 +134,17 @@ def _entry(node: ast.AST, module: str) -> str:
     return f"### {node.name}\n\n{signature}{text}\n" + (methods and f"\n{methods}")
 
 
-def _constructor(node: ast.ClassDef) -> str:
-    """How a class is made: by its `__init__`, or of its fields; "" where neither is its own."""
+def _constructor(node: ast.ClassDef, name: str) -> str:
+    """How `name` is made: by the `__init__` of this class, or of its fields; "" without both."""
     for member in node.body:
         if isinstance(member, ast.FunctionDef) and member.name == "__init__":
-            return _signature(member, name=node.name)
+            return _signature(member, name=name)
     fields = [
         ast.unparse(member)
         for member in node.body
         if isinstance(member, ast.AnnAssign) and "ClassVar" not in ast.unparse(member.annotation)
     ]
-    return _wrapped(node.name, fields, "") if fields else ""
+    return _wrapped(name, fields, "") if fields else ""
 
 
 def _is_public(member: ast.FunctionDef) -> bool:

@@ -83,8 +83,8 @@ class EvaluationBuffer:
         agreement: dict[str, float] = {}
         unexplained: dict[str, float] = {}
         if self._logs is not None:
-            fresh = Probe.of_ring(self._training_ring, _ROWS)
-            agreement = self._logs.agreement(*([probe] if fresh is None else [probe, fresh]))
+            sources = (probe, Probe.of_ring(self._training_ring, _ROWS))
+            agreement = self._logs.agreement(*(one for one in sources if one is not None))
             unexplained = self._logs.unexplained
         rows = probe.rows.to(learner.device)
         td, q, slow = learner.td_error(rows)

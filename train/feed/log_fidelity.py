@@ -14,6 +14,8 @@ rows themselves do, for each condition of the logs:
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,9 +55,7 @@ class LogFidelity:
         steps: dict[str, list[F64]] = {}
         for probe in fresh:
             observation = np.asarray(probe.rows.numpy(), np.float64)[:, :size]
-            for name, begin, end in zip(
-                probe.conditions, probe.bounds, probe.bounds[1:], strict=False
-            ):
+            for name, (begin, end) in zip(probe.conditions, pairwise(probe.bounds), strict=True):
                 steps.setdefault(name, []).append(observation[begin:end])
         every = {name: np.concatenate(parts) for name, parts in sorted(steps.items())}
         names = [name for name, rows in every.items() if len(rows) >= _LEAST_ROWS]

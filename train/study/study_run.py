@@ -76,12 +76,11 @@ def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say)
         try:
             for future in futures:
                 future.result()
-        except KeyboardInterrupt:
-            interrupt_running()
+        except BaseException as stop:  # nothing more is begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(stop, KeyboardInterrupt):  # what runs checkpoints and ends
+                interrupt_running()
             raise
-        finally:  # after a failure or Ctrl-C nothing more is begun; what runs checkpoints and ends
-            for future in futures:
-                future.cancel()
 
 
 def _run_on_ray(plan: StudyPlan, jobs: Sequence[StudyJob], workers: int, say: Say) -> None:

@@ -93,9 +93,7 @@ class CoverageCommand:
         except RestockError as error:  # what is logged tells nothing of it
             drift = str(error)
         advance(1, "charts")
-        page = write_coverage_page(store, missing, drift, out, self.figures)
-        advance(1, "")
-        return page
+        return write_coverage_page(store, missing, drift, out, self.figures)
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:
