@@ -1,10 +1,11 @@
 """Rows of a packed table by number, for tables larger than the processor's caches.
 
-`torch.index_select` copies one row after the other and waits for the memory of each. The kernel
-behind `torch.nn.EmbeddingBag` asks for rows ahead of those that it adds up; with one row in every
-bag the sum is the row, and a gather from a million rows takes half the time. That kernel is not
-part of PyTorch's public interface, so it is tried on a small table before it is used: where it is
-missing, or gives anything but the rows, `index_select` takes its place.
+`torch.index_select` copies one row after the other and waits for the memory of each. The compiled
+gather (`restock.native`) asks for rows well ahead of the one that it copies. Without it, the kernel
+behind `torch.nn.EmbeddingBag` does so, a little less far, with those that it adds up: with one row
+in every bag the sum is the row. That kernel is not part of PyTorch's public interface, so it is
+tried on a small table before it is used: where it is missing, or gives anything but the rows,
+`index_select` takes its place.
 """
 
 from __future__ import annotations
@@ -14,25 +15,32 @@ from functools import cache, lru_cache
 import torch
 from torch import Tensor
 
+from restock import native
+
 _TRIED_WIDTHS = (1, 16, 189)  # floats: below, at and above what a vector register holds
 
 
 def gather_rows(rows: Tensor, index: Tensor) -> Tensor:
     """Rows `index` (B,) int64 of `rows` (n, W), as a new tensor (B, W) on their device.
 
-    Values equal those of `rows.index_select(0, index)`, NaN and infinities included; of a negative
-    zero the sign may be lost.
+    Values equal those of `rows.index_select(0, index)`, NaN and infinities included; without the
+    compiled gather the sign of a negative zero may be lost.
 
     Raises:
         RuntimeError, IndexError: a row number outside the table.
     """
-    if not _has_a_faster_way(rows) or not _prefetching_works():
-        return rows.index_select(0, index)
-    return _sum_of_one_each(rows, index)
+    if _has_a_faster_way(rows) and _is_plain(index):
+        if native.is_used():
+            batch = rows.new_empty(len(index), rows.shape[1])
+            native.compiled.gather(rows.detach().numpy(), index.numpy(), batch.numpy())
+            return batch
+        if _prefetching_works():
+            return _sum_of_one_each(rows, index)
+    return rows.index_select(0, index)
 
 
 def _has_a_faster_way(rows: Tensor) -> bool:
-    """Whether the kernel reads such a table ahead: float32 in main memory, row by row."""
+    """Whether such a table can be read ahead: float32 in main memory, row by row."""
     return (
         rows.dtype == torch.float32
         and rows.device.type == "cpu"
@@ -40,6 +48,11 @@ def _has_a_faster_way(rows: Tensor) -> bool:
         and rows.is_contiguous()
         and not (rows.requires_grad and torch.is_grad_enabled())  # it has no gradient
     )
+
+
+def _is_plain(index: Tensor) -> bool:
+    """Whether they are row numbers as samplers give them: int64 in main memory, in one piece."""
+    return index.dtype == torch.int64 and index.device.type == "cpu" and index.is_contiguous()
 
 
 def _sum_of_one_each(rows: Tensor, index: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ the block, and the weights are those of that distribution.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from restock import native
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Prioritised, Within
@@ -32,6 +34,7 @@ from restock.state import Stateful
 # so that few come again before what was learnt of them counts; many rows cost more to sum.
 FEWEST, MOST = 8, 128
 CHUNK = 16  # rows whose priorities are summed first: a chunk is found, then the row in it
+MEAN_OF = 32_768  # priorities, at least, that give the mean weight of a stratum
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,7 @@ class Priorities(Stateful):
 
     def __init__(self, stratum_rows: Sequence[NDArray[Any]], rules: Sequence[Rule | None]) -> None:
         self.rules = tuple(rules)
+        self._some_unruled = None in self.rules
         self.exponents = Exponents(rules)
         joined = np.concatenate([np.asarray(rows, np.int64) for rows in stratum_rows])
         if len(np.unique(joined)) != len(joined):
@@ -169,12 +173,12 @@ class Priorities(Stateful):
             MixtureError: a TD error that is not finite.
         """
         place, errors = self._place[rows], np.asarray(td_abs, np.float32)
-        if None in self.rules:
+        if self._some_unruled:
             place, errors = place[place >= 0], errors[place >= 0]
-        stratum = self._stratum[place]
+        stratum: Any = self._stratum[place] if len(self.rules) > 1 else 0
         priority = self.exponents.priority(errors, stratum)
-        largest = priority.max(initial=0.0)
-        if not np.isfinite(largest):  # max passes NaN on
+        largest = float(priority.max(initial=0.0))
+        if not math.isfinite(largest):  # max passes NaN on
             raise MixtureError(
                 f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
                 remedy="training has diverged: lower the learning rate, or slow the target down",
@@ -183,7 +187,7 @@ class Priorities(Stateful):
         if self._any_new:
             self._new[place] = False
         if largest > self._largest.min() and (priority > self._largest[stratum]).any():
-            np.maximum.at(self._largest, stratum, priority)
+            np.maximum.at(self._largest, self._stratum[place], priority)
             self._stale_new = True
 
     def draw(self, counts: Ints, batches: int, rng: np.random.Generator) -> tuple[Ints, F32 | None]:
@@ -227,26 +231,36 @@ class Priorities(Stateful):
         """Which member of the stratum at `first` each of `within` (n,), in [0, 1), falls on."""
         ends = np.cumsum(chunks, dtype=np.float64)
         at = (np.arange(len(within)) + within) * (ends[-1] / len(within))  # ascending
-        chunk = np.minimum(np.searchsorted(ends, at, "right"), len(chunks) - 1)
-        rest = (at - (ends[chunk] - chunks[chunk])).astype(np.float32)
-        inside = self._priority[first : first + len(chunks) * CHUNK].reshape(-1, CHUNK)[chunk]
-        upto = np.ascontiguousarray(inside.T)  # (CHUNK, n)
-        # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
-        for before, here in itertools.pairwise(upto):
-            here += before
-        # As many of the chunk's members are passed as sums up to them are at or below the rest.
-        member = np.add.reduce(upto[:-1] <= rest, axis=0, dtype=np.int8)
-        place: Ints = chunk * CHUNK + member
-        return np.minimum(place, size - 1)
+        priority = self._priority[first : first + len(chunks) * CHUNK].reshape(-1, CHUNK)
+        place: Ints = np.empty(len(at), np.int64)
+        find = native.compiled.find_places if native.is_used() else find_places
+        find(priority, chunks, ends, at, place)
+        return np.minimum(place, size - 1, out=place)
+
+
+def find_places(priority: F32, sums: F32, ends: F64, at: F64, out: Ints) -> None:
+    """The compiled function of that name, in NumPy: the same places."""
+    chunk = np.minimum(np.searchsorted(ends, at, "right"), len(ends) - 1)
+    rest = (at - (ends[chunk] - sums[chunk])).astype(np.float32)
+    upto = np.ascontiguousarray(priority[chunk].T)  # (CHUNK, n)
+    # Not by a product with ones: BLAS would wake its threads, which costs more than the sums.
+    for before, here in itertools.pairwise(upto):
+        here += before
+    # As many of the chunk's members are passed as sums up to them are at or below the rest.
+    np.add.reduce(upto[:-1] <= rest, axis=0, dtype=np.int8, out=out)
+    out += chunk * CHUNK
 
 
 def _weights(drawn: F32, priority: F32, total: float, beta: float) -> F32:
-    """(n P) ** -beta over its mean under P, of rows of priority `drawn` (n,) out of `priority`."""
-    if beta == 1.0:
-        mean = float(len(priority))
-    else:
-        mean = float((priority ** np.float32(1.0 - beta)).sum(dtype=np.float64))
-    return np.asarray(total / mean * drawn ** np.float32(-beta), np.float32)
+    """(n P) ** -beta over its mean under P, of rows of priority `drawn` (n,) out of `priority`.
+
+    Of many rows the mean is that of some, evenly spaced: a power of each would cost as much as all
+    else together.
+    """
+    some = np.ascontiguousarray(priority[:: max(len(priority) // MEAN_OF, 1)])
+    mean = 1.0 if beta == 1.0 else float((some ** np.float32(1.0 - beta)).mean(dtype=np.float64))
+    scale = total / (len(priority) * mean)
+    return np.asarray(scale * drawn ** np.float32(-beta), np.float32)
 
 
 class PrioritySampler(QuotaSampler):

@@ -1,7 +1,8 @@
-"""Whether this installation has the compiled update (`restock/compiled/`), and whether it is used.
+"""Whether this installation has what `restock/compiled/` is, and whether it is used.
 
-It is built where a compiler is, and serves x86-64 processors with AVX2. Without it PyTorch's
-operations do the same, to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
+It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
+network, the gather of a batch and draws by priority. Without it PyTorch and NumPy do the same, an
+update to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ else:
 
 
 def is_used() -> bool:
-    """Whether compiled code updates plain networks on the CPU."""
+    """Whether compiled code updates plain networks on the CPU, and draws batches there."""
     return IS_THERE and os.environ.get(SWITCH, "1") != "0"
 
 

@@ -1,4 +1,4 @@
-"""`gather_rows` gives the rows, whether PyTorch's prefetching kernel is there or not."""
+"""`gather_rows` gives the rows, whether compiled, by PyTorch's prefetching kernel, or without."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from restock import native
 from restock.replay import gather_rows
 from restock.replay.sampling import gather
 
@@ -22,10 +23,14 @@ TABLES = npst.arrays(
 )
 
 
-@pytest.fixture(autouse=True)
-def _tried_anew() -> Iterator[None]:
+@pytest.fixture(autouse=True, params=["1", "0"], ids=["compiled", "not compiled"])
+def way(request: pytest.FixtureRequest) -> Iterator[str]:
+    if request.param == "1" and not native.IS_THERE:
+        pytest.skip(f"native code is {native.state()}")
     gather._prefetching_works.cache_clear()
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(native.SWITCH, request.param)
+        yield request.param
     gather._prefetching_works.cache_clear()
 
 
@@ -49,6 +54,24 @@ def test_rows_of_a_batch_are_its_own() -> None:
     batch = gather_rows(rows, torch.tensor([2, 0]))
     batch.zero_()
     assert rows[2].tolist() == [6.0, 7.0, 8.0]
+
+
+@pytest.mark.parametrize(
+    "index",
+    [torch.tensor([1, 0], dtype=torch.int32), torch.tensor([1, 5, 0, 5])[::2]],
+    ids=["int32", "strided"],
+)
+def test_other_row_numbers(index: torch.Tensor) -> None:
+    rows = torch.arange(12.0).view(4, 3)
+    assert same(gather_rows(rows, index), rows, index)
+
+
+def test_a_compiled_gather_keeps_every_bit(way: str) -> None:
+    bits = np.array([0x80000000, 0x7FC00001, 0x00000001, 0xFF800000], np.uint32)
+    rows, index = torch.from_numpy(bits.view(np.float32).reshape(4, 1)), torch.tensor([3, 0, 1, 2])
+    given = gather_rows(rows, index).numpy().view(np.uint32).ravel().tolist()
+    if way == "1":
+        assert given == bits[index.numpy()].tolist()
 
 
 @pytest.mark.parametrize("number", [4, -1])

@@ -11,8 +11,17 @@ from hypothesis import strategies as st
 from scipy import stats
 from support.states import through_json
 
+from restock import native
 from restock.errors import MixtureError
-from restock.replay.sampling.priorities import Lap, Per, Priorities, PrioritySampler, Rule
+from restock.replay.sampling.priorities import (
+    CHUNK,
+    Lap,
+    Per,
+    Priorities,
+    PrioritySampler,
+    Rule,
+    find_places,
+)
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
 SHARES = [0.7, 0.3]
@@ -223,6 +232,55 @@ def test_a_restored_sampler_goes_on_exactly(
     mine, theirs = (go_on(s, 25, np.random.default_rng(seed + 1)) for s in (first, second))
     for one, other in zip(mine, theirs, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.integers(0, 2**32), st.integers(1, 200), st.integers(0, 300), st.booleans())
+def test_compiled_places_are_those_of_numpy(
+    seed: int, chunks: int, draws: int, some_empty: bool
+) -> None:
+    if not native.IS_THERE:
+        pytest.skip(f"native code is {native.state()}")
+    rng = np.random.default_rng(seed)
+    priority = (10 ** rng.uniform(-4, 2, (chunks, CHUNK))).astype(np.float32)
+    if some_empty:  # as a stratum's last chunk is
+        priority[rng.random(priority.shape) < 0.5] = 0
+        priority[-1, 0] = 1
+    sums = np.einsum("ij->i", priority)
+    ends = np.cumsum(sums, dtype=np.float64)
+    at = np.sort(rng.random(draws)) * ends[-1]
+    if draws > 2:
+        at[0], at[-1] = 0.0, ends[-1]  # the range's own ends
+        at[1] = ends[chunks // 2]
+        at.sort()
+    places = [np.full(draws, -1, np.int64) for _ in range(2)]
+    for find, out in zip((native.compiled.find_places, find_places), places, strict=True):
+        find(priority, sums, ends, at, out)
+    np.testing.assert_array_equal(places[0], places[1])
+
+
+def test_draws_are_the_same_without_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, list[Any]] = {}
+    for switch in ("1", "0"):
+        monkeypatch.setenv(native.SWITCH, switch)
+        one = sampler(Per(), refresh_every=4)
+        one.update(np.arange(0, 400, 2), errors()[::2])
+        drawn[switch] = [(one.draw()[0].copy(), one.drawn_weights) for _ in range(9)]
+    np.testing.assert_equal(drawn["0"], drawn["1"])
+
+
+def test_the_mean_weight_of_many_rows_is_that_of_some() -> None:
+    """Of strata with more rows than are raised to a power: 1, to within a percent."""
+    rows = np.arange(200_000)
+    rng = np.random.default_rng(0)
+    one = PrioritySampler([rows], [1.0], 256, rng, rule=Per(), refresh_every=64)
+    one.update(rows, 10 ** np.random.default_rng(1).uniform(-2, 1, len(rows)))
+    weights = []
+    for _ in range(64):
+        one.draw()
+        assert one.drawn_weights is not None
+        weights.append(float(one.drawn_weights.mean()))
+    assert np.mean(weights) == pytest.approx(1.0, abs=0.01)
 
 
 def test_what_cannot_be_a_priority_is_refused() -> None:

@@ -50,6 +50,20 @@ static int get_floats(PyObject *from, Py_buffer *view, int ndim, int writes, int
     return -1;
 }
 
+/* A contiguous array of one dimension: `kind` is 'l' for int64 or 'd' for float64. */
+static int get_vector(PyObject *from, Py_buffer *view, char kind, int writes, const char *name) {
+    if (PyObject_GetBuffer(from, view, PyBUF_ND | PyBUF_FORMAT | (writes ? PyBUF_WRITABLE : 0)) < 0)
+        return -1;
+    char is = view->format && view->format[0] && !view->format[1] ? view->format[0] : 0;
+    if (view->ndim == 1 && view->itemsize == 8 && ((size_t)view->buf & 7) == 0 &&
+        (is == kind || (is == 'q' && kind == 'l')))
+        return 0;
+    PyBuffer_Release(view);
+    PyErr_Format(PyExc_TypeError, "%s must be a contiguous %s vector", name,
+                 kind == 'd' ? "float64" : "int64");
+    return -1;
+}
+
 static int wrong_shape(const char *name) {
     PyErr_Format(PyExc_ValueError, "%s has another shape than the others ask for", name);
     return -1;

@@ -1,7 +1,8 @@
-/* `restock._native`: an update of a plain Q network, compiled.
+/* `restock._native`: an update of a plain Q network and the drawing of its batches, compiled.
  *
- * What `restock.train.dqn` does with PyTorch's operations, in fewer calls and fewer passes over
- * memory. Python's side is `restock/native.py` and `train/dqn/native_backprop.py`. Compiled with
+ * What `restock.train.dqn` does with PyTorch's operations and `restock.replay.sampling` with NumPy's,
+ * in fewer calls and fewer passes over memory. Python's side is `restock/native.py`,
+ * `train/dqn/native_backprop.py`, `replay/sampling/gather.py` and `priorities.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
  * importing it fails, and PyTorch does the work. Stable ABI: one build serves Python 3.11 and later.
@@ -9,10 +10,13 @@
 #include "buffers.h"
 #include "learning.h"
 #include "network.h"
+#include "sampling.h"
 
 static PyMethodDef module_methods[] = {
     {"td_loss", td_loss, METH_VARARGS, td_loss_doc},
     {"adam", adam, METH_VARARGS, adam_doc},
+    {"gather", gather, METH_VARARGS, gather_doc},
+    {"find_places", find_places, METH_VARARGS, find_places_doc},
     {NULL, NULL, 0, NULL},
 };
 
@@ -35,7 +39,7 @@ static int module_exec(PyObject *module) {
 static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
 
 static struct PyModuleDef module_definition = {
-    PyModuleDef_HEAD_INIT, "_native", "A plain Q network's update, compiled.", 0,
+    PyModuleDef_HEAD_INIT, "_native", "A plain Q network's update and its batches, compiled.", 0,
     module_methods,        module_slots, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__native(void) { return PyModuleDef_Init(&module_definition); }
