@@ -271,6 +271,8 @@ def prepare_resumed(
             where=str(path),
             remedy="start a new run: values of one task mean nothing in another",
         )
+    if config.teacher.mirror:
+        config = resolve_teacher(config, profile)
     panel = None
     if (fed := run.document["panel"]) is not None:
         panel = open_panel(Path(fed["path"]), config, profile)

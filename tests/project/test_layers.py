@@ -51,9 +51,9 @@ MAY_IMPORT = {
     ),
     "replay/export": "replay panel store ingest/camera ingest/store ingest/profile ingest/task",
     "train": (
-        "dqn evaluation feed run twin/env twin/floors twin/physics replay/fleet replay/mixture"
-        " replay/panel replay/ring replay/sampling replay/store ingest/profile ingest/store"
-        " ingest/task"
+        "dqn evaluation evaluation/off_policy feed run twin/env twin/floors twin/physics"
+        " replay/fleet replay/mixture replay/panel replay/ring replay/sampling replay/store"
+        " ingest/profile ingest/store ingest/task"
     ),
     "train/dqn": "twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
@@ -61,9 +61,10 @@ MAY_IMPORT = {
         "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"
         " ingest/task"
     ),
+    "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
-        "dqn feed run twin/env twin/floors twin/physics replay/panel replay/ring replay/store"
-        " ingest/live ingest/profile ingest/store ingest/task"
+        "dqn evaluation/off_policy feed run twin/env twin/floors twin/physics replay/panel"
+        " replay/ring replay/store ingest/live ingest/profile ingest/task"
     ),
     "train/comparison": (
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"

@@ -14,7 +14,8 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.report.run.films import films_section
-from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
+from restock.train.evaluation.eval_run import drive_evaluation
+from restock.train.evaluation.evaluation_plan import plan_evaluation
 from restock.train.evaluation.film import RESCUE, WORST, drive_again, scenes, unlike
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 

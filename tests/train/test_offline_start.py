@@ -25,10 +25,10 @@ from restock.train.dqn.learner import greedy_actions
 from restock.train.dqn.network import QNetwork
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation import offline_start
+from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes
 from restock.train.evaluation.offline_start import LEARNT, candidates, chosen_of, estimates
 from restock.train.evaluation.onnx_policy import to_onnx
 from restock.train.evaluation.ope import OpeConfig
-from restock.train.evaluation.ope_estimators import EssGate, OpeEpisodes
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 

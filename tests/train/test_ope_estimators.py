@@ -14,7 +14,7 @@ from restock.train.dqn.fitted_q import (
     fitted_q,
     values,
 )
-from restock.train.evaluation.ope_estimators import (
+from restock.train.evaluation.off_policy.estimators import (
     EssGate,
     OpeEpisodes,
     doubly_robust,

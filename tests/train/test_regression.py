@@ -140,9 +140,9 @@ def test_few_episodes_say_nothing_of_better_or_worse(
     assert "at least 5" in str(few["all"]["reason"])
     assert not regressed(rows)
 
-    from restock.train.evaluation import eval_run
+    from restock.train.evaluation import evaluation_plan
 
-    monkeypatch.setattr(eval_run, "plan_evaluation", lambda *_, **__: None)  # nothing drives
+    monkeypatch.setattr(evaluation_plan, "plan_evaluation", lambda *_, **__: None)  # nothing drives
     assert main(["eval", str(bad), "--no-drive", "--baseline", str(good), "--check"]) == 0
     said = capsys.readouterr()
     assert "inconclusive" in said.out
@@ -204,9 +204,9 @@ def test_the_verb_is_fit_for_a_pipeline(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    from restock.train.evaluation import eval_run
+    from restock.train.evaluation import evaluation_plan
 
-    monkeypatch.setattr(eval_run, "plan_evaluation", lambda *_, **__: None)  # nothing drives
+    monkeypatch.setattr(evaluation_plan, "plan_evaluation", lambda *_, **__: None)  # nothing drives
     worse = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.2})
     argv = ["eval", str(baseline), "--no-drive", "--save-as-baseline", "main"]
     assert main(argv) == 0

@@ -43,7 +43,7 @@ from restock.train.dqn.loss import quantile_target, td_target
 from restock.train.feed.imitation import Imitation
 from restock.train.feed.teacher import open_teacher
 from restock.train.loop import TrainingInterrupted, train
-from restock.train.prepare import prepare_new
+from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.prepare import train as train_new
 from restock.train.run import checkpoint
 from restock.train.run.run import Run
@@ -334,6 +334,10 @@ def test_rows_are_mirrored_where_the_operator_teaches_and_turns_have_their_oppos
     assert mirror(f"profile={lopsided}") is False
     with pytest.raises(ConfigError, match=r"drive 0\.8 left 0\.7, has no opposite"):
         mirror(f"profile={lopsided}", "teacher.mirror=true")
+    prepared = prepare_new(tmp_path / "run", None, None, [f"profile={lopsided}"])
+    Run.create(tmp_path / "run", prepared.document)
+    with pytest.raises(ConfigError, match="has no opposite"):
+        prepare_resumed(tmp_path / "run", ["teacher.mirror=true"])
 
 
 @pytest.mark.parametrize(

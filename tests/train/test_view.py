@@ -26,7 +26,8 @@ from restock.replay.trace.moment import find_moment
 from restock.replay.trace.trace import Trace, TracePlaces, trace_row
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.eval_run import drive_evaluation, plan_evaluation
+from restock.train.evaluation.eval_run import drive_evaluation
+from restock.train.evaluation.evaluation_plan import plan_evaluation
 from restock.train.run import checkpoint
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.run.run import Run

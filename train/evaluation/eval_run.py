@@ -8,223 +8,28 @@ episodes from and from those that chose the checkpoint.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pyarrow as pa
 
-from restock.errors import ConfigError
-from restock.ingest.task.limiter import Limiter, Limits
-from restock.toml import read_toml, typed
-from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.evaluation.cloned import (
-    CLONED,
-    cloned_panel,
-    is_cloned,
-    load_cloned,
-)
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
-from restock.train.evaluation.logged_ways import (
-    EVERY,
-    HELD_OUT,
-    LoggedMissions,
-    logged_missions,
+from restock.train.evaluation.evaluation_plan import (
+    CLEAN,
+    POLICIES,
+    EvaluationPlan,
+    make_policy,
+    plan_evaluation,
 )
-from restock.train.evaluation.ope_dataset import run_panel
-from restock.train.evaluation.policies import load_agent, load_policy
-from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
+from restock.train.evaluation.references import FIRST_SEED
 from restock.train.run.clone_quality import CloneQuality, read_clones
-from restock.train.run.kept_evaluations import LIMITED, WAYS, add_evaluation
+from restock.train.run.kept_evaluations import LIMITED, add_evaluation
 from restock.train.run.measures import summary_rows
-from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
-from restock.train.twin.env.interface import Policy
-from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
-from restock.train.twin.physics.perturbation import (
-    PERTURBATIONS,
-    Perturbation,
-    Schedule,
-    find_perturbation,
-)
-
-CLEAN = "none"
-DRAWN = "drawn"  # missions by the seeds, on the floor
-POLICIES = ("agent", "planner", "random")
-_PATHS = ", cloned:DRIVER, onnx:FILE, run:DIRECTORY"
 
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
-
-
-@dataclass(frozen=True)
-class EvaluationPlan:
-    """What to evaluate; every name was checked."""
-
-    run: Run
-    config: TrainConfig
-    policies: tuple[str, ...]
-    perturbations: dict[str, Perturbation | None]  # by the name or file that was asked for
-    episodes: Mapping[str, int]  # by kind
-    first_seed: int = FIRST_SEED
-    num_envs: int = 32
-    nthread: int = 0  # all cores
-    layouts: str = "default"
-    limits: Limits | None = None  # every policy once more, with this limiter in front
-    left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
-    missions: LoggedMissions | None = None  # None: drawn on the floor, by their seeds
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of episodes that were asked for and every floor has room for."""
-        fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
-        if self.missions is not None:
-            fit = [kind for kind in fit if kind in self.missions.specs]
-        return tuple(fit)
-
-    @property
-    def specs(self) -> list[EpisodeSpec]:
-        """The episodes of each perturbation, kind beside kind; of logged ways each at most once."""
-        of = {
-            kind: range(self.first_seed, self.first_seed + n) for kind, n in self.episodes.items()
-        }
-        drawn = {kind: [EpisodeSpec(kind, seed) for seed in of[kind]] for kind in self.kinds}
-        if self.missions is not None:
-            drawn = {k: list(self.missions.specs[k][: self.episodes[k]]) for k in self.kinds}
-        most = max(map(len, drawn.values()))
-        return [drawn[k][at] for at in range(most) for k in self.kinds if at < len(drawn[k])]
-
-    @property
-    def floors(self) -> str:
-        """The floors by name, for the record: logged ways there are other missions."""
-        return self.layouts if self.missions is None else self.layouts + WAYS
-
-    @property
-    def warnings(self) -> list[str]:
-        """Episodes among those that chose the policy that is kept: they flatter it."""
-        chosen = self.config.evaluation
-        last = self.first_seed + max(self.episodes.values())
-        if self.missions is not None:
-            flattered = "its policy was chosen by such ways: its success is flattered"
-            return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
-        if "agent" not in self.policies or not (
-            chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
-        ):
-            return []
-        return [
-            f"seeds {self.first_seed} to {last - 1} are among those that chose the run's policy"
-            f" ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is flattered"
-        ]
-
-    @property
-    def total(self) -> int:
-        """Episodes to drive."""
-        episodes = len(self.specs)
-        drivers = len(self.policies) * (1 if self.limits is None else 2)
-        return drivers * len(self.perturbations) * episodes
-
-
-def plan_evaluation(
-    path: Path,
-    *,
-    policies: Sequence[str] = POLICIES,
-    perturbations: Sequence[str] = (CLEAN,),
-    episodes: int | str | Mapping[str, int] = 20,
-    first_seed: int = FIRST_SEED,
-    layouts: str | None = None,
-    limiter: str | None = None,
-    missions: str = DRAWN,
-) -> EvaluationPlan:
-    """Check a request. `layouts` None: the run's, with training floors' test split.
-
-    `missions` is "drawn", or "logged" (or "logged:all"): the ways of logged episodes that the run's
-    panel holds out (or of all of them). `limiter` is "profile", by the `[limiter]` of the run's
-    profile, or a TOML file with one.
-
-    Raises:
-        RunError: no such run, or it kept no policy yet.
-        ConfigError: a policy or perturbation that does not exist, floors without room for any
-            kind of episode, or no episodes.
-    """
-    run = Run.open(path)
-    config = parse_config(run.document["config"], where=str(path / "config.json"))
-    known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
-    for flag, names, choices in (
-        ("--policies", policies, ["agent", *REFERENCES, CLONED]),
-        ("--perturbations", perturbations, known),
-    ):
-        unknown = [name for name in names if name not in choices and not _is_path(flag, name)]
-        if unknown or not names:
-            raise ConfigError(
-                f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
-                where=flag,
-                remedy=f"choose from {', '.join(choices)}"
-                + (_PATHS if flag == "--policies" else ", FILE.toml"),
-            )
-    of_kind = episodes_of_kind(episodes)
-    layouts = layouts or layouts_of_split(config.env.layouts, "test")
-    floors = open_floors(layouts)
-    plan = EvaluationPlan(
-        run,
-        config,
-        tuple(dict.fromkeys(policies)),
-        {name: _perturb(name) for name in perturbations},
-        of_kind,
-        first_seed,
-        layouts=layouts,
-        limits=None if limiter is None else _limits(run, limiter),
-        left_out=unfit_kinds(floors) if missions == DRAWN else {},
-        missions=_missions(run, missions, floors, tuple(of_kind)),
-    )
-    if not plan.kinds:
-        refuse_unfit(floors, list(of_kind))
-    for name in plan.policies:
-        if is_cloned(name):
-            cloned_panel(run, name)
-        elif name == "agent" or _is_path("--policies", name):
-            make_policy(name, plan)  # refused before anything is driven
-    return plan
-
-
-def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
-    """Episodes by kind: so many of each, or those that are named, as text `kind=N,kind=N`.
-
-    Raises:
-        ConfigError: no such kind, or not a number of at least 1.
-    """
-    where = "--episodes"
-    if isinstance(asked, str):
-        parts = [part.partition("=") for part in asked.split(",") if part.strip()]
-        named = any(sign for _, sign, _ in parts)
-        try:
-            found = {kind.strip(): int(count) for kind, _, count in parts} if named else None
-            asked = int(asked) if found is None else found
-        except ValueError:
-            raise ConfigError(
-                f"{asked!r} is neither a number nor kind=number,…",
-                where=where,
-                remedy="write 20, or nominal=1000,wheel_slip=300",
-            ) from None
-    if isinstance(asked, int):
-        asked = dict.fromkeys(KINDS, asked)
-    if unknown := [kind for kind in asked if kind not in KINDS]:
-        remedy = f"choose from {', '.join(KINDS)}"
-        raise ConfigError(f"there is no kind {unknown[0]!r}", where=where, remedy=remedy)
-    least = min(asked.values(), default=0)
-    if least < 1:
-        raise ConfigError(f"must be at least 1, got {least}", where=where)
-    return dict(asked)
-
-
-def _is_path(flag: str, name: str) -> bool:
-    if flag == "--policies":
-        kind, _, path = name.partition(":")
-        return kind in ("onnx", "run", CLONED) and bool(path)
-    return name.endswith(".toml")
 
 
 def evaluate(
@@ -319,84 +124,6 @@ def drive_evaluation(
     return added
 
 
-def _missions(
-    run: Run, named: str, floors: Sequence[Warehouse], kinds: Sequence[str]
-) -> LoggedMissions | None:
-    """Those of the logs where they are asked for.
-
-    Raises:
-        ConfigError: no such missions, no logs, several floors, or none of them can be driven.
-    """
-    if named == DRAWN:
-        return None
-    where = f"--missions {named}"
-    if named not in (HELD_OUT, EVERY):
-        remedy = f"choose from {DRAWN}, {HELD_OUT}, {EVERY}"
-        raise ConfigError("there are no such missions", where=where, remedy=remedy)
-    if (panel := run_panel(run.document)) is None:
-        raise ConfigError("the run learnt from no logs", where=where, remedy="leave it out")
-    if panel.task.goal == "none":
-        raise ConfigError("the task has no goal", where=where, remedy="leave it out")
-    if len(floors) > 1:
-        raise ConfigError(
-            f"is about the floor of the logs, these are {len(floors)}",
-            where=where,
-            remedy="name one with --layouts",
-        )
-    return logged_missions(panel, floors[0], kinds, every=named == EVERY)
-
-
-def _limits(run: Run, named: str) -> Limits:
-    """The limits of a run's robot, by its profile or by a TOML file.
-
-    Raises:
-        ConfigError: no such file, or its `[limiter]` cannot be used.
-    """
-    profile = profile_of_run(run)
-    given = profile.limiter
-    if named != "profile":
-        document = read_toml(Path(named), remedy='give "profile", or a TOML file with a [limiter]')
-        if "limiter" not in document:
-            raise ConfigError("has no [limiter]", where=named)
-        given = typed(document["limiter"], Limiter, where=named, prefix="limiter")
-    return Limits.of(profile.task, profile.robot, given)
-
-
-def _perturb(name: str) -> Perturbation | None:
-    """The parameters that episodes are driven under; None: as they are.
-
-    Raises:
-        ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
-    """
-    if name == CLEAN:
-        return None
-    perturbation = find_perturbation(name, where="--perturbations")
-    if isinstance(perturbation, Schedule):
-        raise ConfigError(
-            "is a schedule: policies are compared under the same parameters",
-            where=name,
-            remedy="give the TOML file of one perturbation",
-        )
-    if perturbation.timestep_s != Perturbation().timestep_s:
-        raise ConfigError(
-            f"holds for a timestep of {perturbation.timestep_s:g} s, the evaluation runs at"
-            f" {Perturbation().timestep_s:g} s",
-            where=name,
-            remedy="effective parameters are those of a timestep: fit them at this one",
-        )
-    return perturbation
-
-
-def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """The run's kept policy, a scripted one, or one that is named."""
-    if name == "agent":
-        return load_agent(plan.run)
-    if is_cloned(name):
-        return load_cloned(plan.run, name, seed=plan.first_seed)
-    named = load_policy(name, profile_of_run(plan.run).task)
-    return reference(name, plan.first_seed) if named is None else named
-
-
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
     """How good the clones among the policies are; empty before they were driven."""
     return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
@@ -421,22 +148,3 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
         for result in episodes
     ]
     return pa.Table.from_pylist(rows, schema=EVAL_EPISODES)
-
-
-def settings(plan: EvaluationPlan) -> dict[str, Any]:
-    """What was asked, for the JSON output."""
-    return {
-        "run": str(plan.run.path),
-        "policies": list(plan.policies),
-        "perturbations": {
-            name: msgspec.to_builtins(perturbation or Perturbation())
-            for name, perturbation in plan.perturbations.items()
-        },
-        "episodes_per_kind": dict(plan.episodes),
-        "first_seed": plan.first_seed,
-        "layouts": plan.layouts,
-        "missions": DRAWN if plan.missions is None else plan.missions.text,
-        "limiter": None if plan.limits is None else msgspec.to_builtins(plan.limits),
-        "kinds": list(plan.kinds),
-        "left_out": plan.left_out,
-    }

@@ -2,11 +2,11 @@
 
 What was learnt offline may drive worse than whoever drove in the logs. The candidates are the
 policy as it is, filtered more or less, the teacher's clone alone, and each led by what the
-navigation stack proposes. Of those that the logs' weights reach to the end of episodes (the gate of
-`ope_estimators`) the one with the largest lower bound drives until online updates begin: high
-confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015), by the weighted doubly
-robust estimator. Where the weights reach no candidate's end nothing is known of any of them, and
-the one that is nearest to whoever drove in the logs begins: what navigation proposes.
+navigation stack proposes. Of those that the logs' weights reach to the end of episodes (the gate
+in `off_policy/estimators.py`) the one with the largest lower bound drives until online updates
+begin: high confidence policy improvement (Thomas, Theocharous and Ghavamzadeh 2015), by the
+weighted doubly robust estimator. Where the weights reach no candidate's end nothing is known of any
+of them, and the one that is nearest to whoever drove in the logs begins: what navigation proposes.
 
 Episodes that met a condition count half, however few they are: logs are mostly of the easy ones.
 """
@@ -28,20 +28,20 @@ from restock.train.dqn.fitted_q import fitted_q, soft_greedy
 from restock.train.dqn.learner import Learner
 from restock.train.dqn.network import clone
 from restock.train.dqn.start_policy import StartPolicy, start_network
+from restock.train.evaluation.off_policy.dataset import OpeDataset
+from restock.train.evaluation.off_policy.estimators import (
+    EssGate,
+    OpeEpisodes,
+    doubly_robust,
+    fitted,
+    once,
+)
 from restock.train.evaluation.ope import (
     ALL,
     OpeConfig,
     behaviour_probability,
     measures_of,
     padded_episodes,
-)
-from restock.train.evaluation.ope_dataset import OpeDataset
-from restock.train.evaluation.ope_estimators import (
-    EssGate,
-    OpeEpisodes,
-    doubly_robust,
-    fitted,
-    once,
 )
 
 _RESAMPLES = 2_000

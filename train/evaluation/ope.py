@@ -31,14 +31,14 @@ from restock.train.dqn.fitted_q import (
     values,
 )
 from restock.train.dqn.network import QNetwork
-from restock.train.evaluation.ope_dataset import (
+from restock.train.evaluation.off_policy.dataset import (
     Measure,
     OpeDataset,
     OpeSteps,
     load_ope_dataset,
     run_panel,
 )
-from restock.train.evaluation.ope_estimators import EssGate, OpeEpisodes, estimate
+from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes, estimate
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run

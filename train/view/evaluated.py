@@ -16,8 +16,13 @@ from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.steps.seen_at_ticks import Seen
 from restock.replay.trace.moment import NS, Moment
-from restock.train.evaluation.eval_run import CLEAN, EvaluationPlan, make_policy, plan_evaluation
 from restock.train.evaluation.evaluate import Stepper
+from restock.train.evaluation.evaluation_plan import (
+    CLEAN,
+    EvaluationPlan,
+    make_policy,
+    plan_evaluation,
+)
 from restock.train.evaluation.film import drive_row, everything, unlike
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run

@@ -92,12 +92,8 @@ class EvalCommand:
     def _drive(self) -> int:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.evaluation.eval_run import (
-            clones_driven,
-            drive_evaluation,
-            plan_evaluation,
-            settings,
-        )
+        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation
+        from restock.train.evaluation.evaluation_plan import plan_evaluation, settings
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.measures import summary_rows
