@@ -30,7 +30,7 @@ from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_probl
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
-from restock.ingest.task.surroundings import SCANNED, came_nearer
+from restock.ingest.task.surroundings import SCANNED, came_nearer, steps_remembered
 from restock.ingest.task.task import nearest_action
 
 _CHUNK = 4096  # steps
@@ -153,9 +153,12 @@ class Filling:
             # Speeds of one and the same poses: no second witness, so never slip.
             forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
         signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+        scanned = {name: signals[name] for name in SCANNED}
         came = [
-            came_nearer(self.task, *({name: signals[name][at] for name in SCANNED} for at in pair))
-            for pair in _chunks(before)
+            came_nearer(
+                self.task, *_with_earlier(scanned, rows, before, steps_remembered(self.task))
+            )
+            for rows in _chunks(len(before))
         ]
         signals["came_nearer_m"] = np.concatenate([np.zeros(0), *came])
         return signals
@@ -378,11 +381,21 @@ class Filling:
         self.notes.append(str(found))
 
 
-def _chunks(before: Ints) -> Iterator[tuple[slice, Ints]]:
-    """Steps and the ones before them, some at a time: what is made of scans takes memory."""
-    for start in range(0, len(before), _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        yield rows, before[rows]
+def _chunks(steps: int) -> Iterator[Ints]:
+    """Steps, some at a time: what is made of scans takes memory."""
+    for start in range(0, steps, _CHUNK):
+        yield np.arange(start, min(start + _CHUNK, steps))
+
+
+def _with_earlier(
+    signals: Signals, rows: Ints, before: Ints, count: int
+) -> tuple[Signals, list[Signals]]:
+    """Signals of these steps, and of the `count` steps before each, the last one first."""
+    at = [rows]
+    for _ in range(count):
+        at.append(before[at[-1]])
+    now, *earlier = ({name: column[one] for name, column in signals.items()} for one in at)
+    return now, earlier
 
 
 def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:

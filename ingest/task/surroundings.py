@@ -6,18 +6,23 @@ sectors it is within .17 m of where it is at 2 m. For logs and twin alike.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 
-from restock.arrays import F64
+from restock.arrays import F64, Ints
 from restock.ingest.task.scan import Body, outline_reach
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 
 NEAR_M = 2.0  # of clearance, for who comes nearer
-LARGEST_M = 1.0  # in one step: more is a return that was hidden before
+REMEMBERED_S = 1.0  # what was seen that long ago was there already
+FASTEST_MPS = (
+    2.0  # that anybody walks toward the robot: a return that jumps farther was hidden before
+)
+LEAST_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
 # The signals that it takes.
@@ -27,39 +32,76 @@ SCANNED = (
 )
 
 
-def came_nearer(task: Task, now: Signals, before: Signals) -> F64:
+def steps_remembered(task: Task) -> int:
+    """How many steps before its own `came_nearer` looks at."""
+    return max(round(REMEMBERED_S / task.control_period_s), 1)
+
+
+def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     """How far (m) something came nearer since the step before, (N,); 0 where nothing did.
 
-    A return of now within NEAR_M is put where the robot was before, by the localised and the
-    gyroscope's motion. Where the lidar then saw farther, in that sector and both beside it, it has
-    come. What comes into view behind a corner was hidden then, and does not count. NaN without a
+    A return of now within NEAR_M is put where the robot was at each of the steps before, by the
+    localised and the gyroscope's motion. Where the lidar saw farther at all of them, in that sector
+    and both beside it, it has come; the smallest of these ways is how far. So the edge that a beam
+    now hits and now misses does not come, nor does what it came upon behind a corner, which is too
+    far to have walked. Where no beam of the three sectors came back nothing is known. NaN without a
     lidar.
+
+    Args:
+        now: the signals SCANNED.
+        earlier: those of the steps before, the last one first, `steps_remembered` of them or fewer;
+            where an episode has none that early, its first again.
     """
     clearance, count = now["sector_clearance_m"], task.sectors
     if not count:
         return np.full(len(clearance), np.nan)
     bearing, reach = _sectors(count, task.body)
-    elapsed_s = (now["stamp_ns"] - before["stamp_ns"]) * 1e-9
-    turn = elapsed_s * (now["gyro_yaw_rate_radps"] + before["gyro_yaw_rate_radps"]) / 2
+    # The same scan again, of a lidar slower than the steps, tells nothing.
+    told = (clearance != earlier[0]["sector_clearance_m"]).any(axis=1)
+    row, sector = np.nonzero((clearance < NEAR_M) & told[:, None])
+    distance = (clearance + reach)[row, sector]
+    lever = task.body.lidar_x_m  # points are of the lidar, turns about the middle of the body
+    x, y = distance * np.cos(bearing[sector]) + lever, distance * np.sin(bearing[sector])
+    came = np.full(len(row), np.inf)
+    after = now
+    for before in earlier:
+        x, y = _seen_from(before, after, row, x, y)
+        x_of_lidar = x - lever
+        place = ((np.arctan2(y, x_of_lidar) + np.pi) * (count / (2 * np.pi))).astype(np.intp)
+        farther = _farthest_free(before["sector_clearance_m"] + reach, task.range_max_m + reach)
+        gain = farther[row, np.minimum(place, count - 1)] - np.hypot(x_of_lidar, y)
+        came = np.minimum(came, gain)
+        left = came > 0
+        row, x, y, came = row[left], x[left], y[left], came[left]
+        after = before
+    elapsed_s = (now["stamp_ns"] - earlier[0]["stamp_ns"]) * 1e-9
+    walked = came <= FASTEST_MPS * np.maximum(elapsed_s, LEAST_S)[row]
+    most = np.zeros(len(clearance))
+    np.maximum.at(most, row[walked], came[walked])
+    return most
+
+
+def _seen_from(before: Signals, after: Signals, row: Ints, x: F64, y: F64) -> tuple[F64, F64]:
+    """Points (n,) of these rows in the body frame of `after`, in that of the step before."""
+    elapsed_s = (after["stamp_ns"] - before["stamp_ns"]) * 1e-9
+    turn = elapsed_s * (after["gyro_yaw_rate_radps"] + before["gyro_yaw_rate_radps"]) / 2
     forward, left = (
-        elapsed_s * now[name] for name in ("localised_speed_mps", "localised_lateral_mps")
+        elapsed_s * after[name] for name in ("localised_speed_mps", "localised_lateral_mps")
     )
     half_cos, half_sin = np.cos(turn / 2), np.sin(turn / 2)  # motion is along the mean heading
-    moved_x = forward * half_cos - left * half_sin
-    moved_y = forward * half_sin + left * half_cos
-    cos, sin = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    x, y = (clearance + reach) * np.cos(bearing), (clearance + reach) * np.sin(bearing)
-    lever = task.body.lidar_x_m  # points are of the lidar, turns about the middle of the body
-    then_x = moved_x[:, None] + cos * (x + lever) - sin * y - lever
-    then_y = moved_y[:, None] + sin * (x + lever) + cos * y
-    place = ((np.arctan2(then_y, then_x) + np.pi) * (count / (2 * np.pi))).astype(np.intp)
-    seen = before["sector_clearance_m"] + reach
-    least = np.minimum(np.minimum(np.roll(seen, 1, axis=1), seen), np.roll(seen, -1, axis=1))
-    farther = np.take_along_axis(least, np.minimum(place, count - 1), axis=1)
-    gain = np.clip(farther - np.hypot(then_x, then_y), 0.0, LARGEST_M)
-    # The same scan again, of a lidar slower than the steps, tells nothing.
-    told = (clearance < NEAR_M) & (clearance != before["sector_clearance_m"]).any(axis=1)[:, None]
-    return np.asarray(np.where(told, gain, 0.0).max(axis=1), np.float64)
+    moved_x, moved_y = forward * half_cos - left * half_sin, forward * half_sin + left * half_cos
+    cos, sin = np.cos(turn)[row], np.sin(turn)[row]
+    return moved_x[row] + cos * x - sin * y, moved_y[row] + sin * x + cos * y
+
+
+def _farthest_free(seen: F64, nothing: F64) -> F64:
+    """The nearest return (N, K) of each sector and the two beside it; -inf where there is none.
+
+    `nothing` (K,) is what a sector says in which no beam came back.
+    """
+    known = np.where(seen < nothing - 1e-6, seen, np.inf)
+    least = np.minimum(np.minimum(np.roll(known, 1, axis=1), known), np.roll(known, -1, axis=1))
+    return np.where(np.isinf(least), -np.inf, least)
 
 
 def plan_distances_m(task: Task) -> tuple[float, ...]:

@@ -14,6 +14,8 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
+from restock.errors import RunError
+
 
 class Stateful:
     """Saves and restores what `STATE` names.
@@ -32,11 +34,21 @@ class Stateful:
         return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts everything where `state_dict` found it. Raises `mismatch` for another's state."""
+        """Puts everything where `state_dict` found it. Raises `mismatch` for another's state.
+
+        Raises:
+            RunError: a state without one of these names: another version of Restock saved it.
+        """
         for name in self.SAME:
             if not _alike(saved(getattr(self, name)), state.get(_key(name))):
                 raise self.mismatch(_key(name), state.get(_key(name)))
         for name in self.STATE:
+            if _key(name) not in state:
+                raise RunError(
+                    f"the saved state of {type(self).__name__} has no {_key(name)}:"
+                    " another version of Restock saved it",
+                    remedy="resume with the version that the run began with, or start another run",
+                )
             value, kind = state[_key(name)], self.STATE_TYPES.get(name)
             if kind is None:
                 setattr(self, name, restored(getattr(self, name), value))

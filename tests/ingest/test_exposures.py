@@ -59,7 +59,7 @@ def exposed(table: pa.Table, name: str) -> list[int]:
 
 def test_each_situation_is_told_by_what_is_known_before_acting():
     assert exposed(steps(20), "closing_traffic") == []
-    someone = steps(20, came_nearer_m=changed(0.15, 0.0, slice(8, 10)))
+    someone = steps(20, came_nearer_m=changed(0.1, 0.0, slice(8, 10)))
     assert exposed(someone, "closing_traffic") == [9, 10, 11, *range(12, 17)]
     noise = steps(20, came_nearer_m=np.full(20, 0.03))
     assert exposed(noise, "closing_traffic") == []

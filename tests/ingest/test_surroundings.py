@@ -55,7 +55,7 @@ def between(
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
     before = signals(0, scan((0.0, 0.0, 0.0), discs), forward_m, turn)
     now = signals(1, scan(pose, then), forward_m, turn)
-    return float(came_nearer(TASK, now, before)[0])
+    return float(came_nearer(TASK, now, [before])[0])
 
 
 @pytest.mark.parametrize("bearing_deg", range(-175, 180, 23))
@@ -85,14 +85,54 @@ def test_what_stands_does_not_come_nearer_however_the_robot_moves(discs, forward
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
     before = signals(0, scan((0.0, 0.0, 0.0), discs, walls), forward_m, turn)
     now = signals(1, scan(pose, discs, walls), forward_m, turn)
-    assert came_nearer(TASK, now, before)[0] < 0.1
+    assert came_nearer(TASK, now, [before])[0] < 0.1
+
+
+def over(scans: list[Any]) -> float:
+    """What came nearer at the last of these scans (1, K) of a robot that stands."""
+    *earlier, now = (signals(step, one, 0.0, 0.0) for step, one in enumerate(scans))
+    return float(came_nearer(TASK, now, earlier[::-1])[0])
+
+
+def test_an_edge_that_beams_hit_now_and_miss_now_does_not_come_nearer():
+    """Chair legs and the rims of things, with something behind them."""
+    seen, missed = (scan((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], []))
+    assert over([missed, seen]) > 0.2  # of two scans alone it looks so
+    assert over([seen, missed, seen]) == 0
+    assert over([seen, missed, missed, missed, seen]) == 0
+
+
+def test_who_comes_on_does_so_against_all_that_was_seen_before():
+    at = [scan((0.0, 0.0, 0.0), [(far, 0.0, 0.25)], 3.0) for far in (2.0, 1.8, 1.6, 1.4, 1.2)]
+    assert over(at) == pytest.approx(0.2, abs=0.06)
+
+
+def test_what_is_suddenly_much_nearer_was_hidden_before():
+    """Behind a corner, or from a beam that was lost: nobody walks a metre in a step."""
+    empty, near = (scan((0.0, 0.0, 0.0), discs, 2.5) for discs in ([], [(1.2, 0.0, 0.25)]))
+    assert over([empty, empty, near]) == 0
+
+
+def test_where_no_beam_came_back_nothing_is_known():
+    near = scan((0.0, 0.0, 0.0), [(1.9, 0.0, 0.25)], 3.0)
+    lost = np.full_like(near, TASK.range_max_m)
+    assert over([lost, near]) == 0
+
+
+def test_a_lidar_slower_than_the_steps_sees_nobody_come_where_the_robot_goes():
+    """Its scans are held: the last one is then of where the robot was steps ago."""
+    at_m = np.arange(8) * 0.15
+    scans = [scan((x, 0.0, 0.0), [(3.0, 0.2, 0.4)]) for x in at_m]
+    held = [signals(step, scans[step - step % 2], 0.15, 0.0) for step in range(8)]
+    for step in range(2, 8):
+        assert came_nearer(TASK, held[step], held[:step][::-1])[0] < 0.02
 
 
 def test_the_same_scan_again_tells_nothing():
     """Of a lidar slower than the steps: the robot went on, the scan did not."""
     held = scan((0.0, 0.0, 0.0), [(-1.5, 0.0, 0.3)])
     before, now = signals(0, held, 0.2, 0.0), signals(1, held, 0.2, 0.0)
-    assert came_nearer(TASK, now, before)[0] == 0
+    assert came_nearer(TASK, now, [before])[0] == 0
 
 
 def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():

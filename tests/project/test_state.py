@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from restock.errors import RunError
 from restock.state import Stateful, restored, saved
 
 
@@ -146,8 +147,9 @@ def test_a_list_or_mapping_of_another_length_is_taken_as_it_was_saved() -> None:
 def test_a_state_that_lacks_a_name_is_refused() -> None:
     state = Outer().state_dict()
     del state["inner"]
-    with pytest.raises(KeyError, match="inner"):
+    with pytest.raises(RunError, match="of Outer has no inner: another version") as caught:
         Outer().load_state_dict(state)
+    assert "start another run" in str(caught.value.remedy)
 
 
 def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:

@@ -33,7 +33,7 @@ CASE WHEN ahead_m < 1.45 THEN
     + 3.86
     - 7.46 * moved_m
     + 2.92 * bend_rad
-    - 10.24 * someone_m
+    - 24 * someone_m
     - 35.69 * aside_m
     - 3.82 * early
 ELSE -9 END

@@ -1,9 +1,9 @@
 -- Someone comes nearer within 2 m, whatever comes of it: what the lidar saw come nearer over the last
--- .8 s, the robot's own motion taken off, adds up to .2 m beyond the noise of two ranges a step. It
+-- .8 s, the robot's own motion taken off, adds up to .1 m beyond the noise of two ranges a step. It
 -- holds on for a second, as people do not vanish.
 -- kind: exposure
 -- timing: pre
 -- let came_m:
 sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
 -- label:
-max(came_m) OVER (episode ROWS BETWEEN 5 PRECEDING AND CURRENT ROW) > 0.2
+max(came_m) OVER (episode ROWS BETWEEN 5 PRECEDING AND CURRENT ROW) > 0.1

@@ -8,5 +8,5 @@
 sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
 -- label:
 max(plan_return_m) OVER (episode ROWS BETWEEN 4 PRECEDING AND CURRENT ROW) < 2.3
-AND max(came_m) OVER (episode ROWS BETWEEN 25 PRECEDING AND CURRENT ROW) < 0.2
+AND max(came_m) OVER (episode ROWS BETWEEN 25 PRECEDING AND CURRENT ROW) < 0.06
 AND step_index >= 4

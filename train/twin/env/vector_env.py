@@ -33,6 +33,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.limiter import Limits, limit
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
+from restock.ingest.task.surroundings import SCANNED, steps_remembered
 from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
@@ -63,7 +64,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
     STATE = (
-        *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
+        *("specs", "observation", "signals", "scanned", "previous_action", "steps", "bumps"),
+        *("episode_number",),
         *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
         *("mission_arm", "diverged", "queue", "simulation", "sensing", "truth", "navigation"),
     )
@@ -173,6 +175,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
+        self.scanned: list[Signals] = []  # of the steps before, the last one first
         self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
         self.previous_action = np.zeros(num_envs, np.int64)
         self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
@@ -245,16 +248,21 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
                 self.simulation.traffic.closest_m[env] = np.inf
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
-        add_motion(self.task, first, None)
+        add_motion(self.task, first)
         add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
         self.navigation.propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
-            for name, column in self.signals.items():
-                column[ids] = first[name]
+            for signals in (self.signals, *self.scanned):
+                for name, column in signals.items():
+                    column[ids] = first[name]
         else:
             self.signals = first
+            self.scanned = [
+                {name: first[name].copy() for name in SCANNED}
+                for _ in range(steps_remembered(self.task) - 1)
+            ]
 
     def _lay_out(self, env: int, spec: EpisodeSpec) -> None:
         perturbation = spec.perturbation or self.perturbation
@@ -318,7 +326,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.steps += 1
 
         after = self.sensing.sense(everyone, self.steps)
-        add_motion(self.task, after, now)
+        add_motion(self.task, after, [now, *self.scanned])
+        if self.scanned:
+            self.scanned = [{name: now[name].copy() for name in SCANNED}, *self.scanned[:-1]]
         plans, goals = self.navigation.plans_m, self.navigation.goals_m
         offset = add_route(task, after, plans, goals)
         progress = now["route_remaining_m"] - after["route_remaining_m"]

@@ -7,6 +7,7 @@ noise of a perturbation. All noise of an episode is drawn when it begins, from i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -135,11 +136,14 @@ class Sensing(Stateful):
         }
 
 
-def add_motion(task: Task, signals: Signals, before: Signals | None) -> None:
-    """Speeds from the last two localised poses, and who came nearer; at an episode's first step
-    speeds are the wheels'."""
-    before = signals if before is None else before
-    forward, lateral = localised_velocity(signals, before)
+def add_motion(task: Task, signals: Signals, earlier: Sequence[Signals] = ()) -> None:
+    """Speeds from the last two localised poses, and who came nearer.
+
+    `earlier` are the steps before, the last one first; at an episode's first step there are none,
+    and speeds are the wheels'.
+    """
+    before = earlier or [signals]
+    forward, lateral = localised_velocity(signals, before[0])
     signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
     signals["came_nearer_m"] = came_nearer(task, signals, before)
 
