@@ -11,6 +11,7 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.long import one_in
 from support.stores import manifest, one, shown, views_over
 
 from restock.errors import StoreError
@@ -138,6 +139,7 @@ def test_compaction_is_advised_of_many_files_of_few_rows(tmp_path):
     assert finding(3).status == "pass"
 
 
+@pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
 def test_a_compacted_store_goes_on(place):
     writer = StoreWriter(place)
     version = writer.write_all([one(1), one(2), one(3)])

@@ -18,6 +18,7 @@ import pytest
 from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError
 from deltalake.transaction import AddAction
+from support.long import one_in
 from support.s3_server import files_of
 from support.stores import one, shown
 
@@ -81,6 +82,7 @@ def _write(place: Path | str, recording: int, ingest: str) -> None:
     StoreWriter(place).write(*one(recording, ingest))
 
 
+@pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
 def test_writers_at_the_same_time_lose_nothing_and_double_nothing(place):
     """Processes that all make the store, two of them with the same recording."""
     context = multiprocessing.get_context("spawn")

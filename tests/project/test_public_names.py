@@ -60,6 +60,7 @@ def test_a_name_is_what_type_checkers_see(face: str) -> None:
         module.nothing  # noqa: B018
 
 
+@pytest.mark.long
 def test_no_module_takes_the_place_of_a_name_however_late_it_is_imported() -> None:
     everything = [
         ".".join(["restock", *path.relative_to(ROOT / room).with_suffix("").parts])

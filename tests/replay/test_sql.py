@@ -16,6 +16,7 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from support.long import one_in
 from support.panels import panel_of
 
 from restock import cli
@@ -185,7 +186,7 @@ def test_without_a_query_there_is_a_prompt(
     assert "nope" in captured.err
 
 
-@pytest.mark.parametrize("name", ["views.sql", "views.duckdb"])
+@pytest.mark.parametrize("name", one_in(2, ["views.sql", "views.duckdb"]))
 def test_any_duckdb_sees_the_exported_views(
     store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

@@ -85,6 +85,7 @@ def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) 
     assert (tmp_path / "run" / "strata.parquet").is_file() == mixed
 
 
+@pytest.mark.long
 def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
     done = example("cleanrl_dqn").main(steps=2400, num_envs=8, target_network_frequency=50)
     assert done["env_steps"] == 2400

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from support.long import one_in
 from support.paths import ROOT
 from support.stores import recording_transitions
 
@@ -144,7 +145,7 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     assert whole["exploration"] == parts["exploration"]
 
 
-@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("ended_by", one_in(2, [signal.SIGINT, signal.SIGTERM]))
 def test_ctrl_c_or_a_kill_writes_a_checkpoint_and_says_how_to_go_on(
     ended_by: signal.Signals, tmp_path: Path
 ) -> None:
@@ -262,6 +263,7 @@ def test_eval_drives_everyone_through_the_same_episodes(
     assert any(row["success"] for row in nominal)
 
 
+@pytest.mark.long  # test_film and test_eval_run have the shorter ones
 def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

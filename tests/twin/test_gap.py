@@ -207,6 +207,7 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
         read_gap(tmp_path / "other")
 
 
+@pytest.mark.long
 def test_the_same_seed_measures_the_same(gap: TwinGap, stored: Path) -> None:
     with Store(stored) as store:
         again = measure_gap(store, TRUE, msgspec.structs.replace(CONFIG, nthread=2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from support.long import one_in
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
@@ -40,7 +41,10 @@ def test_the_planner_is_good_in_nominal_aisles_and_stuck_in_partly_blocked_ones(
     assert blocked["full"] >= 0.8  # it finds the block and goes around
 
 
-@pytest.mark.parametrize("kind", ["nominal", "wheel_slip", "blocked_aisle", "near_collision"])
+KINDS = ["near_collision", "wheel_slip", "blocked_aisle", "nominal"]
+
+
+@pytest.mark.parametrize("kind", one_in(2, KINDS))
 def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
     # 24 episodes: 4 to 10 points of noise below what benchmarks/drivers.py asks over 100.
     assert min(success(Operator(), kind).values()) >= 0.8

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from support.long import one_in
 from support.paths import ROOT
 
 from restock.train.twin.physics.model import PARKED_M
@@ -98,7 +99,7 @@ def test_traffic_is_the_whole_scene_in_every_message() -> None:
     ) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("file_format", "name"), [("mcap", "a.mcap"), ("rosbag2", "a")])
+@pytest.mark.parametrize(("file_format", "name"), one_in(2, [("mcap", "a.mcap"), ("rosbag2", "a")]))
 def test_a_recording_holds_frames_map_and_scene_as_viewers_expect(
     tmp_path: Path, file_format: Format, name: str
 ) -> None:
