@@ -96,6 +96,16 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None
     writer.writerows([plain(row[name]) for name in names] for row in rows)
 
 
+def print_skipped(reasons: Mapping[str, str | None]) -> None:
+    """Why topics' messages were skipped: sentences, which no column is wide enough for."""
+    topics: dict[str, list[str]] = {}
+    for topic, reason in reasons.items():
+        if reason:
+            topics.setdefault(reason, []).append(topic)
+    for reason, names in topics.items():
+        sys.stdout.write(visible(f"skipped {', '.join(names)}: {reason}") + "\n")
+
+
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:

@@ -113,7 +113,6 @@ def _print(entry: dict[str, Any]) -> None:
             "rate Hz": topic["rate_hz"],
             "encoding": topic["encoding"],
             "offered QoS": "; ".join(map(_qos, topic["qos"])),
-            "": f"skipped: {topic['skipped']}" if topic["skipped"] else "",
         }
         for name, topic in entry["topics"].items()
     ]
@@ -130,11 +129,11 @@ def _print(entry: dict[str, Any]) -> None:
     mixed = {topic["encoding"] for topic in entry["topics"].values()} - {"cdr"}
     coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
     qos = ["offered QoS"] if any(row["offered QoS"] for row in rows) else []
-    last = [""] if any(row[""] for row in rows) else []
-    shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos, *last]
+    shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos]
     for packed in entry["chunks"]:
         sys.stdout.write(_packed(packed) + "\n")
     output.print_table(rows, shown)
+    output.print_skipped({name: topic["skipped"] for name, topic in entry["topics"].items()})
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),
         ("metadata records", entry["metadata"]),

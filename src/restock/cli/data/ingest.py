@@ -208,8 +208,9 @@ def show(outcome: IngestResult) -> None:
     used = [topic for topic in row["topics"] if topic["reason"] != UNUSED]
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
     used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]
-    columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS, "reason"]
+    columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS]
     output.print_table(used, output.told(used, columns))
+    output.print_skipped({topic["topic"]: topic["reason"] for topic in used})
     if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
         topics = _count(len(rest), "further topic")
