@@ -198,6 +198,7 @@ def parts(count: int, steps: int) -> dict[str, float]:
         ("lidar", sim.batch, "ray"),
         ("lidar", sim, "cast"),
         ("sensors and their noise", env.sensing, "sense"),
+        ("sensors and their noise", env.sensing, "add_motion"),
         ("navigation: plans, blocked aisles", env.navigation, "update"),
         ("traffic", sim.traffic, "advance"),
         ("traffic", sim.scenery, "walk"),
@@ -213,7 +214,6 @@ def parts(count: int, steps: int) -> dict[str, float]:
         "observe": "observation",
         "reward": "reward and termination",
         "terminated": "reward and termination",
-        "add_motion": "sensors and their noise",
         "add_route": "route",
     }
     before = {name: getattr(vector_env, name) for name in swapped}

@@ -33,7 +33,6 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.limiter import Limits, limit
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.surroundings import SCANNED, steps_remembered
 from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
@@ -52,7 +51,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_trial import robot_model
-from restock.train.twin.physics.sensing import Sensing, add_motion, add_route
+from restock.train.twin.physics.sensing import Sensing, add_route
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 from restock.train.twin.physics.truth import Truth
 
@@ -64,8 +63,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
     STATE = (
-        *("specs", "observation", "signals", "scanned", "previous_action", "steps", "bumps"),
-        *("episode_number",),
+        *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
         *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
         *("mission_arm", "diverged", "queue", "simulation", "sensing", "truth", "navigation"),
     )
@@ -175,7 +173,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
         self.signals: Signals = {}
-        self.scanned: list[Signals] = []  # of the steps before, the last one first
         self.observation = np.zeros((num_envs, self.task.observation_size), np.float32)
         self.previous_action = np.zeros(num_envs, np.int64)
         self.steps = np.zeros(num_envs, np.int64)  # of the running episodes
@@ -248,21 +245,16 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
                 self.simulation.traffic.closest_m[env] = np.inf
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
-        add_motion(self.task, first)
+        self.sensing.add_motion(ids, first)
         add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
         self.navigation.propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
         if self.signals:
-            for signals in (self.signals, *self.scanned):
-                for name, column in signals.items():
-                    column[ids] = first[name]
+            for name, column in self.signals.items():
+                column[ids] = first[name]
         else:
             self.signals = first
-            self.scanned = [
-                {name: first[name].copy() for name in SCANNED}
-                for _ in range(steps_remembered(self.task) - 1)
-            ]
 
     def _lay_out(self, env: int, spec: EpisodeSpec) -> None:
         perturbation = spec.perturbation or self.perturbation
@@ -326,9 +318,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.steps += 1
 
         after = self.sensing.sense(everyone, self.steps)
-        add_motion(self.task, after, [now, *self.scanned])
-        if self.scanned:
-            self.scanned = [{name: now[name].copy() for name in SCANNED}, *self.scanned[:-1]]
+        self.sensing.add_motion(everyone, after, now)
         plans, goals = self.navigation.plans_m, self.navigation.goals_m
         offset = add_route(task, after, plans, goals)
         progress = now["route_remaining_m"] - after["route_remaining_m"]

@@ -7,7 +7,6 @@ noise of a perturbation. All noise of an episode is drawn when it begins, from i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -19,9 +18,11 @@ from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.surroundings import (
     PLAN_PARTS,
+    SCANNED,
     came_nearer,
     plan_distances_m,
     returns_on_plan,
+    steps_remembered,
 )
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
@@ -36,7 +37,7 @@ _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 class Sensing(Stateful):
     """The sensors of N robots."""
 
-    STATE = ("ranges_m", "pose", "pose_stamp_ns", "true_clearance_m")
+    STATE = ("ranges_m", "pose", "pose_stamp_ns", "true_clearance_m", "scanned")
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task
@@ -54,6 +55,13 @@ class Sensing(Stateful):
         self._dropout_beyond = np.full(num, np.inf)
         self.ranges_m = np.zeros((num, simulation.beams))  # as measured at the last step
         self.true_clearance_m = np.zeros(num)
+        scan: Signals = {name: np.zeros(num) for name in SCANNED}
+        scan["sector_clearance_m"] = np.zeros((num, task.sectors))
+        scan["stamp_ns"] = np.zeros(num, np.int64)
+        self.scanned: list[Signals] = [  # of the steps before, the last one first
+            {name: column.copy() for name, column in scan.items()}
+            for _ in range(steps_remembered(task))
+        ]
 
     def reset(self, env: int, seeds: np.random.SeedSequence, perturbation: Perturbation) -> None:
         """Draw an episode's noise."""
@@ -135,17 +143,22 @@ class Sensing(Stateful):
             "command_yaw_rate_radps": sim.controller.commands[ids, 0, 1].copy(),
         }
 
+    def add_motion(self, ids: Ints, signals: Signals, before: Signals | None = None) -> None:
+        """Speeds from the last two localised poses, and who came nearer.
 
-def add_motion(task: Task, signals: Signals, earlier: Sequence[Signals] = ()) -> None:
-    """Speeds from the last two localised poses, and who came nearer.
-
-    `earlier` are the steps before, the last one first; at an episode's first step there are none,
-    and speeds are the wheels'.
-    """
-    before = earlier or [signals]
-    forward, lateral = localised_velocity(signals, before[0])
-    signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
-    signals["came_nearer_m"] = came_nearer(task, signals, before)
+        Of all robots at once; of `ids` (n,) at their episodes' first step, where there is none
+        `before`: speeds are the wheels', and nobody came.
+        """
+        forward, lateral = localised_velocity(signals, signals if before is None else before)
+        signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
+        if before is None:
+            for scan in self.scanned:
+                for name, column in scan.items():
+                    column[ids] = signals[name]
+            signals["came_nearer_m"] = came_nearer(self.task, signals, [signals])
+            return
+        signals["came_nearer_m"] = came_nearer(self.task, signals, self.scanned)
+        self.scanned = [{name: signals[name].copy() for name in SCANNED}, *self.scanned[:-1]]
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
