@@ -65,11 +65,16 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     came = np.full(len(row), np.inf)
     after = now
     for before in earlier:
+        if not len(row):
+            break
         x, y = _seen_from(before, after, row, x, y)
         x_of_lidar = x - lever
         place = ((np.arctan2(y, x_of_lidar) + np.pi) * (count / (2 * np.pi))).astype(np.intp)
-        farther = _farthest_free(before["sector_clearance_m"] + reach, task.range_max_m + reach)
-        gain = farther[row, np.minimum(place, count - 1)] - np.hypot(x_of_lidar, y)
+        around = (np.minimum(place, count - 1)[:, None] + (-1, 0, 1)) % count
+        seen = before["sector_clearance_m"][row[:, None], around]
+        seen = np.where(seen < task.range_max_m - 1e-6, seen + reach[around], np.inf)
+        farther = seen.min(axis=1)
+        gain = np.where(np.isinf(farther), 0.0, farther - np.hypot(x_of_lidar, y))
         came = np.minimum(came, gain)
         left = came > 0
         row, x, y, came = row[left], x[left], y[left], came[left]
@@ -92,16 +97,6 @@ def _seen_from(before: Signals, after: Signals, row: Ints, x: F64, y: F64) -> tu
     moved_x, moved_y = forward * half_cos - left * half_sin, forward * half_sin + left * half_cos
     cos, sin = np.cos(turn)[row], np.sin(turn)[row]
     return moved_x[row] + cos * x - sin * y, moved_y[row] + sin * x + cos * y
-
-
-def _farthest_free(seen: F64, nothing: F64) -> F64:
-    """The nearest return (N, K) of each sector and the two beside it; -inf where there is none.
-
-    `nothing` (K,) is what a sector says in which no beam came back.
-    """
-    known = np.where(seen < nothing - 1e-6, seen, np.inf)
-    least = np.minimum(np.minimum(np.roll(known, 1, axis=1), known), np.roll(known, -1, axis=1))
-    return np.where(np.isinf(least), -np.inf, least)
 
 
 def plan_distances_m(task: Task) -> tuple[float, ...]:
