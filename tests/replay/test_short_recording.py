@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,19 @@ def test_every_shipped_mixture_packs_one_episode(name: str, tmp_path: Path, caps
     assert cli.main(["audit", str(store), "--panel", str(tmp_path / "panel"), "--json"]) in (0, 1)
     found = {one["audit"]: one for one in json.loads(capsys.readouterr().out)["audits"]}
     assert found["leakage"]["status"] == "pass"
+
+
+def test_what_is_short_is_told_as_shares_of_the_batch_that_logs_get_less_of(
+    tmp_path: Path, capsys
+) -> None:
+    """Of few rows a stratum may be short, and yet more of them than was wanted."""
+    store = write_store(tmp_path / "store", [drive(50)], task=TASK)
+    assert cli.main(["mix", str(store), "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"logs get \d\.\d% of a batch, not 50\.0%", said)
+    short = re.findall(r"short of rows \((.*)% of a batch wanted, (.*)% drawn\)", said)
+    assert len(short) >= 4
+    assert all(float(drawn) < float(wanted) <= 20 for wanted, drawn in short)
 
 
 def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, capsys) -> None:

@@ -211,13 +211,19 @@ def _missing(line: dict[str, Any]) -> str:
 
 
 def _summary(document: dict[str, Any]) -> list[str]:
+    # Where the logs get less of a batch than is wanted, a short stratum may be more of them.
+    given, wanted = document["logs_share"], document["logs_share_wanted"]
+    fewer = given < wanted - 1e-9
+    if not fewer:
+        given = wanted = 1.0
     lines = [
-        f"{line['stratum']}: {line['note']} ({line['wanted_share']:.1%} wanted,"
-        f" {line['share']:.1%} drawn){_missing(line)}"
+        f"{line['stratum']}: {line['note']} ({line['wanted_share'] * wanted:.1%}"
+        f"{' of a batch' if fewer else ''} wanted, {line['share'] * given:.1%} drawn)"
+        f"{_missing(line)}"
         for line in document["strata"]
         if line["note"]
     ]
-    if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
+    if fewer:
         lines.append(
             f"logs get {document['logs_share']:.1%} of a batch, not"
             f" {document['logs_share_wanted']:.1%}: their rows allow no more"
