@@ -24,6 +24,8 @@ from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import losses
 from restock.report.run.logs_alone import table as off_policy_table
 
+_YEARS_FROM_DAYS = 512  # ages are in years from there on
+
 
 def success(facts: Facts) -> Section | None:
     if not facts.cells:
@@ -136,7 +138,7 @@ def sampled(facts: Facts) -> Section:
             Figure(
                 charts.ages(_age_rows(facts)),
                 "How old the sampled rows were",
-                f"Logs age by the calendar (days before training began{_newest(facts)}); fresh"
+                f"Logs age by the calendar (before training began{_newest(facts)}); fresh"
                 " rows by environment steps since they were collected. The two are never pooled.",
             )
         )
@@ -163,7 +165,8 @@ def _newest(facts: Facts) -> str:
     if facts.panel is None or began_ns is None:
         return ""
     days = (began_ns - facts.panel.header.newest_ns) / DAY_NS
-    return f"; the panel's newest row was {days:,.1f} days old then"
+    age = f"{days:,.1f} days" if days < _YEARS_FROM_DAYS else f"{days / 365.25:.1f} years"
+    return f"; the panel's newest row was {age} old then"
 
 
 def _age_rows(facts: Facts) -> Rows:
@@ -184,7 +187,7 @@ def _age_rows(facts: Facts) -> Rows:
 
 def _span(low: int, unit: str) -> str:
     """From `low` to twice that, as a label: days of years as those."""
-    if unit == "d" and low >= 512:
+    if unit == "d" and low >= _YEARS_FROM_DAYS:
         return f"{low / 365.25:.1f} to {2 * low / 365.25:.1f} y"
     return f"{_short(low)} to {_short(2 * low)} {unit}"
 
