@@ -36,6 +36,9 @@ def pad_plans(plans: Sequence[NDArray[Any]]) -> F64:
     return padded
 
 
+ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
+
+
 def view_route(
     plans_m: F64, pose_x_m: F64, pose_y_m: F64, pose_yaw_rad: F64, distances_m: Sequence[float]
 ) -> RouteView:
@@ -57,7 +60,9 @@ def view_route(
     along = np.minimum(np.maximum(along, 0.0), 1.0)
     gap_x, gap_y = off_x - along * step_x, off_y - along * step_y
     distance2 = gap_x * gap_x + gap_y * gap_y
-    nearest = np.argmin(distance2, axis=1)  # (N,)
+    # Where a plan comes by twice it is at the first time, whatever rounding makes of the two.
+    least = distance2.min(axis=1, keepdims=True)
+    nearest = np.argmax(distance2 <= least + ROUNDING * (least + 0.1), axis=1)  # (N,), the first
     rows = np.arange(len(plans_m))
     here = arc[rows, nearest] + along[rows, nearest] * length[rows, nearest]
     total = arc[:, -1]

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from restock.ingest.task.route import pad_plans, view_route
@@ -52,7 +52,11 @@ coordinate = st.floats(-20, 20)
 plans = st.lists(st.tuples(coordinate, coordinate), min_size=1, max_size=8)
 
 
+TWICE_AT_THE_ORIGIN = [(7.203125, 0.0), (-1.0, 0.0), (0.0, 2.0**-23), (0.0, 0.0)]
+
+
 @given(st.lists(plans, min_size=1, max_size=4), coordinate, coordinate, st.floats(-4, 4))
+@example([[(0.0, 0.0)] * 6, TWICE_AT_THE_ORIGIN], 0.0, 0.0, 0.0)
 def test_padding_changes_nothing(several, x, y, yaw):
     count = len(several)
     arrays = [np.asarray(plan, float) for plan in several]
