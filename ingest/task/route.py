@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
+ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
+
 
 @dataclass(frozen=True)
 class RouteView:
@@ -34,9 +36,6 @@ def pad_plans(plans: Sequence[NDArray[Any]]) -> F64:
         row[: len(plan)] = plan
         row[len(plan) :] = plan[-1]
     return padded
-
-
-ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
 
 
 def view_route(
