@@ -65,8 +65,8 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
     _of_lidar(
         "came_nearer_m",
-        "how far something within 2 m came nearer since the step before, and than in the last"
-        " second, the robot's own motion taken off; 0: nothing",
+        "how far something within 2 m came nearer since the step before, and than it was seen in"
+        " the last second, the robot's own motion taken off; 0: nothing",
     ),
     _of_lidar(
         "plan_return_m",

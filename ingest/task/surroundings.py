@@ -19,9 +19,7 @@ from restock.ingest.task.task import Task
 
 NEAR_M = 2.0  # of clearance, for who comes nearer
 REMEMBERED_S = 1.0  # what was seen that long ago was there already
-FASTEST_MPS = (
-    2.0  # that anybody walks toward the robot: a return that jumps farther was hidden before
-)
+FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden before
 LEAST_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead

@@ -5,6 +5,7 @@
 -- the first 1.6 s of an episode nothing says that it stays. It takes clear evidence within 1 s, and
 -- holds on through gaps.
 -- Weights: a logistic regression; `python benchmarks/labels.py --cache FOLDER --fit blocked_aisle`.
+-- That of someone_m was raised by hand, on two logs, when edges and lost beams ceased to count in it.
 -- timing: pre
 -- priority: 40
 -- uncertain: 0.2 to 0.8
