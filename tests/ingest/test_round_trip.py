@@ -40,11 +40,12 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
+from restock.train.twin.env.operator_policy import Operator
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
 from restock.train.twin.recording.fleet import DrivenMission, Fleet
-from restock.train.twin.recording.missions import HANDOVER, Mission, schedule
+from restock.train.twin.recording.missions import HANDOVER, VERSIONS, Mission, schedule
 from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record
 from restock.train.twin.recording.robot_topics import TOPICS
@@ -155,7 +156,9 @@ class Trip:
 
 
 def _missions(plan: RecordingPlan, policy: Any) -> Any:
-    driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
+    driver, version = plan.policy, VERSIONS.get(plan.policy, "1")
+    if policy is not None:
+        driver, version = policy.name, policy.version
     return schedule(plan.seed, plan.conditions, driver, plan.hardware, version=version)
 
 
@@ -270,7 +273,10 @@ def test_missions_come_in_their_order_each_with_its_driver(trip: Trip) -> None:
     for driven in trip.driven:
         drivers = {(name, version) for name, version, _ in driven.drive.policy}
         assert (driven.mission.driver, driven.mission.version) in drivers
-        assert drivers <= {(driven.mission.driver, driven.mission.version), ("operator", "1")}
+        assert drivers <= {
+            (driven.mission.driver, driven.mission.version),
+            ("operator", Operator.version),
+        }
         assert driven.drive.plans[0][1][-1] == pytest.approx(driven.drive.goal_m)
     if isinstance(trip.case.hardware, Schedule):
         drawn = {_parameters(mission).latency_s for mission in trip.missions}

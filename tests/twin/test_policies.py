@@ -16,10 +16,14 @@ from restock.train.twin.physics.episode import EpisodeSpec
 
 
 def success(
-    policy: BehaviourPolicy, kind: str, count: int = 24, task: Task | None = None
+    policy: BehaviourPolicy,
+    kind: str,
+    count: int = 24,
+    task: Task | None = None,
+    layouts: str = "default",
 ) -> dict[str, float]:
     """Success by block kind ('none' outside blocked aisles), over fixed episodes."""
-    env = WarehouseVectorEnv(count, task=task)
+    env = WarehouseVectorEnv(count, task=task, layouts=layouts)
     env.set_episodes([EpisodeSpec(kind, 500 + index) for index in range(count)])
     observation, _ = env.reset(seed=0)
     result: dict[int, tuple[str, bool]] = {}
@@ -48,6 +52,30 @@ KINDS = ["near_collision", "wheel_slip", "blocked_aisle", "nominal"]
 def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
     # 24 episodes: 4 to 10 points of noise below what benchmarks/drivers.py asks over 100.
     assert min(success(Operator(), kind).values()) >= 0.8
+
+
+@pytest.mark.parametrize("layouts", ["default", "generated:test"])
+def test_the_operator_gets_past_pallets(layouts: str) -> None:
+    """Through the gap where there is one, and around where there is none, on floors of any kind."""
+    passed = success(Operator(epsilon=0.0), "blocked_aisle", layouts=layouts)
+    assert min(passed.values()) >= 0.9
+
+
+def test_an_operator_goes_on_as_it_was_from_its_state() -> None:
+    """Its lattices are not kept: another process makes the same again."""
+    env = WarehouseVectorEnv(4, conditions={"blocked_aisle": 1.0}, layouts="generated:test")
+    observation, _ = env.reset(seed=4)
+    first = Operator(seed=6)
+    for _ in range(25):
+        observation, *_ = env.step(first.act(env, observation)[0])
+    second = Operator(seed=1)
+    second.load_state_dict(first.state_dict())
+    assert first._lattices
+    assert not second._lattices
+    for _ in range(25):
+        action = first.act(env, observation)[0]
+        np.testing.assert_array_equal(action, second.act(env, observation)[0])
+        observation, *_ = env.step(action)
 
 
 def test_the_operator_of_a_fast_robot_comes_over_slippery_floor() -> None:

@@ -25,6 +25,8 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
+from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
 from restock.train.twin.recording.recorder import (
     HARDWARE,
@@ -59,7 +61,8 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
 @pytest.mark.parametrize("policy", ["planner", "operator"])
 def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
     summary = record(tmp_path / "log.mcap", RecordingPlan(missions=1, seed=3, policy=policy))
-    assert set(summary.policies) == {f"{policy} 1"}
+    version = {"planner": PlannerFollower, "operator": Operator}[policy].version
+    assert set(summary.policies) == {f"{policy} {version}"}
     assert summary.succeeded["nominal"] == summary.missions["nominal"] == 1
 
 

@@ -90,21 +90,44 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> F64 | None:
-        """A plan past boxes (K, 3) (x, y, yaw) that the map does not know; None: no way.
+        """A plan past boxes as `graph_around` takes them; None where there is no way. Not cached.
 
-        For those who see more than the robot does. Not cached.
+        Without boxes it is that of `plan`.
         """
-        clearance = self._clearance_m
-        for x, y, yaw in boxes:
-            gap = box_distance(*_cell_middles(self.shape), (x, y), half_m, yaw)
-            clearance = np.minimum(clearance, gap)
-        graph = self._build_graph(clearance)
+        if not len(boxes):
+            return self.plan(x_m, y_m, goal)
+        graph = self.graph_around(x_m, y_m, goal, boxes, half_m)
         distance, before = csgraph.dijkstra(
             graph, indices=self.cell(*goal), return_predecessors=True
         )
         cell = self.cell(x_m, y_m)
         start = cell if np.isfinite(distance[cell]) else self._nearest(cell, distance)
         return self._read_off(start, before, goal) if start >= 0 else None
+
+    def graph_around(
+        self,
+        x_m: float,
+        y_m: float,
+        goal: tuple[float, float],
+        boxes: F64,
+        half_m: tuple[float, float],
+    ) -> sparse.csr_matrix:
+        """Cells joined at the cost of driving between them past boxes (K, 3) (x, y, yaw) that
+        the map does not know; edges run against the robot's way, in weighted metres.
+
+        For those who see more than the robot does: without one-way rules where boxes leave no
+        other way from a place to the goal, as in `plan`. Not cached.
+        """
+        clearance = self._clearance_m
+        for x, y, yaw in boxes:
+            gap = box_distance(*_cell_middles(self.shape), (x, y), half_m, yaw)
+            clearance = np.minimum(clearance, gap)
+        graph = self._build_graph(clearance)
+        cell = self.cell(x_m, y_m)
+        if self._unruled is None or clearance.flat[cell] < self.warehouse.room_m:
+            return graph
+        distance = csgraph.dijkstra(graph, indices=self.cell(*goal))
+        return graph if np.isfinite(distance[cell]) else self._unruled._build_graph(clearance)
 
     def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
         """From a cell along the tree to the goal, smoothed and resampled."""
@@ -113,7 +136,7 @@ class Planner:
             cells.append(int(before[cells[-1]]))
         way = np.stack(np.unravel_index(np.array(cells), self.shape), axis=-1) * CELL_M + CELL_M / 2
         way[-1] = goal
-        return _resample(_smooth(way))
+        return smooth_plan(way)
 
     def distance_m(self, x_m: float, y_m: float, goal: tuple[float, float]) -> float:
         """Cost-weighted length of the way to the goal on the known map; inf where there is none."""
@@ -258,6 +281,11 @@ def box_distance(
     outside_y = np.maximum(np.abs(cos * dy - sin * dx) - half[1], 0.0)
     distance: F64 = np.hypot(outside_x, outside_y)
     return distance
+
+
+def smooth_plan(way: NDArray[Any]) -> F64:
+    """A plan (PLAN_POINTS, 2) along the cells' middles (C, 2) of a way."""
+    return _resample(_smooth(way))
 
 
 def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:

@@ -13,6 +13,8 @@ import numpy as np
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionsFile, as_toml
 from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
@@ -22,7 +24,8 @@ SCRIPTED = (HANDOVER, "planner", "operator", "random")
 NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_collision": 0.06}
 # How the fleet is driven: the planner (and its next release, on a few robots), whom an operator
 # helps out, and missions that an operator drives throughout.
-FLEET = {"planner 1": 0.70, "planner 2": 0.18, "operator 1": 0.12}
+FLEET = {"planner 1": 0.70, "planner 2": 0.18, f"operator {Operator.version}": 0.12}
+VERSIONS = {one.name: one.version for one in (PlannerFollower, Operator, RandomPolicy)}
 BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
 
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
@@ -202,6 +205,7 @@ def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float
 __all__ = [
     "FLEET",
     "NATURAL",
+    "VERSIONS",
     "Mission",
     "OrderedMissions",
     "meets",

@@ -39,6 +39,7 @@ from restock.train.twin.recording.missions import (
     HANDOVER,
     NATURAL,
     SCRIPTED,
+    VERSIONS,
     Mission,
     OrderedMissions,
     meets,
@@ -255,7 +256,9 @@ def record(
     )
     robot = _robot(plan, fleet)
     summary = RecordingSummary(path, plan)
-    driver, version = (plan.policy, "1") if policy is None else (policy.name, policy.version)
+    driver, version = plan.policy, VERSIONS.get(plan.policy, "1")
+    if policy is not None:
+        driver, version = policy.name, policy.version
     missions: OrderedMissions | Iterator[Mission]
     if isinstance(plan.missions, MissionsFile):
         missions = OrderedMissions(

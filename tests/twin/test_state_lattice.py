@@ -1,0 +1,130 @@
+"""The state lattice: which gaps the body fits through, and how it must stand to do so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.layout import Warehouse, default_warehouse
+from restock.train.twin.floors.planner import Planner
+from restock.train.twin.floors.state_lattice import (
+    Motion,
+    StateLattice,
+    lattice_around,
+    rectangle,
+)
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, length_m
+from restock.train.twin.physics.model import PALLET_HALF_M
+
+FLOOR = default_warehouse()
+AISLE = FLOOR.segments[1].area  # aisle 1 east: x from west to east
+BODY = Motion(rectangle(0.7, 0.5), ahead_mps=1.0, back_mps=0.4, turn_radps=1.2)
+GOAL = (AISLE.x_max + 1.2, AISLE.center[1])  # in the cross-aisle behind it
+
+
+def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GOAL) -> StateLattice:
+    """Aisle 1 east with a pallet against its north rack, and so much room south of it."""
+    half = np.array([[0.6, (AISLE.y_max - AISLE.y_min - gap_m) / 2]])
+    box = np.array([[AISLE.center[0], AISLE.y_max - half[0, 1], 0.0]])
+    planner = Planner(FLOOR)
+    start = (AISLE.x_min + 0.2, AISLE.center[1])
+    graph = planner.graph_around(*start, goal, box, (half[0, 0], half[0, 1]))
+    return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, 2.3)
+
+
+def test_outlines_are_about_the_axle() -> None:
+    outline = rectangle(0.8, 0.4, axle_x_m=0.1, points=3)
+    assert len(outline) == len(np.unique(outline, axis=0)) == 8
+    assert outline[:, 0].min() == pytest.approx(-0.5)
+    assert outline[:, 0].max() == pytest.approx(0.3)
+    assert np.abs(outline[:, 1]).max() == pytest.approx(0.2)
+
+
+def test_a_wide_gap_is_driven_through_and_a_narrow_one_gone_around() -> None:
+    start = (AISLE.x_min + 0.2, AISLE.center[1], 0.0)
+    through, around = with_gap(0.9).plan(*start), with_gap(0.45).plan(*start)
+    assert through is not None
+    assert around is not None
+    assert length_m(through) < 1.2 * (GOAL[0] - start[0])
+    assert length_m(around) > 2.0 * length_m(through)
+    for plan in (through, around):
+        np.testing.assert_allclose(plan[-1], GOAL)
+        assert np.hypot(*(plan[0] - start[:2])) < 0.15
+
+
+def test_a_gap_that_fits_the_width_alone_must_be_entered_straight() -> None:
+    """.75 m: the body's .7 x .5 m pass in line with the gap, and not askew."""
+    lattice = with_gap(0.75)
+    in_gap = (AISLE.center[0], AISLE.y_min + 0.375)
+    straight, askew = (lattice.time_s(np.array([*in_gap, yaw])) for yaw in (0.0, 1.2))
+    assert askew > straight + 0.5
+    assert lattice.time_s(np.array([*in_gap, np.pi])) > straight  # it would have to back out
+
+
+def test_the_time_shrinks_along_the_plan() -> None:
+    lattice = with_gap(0.9)
+    plan = lattice.plan(AISLE.x_min + 0.2, AISLE.center[1], 0.0)
+    assert plan is not None
+    step = np.diff(plan, axis=0)
+    yaw = np.arctan2(step[:, 1], step[:, 0])
+    poses = np.column_stack([plan[:-1], yaw])[8:-8:4]
+    inside = [lattice.window.covers(x, y) for x, y, _ in poses]
+    times = lattice.time_s(poses[inside])
+    assert len(times) > 4
+    assert (np.diff(times) < 0.05).all()  # the plan is smoothed, the tree is not
+    assert times[-1] < times[0] - 2.0
+
+
+def test_at_the_goal_no_time_is_left_and_a_slower_robot_takes_longer() -> None:
+    inside = (AISLE.x_max - 0.3, AISLE.center[1])
+    assert with_gap(0.9, goal=inside).time_s(np.array([*inside, 1.0])) < 0.3
+    slow = Motion(BODY.outline_m, ahead_mps=0.25, back_mps=0.1, turn_radps=0.3)
+    pose = np.array([AISLE.x_min + 0.2, AISLE.center[1], 0.0])
+    assert with_gap(0.9, slow).time_s(pose) == pytest.approx(4 * with_gap(0.9).time_s(pose))
+
+
+def test_headings_are_the_same_all_the_way_round() -> None:
+    lattice = with_gap(0.9)
+    yaw = np.linspace(-np.pi, np.pi, 33)
+    poses = np.column_stack([np.full_like(yaw, AISLE.x_min + 0.6), np.full_like(yaw, 0.9), yaw])
+    turned = poses + np.array([0.0, 0.0, 2 * np.pi])
+    np.testing.assert_allclose(lattice.time_s(poses), lattice.time_s(turned), atol=1e-9)
+    assert np.isfinite(lattice.times_s).all()
+
+
+def test_where_a_rule_leaves_no_way_around_a_block_it_is_broken() -> None:
+    """As plans do: behind a block in a one-way aisle a goal is reached against its heading."""
+    broken = 0
+    for floor in open_floors("generated:test")[:24]:
+        if not floor.one_way:
+            continue
+        planner = Planner(floor)
+        for seed in range(40):
+            episode = draw_episode(EpisodeSpec("blocked_aisle", seed), floor, planner)
+            if episode.block != "full":
+                continue
+            pallets = episode.pallets[episode.pallets[:, 0] > 0]
+            start = episode.start[:2]
+            plan = planner.plan_around(*start, episode.goal, pallets, PALLET_HALF_M[:2])
+            assert plan is not None
+            assert clear_of(plan, pallets)
+            broken += against(floor, plan)
+    assert broken > 0
+
+
+def clear_of(plan: np.ndarray, pallets: np.ndarray) -> bool:
+    """Whether no point of a plan lies within a pallet's inner circle."""
+    gap = np.hypot(*(plan[:, None] - pallets[None, :, :2]).transpose(2, 0, 1))
+    return bool(gap.min() > min(PALLET_HALF_M[:2]))
+
+
+def against(floor: Warehouse, plan: np.ndarray) -> bool:
+    """Whether a plan runs against a one-way rule for half a metre."""
+    along = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
+    step = np.diff(plan, axis=0)
+    for rule in floor.one_way:
+        inside = [rule.area.contains(x, y) for x, y in plan[:-1]]
+        if (step @ np.array(along[rule.heading]))[inside].clip(max=0.0).sum() < -0.5:
+            return True
+    return False

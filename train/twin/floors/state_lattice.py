@@ -1,0 +1,333 @@
+"""The time to a goal from every pose near obstacles, and the plan that takes it: a state lattice.
+
+A plan on the map is a way for a point. Whether the robot's outline comes through a gap, and how it
+must stand before it, a search over places and headings says (state lattices: Pivtoraiko and Kelly,
+2005): within a window around the obstacles over cells of .1 m and 16 headings, outside it over the
+planner's cells, both in one Dijkstra tree from the goal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from restock.arrays import F64, Bools, Ints
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.planner import CELL_M, smooth_plan
+
+# A step to a neighbouring cell for each of 16 headings, counter-clockwise from east.
+_QUARTER = [(1, 0), (2, 1), (1, 1), (1, 2)]
+STEPS = [*_QUARTER, *((-y, x) for x, y in _QUARTER)]
+STEPS += [(-x, -y) for x, y in STEPS]
+HEADINGS_RAD = np.array([np.arctan2(y, x) % (2 * np.pi) for x, y in STEPS])
+_ROUND_RAD = np.append(HEADINGS_RAD, 2 * np.pi)
+TOUCH_M = 0.06  # a pose whose outline comes nearer to anything is not free
+NEAR_M, NEAR_COST = 0.25, 2.0  # within this clearance a step costs up to so many times more
+ARC = 0.35  # of the time to turn on the spot, that the same turn takes while driving
+OFF_COST_S = 0.5  # a cell that a pose lies off the free ones
+_FIELD_M = 0.05  # cells of the clearance that outlines are looked up in
+_NO_WAY_S = 60.0  # of a heading without any free state
+BORDER_CELLS = 2  # along a window's sides, where the floor's cells go on
+ENTER_RAD = 0.6  # the turn that coming in costs: outside, where a cell has no heading, none does
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a lattice must know of a robot that turns on the spot: its outline and speeds."""
+
+    outline_m: F64  # (K, 2) points on its outline, x ahead of the pose
+    ahead_mps: float
+    back_mps: float  # 0: it does not drive backwards
+    turn_radps: float  # on the spot
+
+
+def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: int = 5) -> F64:
+    """Points on a rectangle's outline, (4 * points - 4, 2), about an axle ahead of its middle."""
+    side = np.linspace(-1.0, 1.0, points)[:-1]
+    one = np.ones_like(side)
+    corners = np.concatenate(
+        [
+            np.stack(pair, axis=-1)
+            for pair in ((one, side), (-side, one), (-one, -side), (side, -one))
+        ]
+    )
+    return corners * (length_m / 2, width_m / 2) - (axle_x_m, 0.0)
+
+
+@dataclass(frozen=True)
+class Window:
+    """The cells of a floor that a lattice spans."""
+
+    low: Ints  # (2,) the first
+    high: Ints  # (2,) behind the last
+    floor: tuple[int, int]  # the floor's own number of cells
+
+    @classmethod
+    def around(cls, places_m: F64, reach_m: float, floor: tuple[int, int]) -> Window:
+        """All within `reach_m` of places (K, 2), along both axes, that is on the floor."""
+        low = np.floor((places_m.min(axis=0) - reach_m) / CELL_M).astype(np.int64)
+        high = np.ceil((places_m.max(axis=0) + reach_m) / CELL_M).astype(np.int64)
+        return cls(np.maximum(low, 0), np.minimum(high, floor), floor)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        nx, ny = (self.high - self.low).tolist()
+        return nx, ny
+
+    @property
+    def cells(self) -> Ints:
+        """The floor's indices (nx, ny) of its cells."""
+        x, y = (np.arange(self.low[axis], self.high[axis]) for axis in range(2))
+        return np.asarray(x[:, None] * self.floor[1] + y)
+
+    @property
+    def border(self) -> Bools:
+        """Its cells (nx, ny) along those sides that are not the floor's."""
+        border = np.ones(self.shape, np.bool_)
+        first = np.where(self.low > 0, BORDER_CELLS, 0)
+        last = self.shape - np.where(self.high < self.floor, BORDER_CELLS, 0)
+        border[first[0] : last[0], first[1] : last[1]] = False
+        return border
+
+    def covers(self, x_m: float, y_m: float) -> bool:
+        """Whether a place lies within it, off its border."""
+        margin = (BORDER_CELLS + 1) * CELL_M
+        place = np.array([x_m, y_m])
+        inside = (self.low == 0) | (place > self.low * CELL_M + margin)
+        inside &= (self.high == self.floor) | (place < self.high * CELL_M - margin)
+        return bool(inside.all())
+
+
+@dataclass(frozen=True)
+class StateLattice:
+    """Time to the goal from every pose of a window, and plans there from anywhere."""
+
+    window: Window
+    times_s: F64  # (nx, ny, 17) at the middles of cells; the last heading is the first again
+    goal: tuple[float, float]
+    _before: Ints  # (cells + states + 1,) the next node on the way; below 0: none
+
+    def time_s(self, poses: F64) -> F64:
+        """Time (...) from poses (..., 3): x, y, heading; between states it is interpolated."""
+        corner, share = [], []
+        for value, count in zip(self._place(poses), self.times_s.shape, strict=True):
+            value = np.clip(value, 0.0, count - 1.001)
+            corner.append(value.astype(np.int64))
+            share.append(value - corner[-1])
+        total = np.zeros(poses.shape[:-1])
+        for bits in np.ndindex(2, 2, 2):
+            weight = np.ones_like(total)
+            for part, bit in zip(share, bits, strict=True):
+                weight *= part if bit else 1.0 - part
+            i, j, k = (first + bit for first, bit in zip(corner, bits, strict=True))
+            total += weight * self.times_s[i, j, k]
+        return total
+
+    def plan(self, x_m: float, y_m: float, yaw_rad: float) -> F64 | None:
+        """The plan (PLAN_POINTS, 2) from a pose; None where no way leads to the goal."""
+        node = self._nearest(x_m, y_m, yaw_rad)
+        if node < 0:
+            return None
+        way = []
+        while node < len(self._before) - 1:
+            way.append(self._middle(node))
+            node = int(self._before[node])
+        places = np.array([*way, self.goal])
+        moved = np.any(np.diff(places, axis=0) != 0.0, axis=1)
+        return smooth_plan(places[np.append(moved, True)])
+
+    def _nearest(self, x_m: float, y_m: float, yaw_rad: float) -> int:
+        """The node nearest to a pose from which there is a way, within .6 m; -1: none."""
+        inside = self.window.covers(x_m, y_m)
+        pose = np.array([x_m, y_m, yaw_rad])
+        x, y, turned = (float(value) for value in self._place(pose))
+        size = self.window.shape if inside else self.window.floor
+        if not inside:
+            x, y = x + float(self.window.low[0]), y + float(self.window.low[1])
+        near = [
+            np.arange(max(round(at) - 6, 0), min(round(at) + 7, count))
+            for at, count in zip((x, y), size, strict=True)
+        ]
+        i, j = (part.ravel() for part in np.meshgrid(*near, indexing="ij"))
+        nodes = i * size[1] + j
+        if inside:
+            nodes = (
+                nodes * len(STEPS) + round(turned) % len(STEPS) + int(np.prod(self.window.floor))
+            )
+        gap = np.where(self._before[nodes] < 0, np.inf, np.hypot(i - x, j - y))
+        return int(nodes[gap.argmin()]) if np.isfinite(gap).any() else -1
+
+    def _place(self, poses: F64) -> list[F64]:
+        """Poses (..., 3) in cells and headings of the window."""
+        turned = np.interp(poses[..., 2] % (2 * np.pi), _ROUND_RAD, np.arange(len(_ROUND_RAD)))
+        return [*(poses[..., a] / CELL_M - 0.5 - self.window.low[a] for a in range(2)), turned]
+
+    def _middle(self, node: int) -> tuple[float, float]:
+        nx, ny = self.window.floor
+        if node < nx * ny:
+            cell = np.array(divmod(node, ny))
+        else:
+            i, j, _ = np.unravel_index(node - nx * ny, (*self.window.shape, len(STEPS)))
+            cell = self.window.low + np.array([i, j])
+        x, y = ((cell + 0.5) * CELL_M).tolist()
+        return x, y
+
+
+def lattice_around(
+    floor: Warehouse,
+    graph: sparse.csr_matrix,
+    boxes: F64,
+    half_m: F64,
+    goal: tuple[float, float],
+    goal_radius_m: float,
+    motion: Motion,
+    reach_m: float,
+) -> StateLattice:
+    """A lattice about boxes (K, 2) of half sizes (K, 2), with `reach_m` around their middles.
+
+    `graph` joins the floor's cells past the boxes, in metres, against the robot's way
+    (`Planner.graph_around`): outside the window it goes on with that.
+    """
+    size = round(floor.width_m / CELL_M), round(floor.depth_m / CELL_M)
+    window = Window.around(boxes, reach_m, size)
+    room = _room(floor, boxes, half_m, window, motion.outline_m)
+    free = room > TOUCH_M
+    cost = 1.0 + NEAR_COST * np.clip(1.0 - room / NEAR_M, 0.0, 1.0)
+    edges = [_outside(graph, window, motion), _inside(free, cost, motion, graph.shape[0])]
+    edges += [
+        _across(free, window, motion, graph.shape[0]),
+        _arrivals(free, window, goal, goal_radius_m),
+    ]
+    from_, to, time_s = (np.concatenate(parts) for parts in zip(*edges, strict=True))
+    nodes = graph.shape[0] + free.size + 1
+    joined = sparse.csr_matrix((time_s, (to, from_)), shape=(nodes, nodes))
+    times, before = csgraph.dijkstra(joined, indices=nodes - 1, return_predecessors=True)
+    times = times[graph.shape[0] : -1].reshape(free.shape)
+    filled = np.stack([_filled(times[..., k]) for k in range(len(STEPS))], axis=-1)
+    filled = np.concatenate([filled, filled[..., :1]], axis=-1)
+    before = before.astype(np.int64)
+    before[-1] = nodes  # the root: behind all
+    return StateLattice(window, filled, goal, before)
+
+
+Edges = tuple[Ints, Ints, F64]  # from and to in the robot's way, and the seconds
+
+
+def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
+    """Between cells of the floor, but within the window."""
+    within = np.zeros(graph.shape[0], np.bool_)
+    within[window.cells[~window.border]] = True
+    way = graph.tocoo()
+    kept = ~(within[way.row] | within[way.col])
+    return way.col[kept], way.row[kept], way.data[kept] / motion.ahead_mps
+
+
+def _across(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
+    """Between states and cells along the window's border."""
+    enter_s = ENTER_RAD / motion.turn_radps
+    at = np.flatnonzero(window.border[..., None] & free)
+    cell = window.cells.ravel()[at // free.shape[2]]
+    leave, enter = np.full(len(at), 1e-9), np.full(len(at), enter_s)
+    return np.append(at + cells, cell), np.append(cell, at + cells), np.append(leave, enter)
+
+
+def _arrivals(
+    free: Bools, window: Window, goal: tuple[float, float], goal_radius_m: float
+) -> Edges:
+    """From states and cells at the goal to the root, the last node."""
+    nx, ny = window.floor
+    x, y = (CELL_M * (np.arange(window.low[a], window.high[a]) + 0.5) for a in range(2))
+    near = np.hypot(x[:, None] - goal[0], y - goal[1]) < max(goal_radius_m - CELL_M, CELL_M)
+    states = np.flatnonzero(near[..., None] & free) + nx * ny
+    cell = min(int(goal[0] / CELL_M), nx - 1) * ny + min(int(goal[1] / CELL_M), ny - 1)
+    at = np.append(states, cell)
+    return at, np.full(len(at), nx * ny + free.size), np.full(len(at), 1e-9)
+
+
+def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
+    """Between the states of the window, whose nodes follow those of the cells."""
+    nx, ny, headings = free.shape
+    index = np.arange(free.size).reshape(free.shape)
+    edges: list[Edges] = []
+
+    def join(from_: Ints, to: Ints, seconds: float, *, back: float = 0.0) -> None:
+        both = free.flat[from_] & free.flat[to]
+        from_, to = from_[both], to[both]
+        weight = (cost.flat[from_] + cost.flat[to]) / 2
+        edges.append((from_ + cells, to + cells, weight * seconds))
+        if back:
+            edges.append((to + cells, from_ + cells, weight * back))
+
+    for k, (dx, dy) in enumerate(STEPS):
+        length = CELL_M * float(np.hypot(dx, dy))
+        one = index[max(-dx, 0) : nx - max(dx, 0), max(-dy, 0) : ny - max(dy, 0)]
+        other = index[max(dx, 0) : nx - max(-dx, 0), max(dy, 0) : ny - max(-dy, 0)]
+        ahead = length / motion.ahead_mps
+        back = length / motion.back_mps if motion.back_mps else 0.0
+        join(one[..., k].ravel(), other[..., k].ravel(), ahead, back=back)
+        following = (k + 1) % headings
+        angle = (HEADINGS_RAD[following] - HEADINGS_RAD[k]) % (2 * np.pi)
+        turn = float(angle) / motion.turn_radps
+        join(index[..., k].ravel(), index[..., following].ravel(), turn, back=turn)
+        for to in (following, (k - 1) % headings):
+            join(one[..., k].ravel(), other[..., to].ravel(), ahead + ARC * turn)
+    from_, to_, time_s = (np.concatenate(parts) for parts in zip(*edges, strict=True))
+    return from_, to_, time_s
+
+
+def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: F64) -> F64:
+    """Clearance (nx, ny, 16) of the outline at every state of the window."""
+    pad = float(np.hypot(*outline_m.T).max()) + _FIELD_M
+    x, y = (
+        np.arange((window.low[a] + 0.5) * CELL_M - pad, window.high[a] * CELL_M + pad, _FIELD_M)
+        for a in range(2)
+    )
+    gap = floor_gap(floor, x[:, None], y[None, :])
+    for middle, half in zip(boxes, half_m, strict=True):
+        gap = np.minimum(gap, box_gap(x[:, None], y[None, :], tuple(middle), tuple(half)))
+    count = window.shape
+    per_cell = round(CELL_M / _FIELD_M)
+    room = np.empty((*count, len(STEPS)))
+    for k, heading in enumerate(HEADINGS_RAD):
+        cos, sin = np.cos(heading), np.sin(heading)
+        turned = outline_m @ np.array([[cos, sin], [-sin, cos]])
+        least = np.full(count, np.inf)
+        for i, j in np.unique(np.round((turned + pad) / _FIELD_M).astype(np.int64), axis=0):
+            part = gap[i:, j:][: per_cell * count[0] : per_cell, : per_cell * count[1] : per_cell]
+            np.minimum(least, part, out=least)
+        room[..., k] = least
+    return room
+
+
+def _filled(times: F64) -> F64:
+    """Times (nx, ny) of one heading; off the free states that of the nearest, and more."""
+    known = np.isfinite(times)
+    if not known.any():
+        return np.full(times.shape, _NO_WAY_S)
+    gap, (i, j) = ndimage.distance_transform_edt(~known, return_indices=True)
+    filled: F64 = times[i, j] + OFF_COST_S * gap
+    return filled
+
+
+def floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
+    """From points to the nearest rack or wall; negative inside."""
+    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    for rack in floor.racks:
+        room = np.minimum(room, box_gap(x, y, rack.center, rack.half_size))
+    return room
+
+
+def box_gap(
+    x: F64,
+    y: F64,
+    center: tuple[float | F64, float | F64],
+    half: tuple[float | F64, float | F64],
+) -> F64:
+    """From points to an axis-aligned box; negative inside."""
+    dx, dy = np.abs(x - center[0]) - half[0], np.abs(y - center[1]) - half[1]
+    outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0))
+    gap: F64 = outside + np.minimum(np.maximum(dx, dy), 0)
+    return gap
