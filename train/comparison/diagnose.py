@@ -41,6 +41,7 @@ Cause = Literal[
 ]
 WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be diagnosed
+_LEAST_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
 _LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
 
 
@@ -69,8 +70,8 @@ class Symptom:
     """One condition in one window, or over several."""
 
     condition: str
-    gap: float | None  # G_k
-    outlier: float  # O_k
+    gap: float | None  # G_k; None: not in replay, or too few rows
+    outlier: float | None  # O_k; None: too few rows
     replay_share: float
     met_share: float | None  # of the evaluations' steps
     agreement: float | None  # of its logged rows with fresh ones
@@ -115,7 +116,7 @@ class Window:
                         f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
                         f" {relative:.1f} times the median condition's gap"
                     )
-            elif symptom.outlier >= limits.gap:
+            elif not symptom.replay_share and (symptom.outlier or 0.0) >= limits.gap:
                 reasons.append(
                     f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
                     " replay has none of it"
@@ -294,12 +295,13 @@ def windows_of(run: Run) -> list[Window]:
 
 def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     known_well = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
-    middle = median(row["evaluation_td"] for row in known_well)
+    judged = [row for row in known_well if row["evaluation_rows"] >= _LEAST_TD_ROWS]
+    middle = median(row["evaluation_td"] for row in judged or known_well)
     symptoms = [
         Symptom(
             row["condition"],
-            row["evaluation_td"] / row["replay_td"] if row["replay_td"] else None,
-            row["evaluation_td"] / max(middle, 1e-12),
+            row["evaluation_td"] / row["replay_td"] if row in judged and row["replay_td"] else None,
+            row["evaluation_td"] / max(middle, 1e-12) if row in judged else None,
             row["replay_share"] or 0.0,
             row["met_share"],
             row["agreement"],
@@ -310,7 +312,7 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     weight = sum(row["evaluation_rows"] for row in known_well)
-    known = [row["explained"] for row in known_well if row["explained"] is not None]
+    known = [row["explained"] for row in judged or known_well if row["explained"] is not None]
 
     def mean(name: str) -> float:
         return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)
