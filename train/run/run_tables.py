@@ -180,11 +180,7 @@ TABLES: dict[str, pa.Schema] = {
             _F,
             "share of the logs' rows of the condition that these steps and the ring's confirm",
         ),
-        (
-            "logs_unexplained",
-            _F,
-            "of the variance of their next observations, left unexplained",
-        ),
+        ("logs_unexplained", _F, "of the variance of their next observations, left unexplained"),
     ),
     "off_policy": _schema(
         "a measure x condition x estimator: the offline policy on held-out logs",
@@ -193,11 +189,7 @@ TABLES: dict[str, pa.Schema] = {
         ("condition", _S, "of the episode, or all"),
         ("estimator", _S, "logged | fqe | pdwis | wdr"),
         ("value", _F, "the estimate; null where it is refused"),
-        (
-            "low",
-            _F,
-            "lower end of its 95 % interval, over episodes; null of fqe",
-        ),
+        ("low", _F, "lower end of its 95 % interval, over episodes; null of fqe"),
         ("high", _F, "upper end"),
         ("refused", _S, "why, or null"),
         ("episodes", _I, "of the logs"),
@@ -349,11 +341,7 @@ EVAL_EPISODES = _schema(
     ("time_s", _F, "of the episode, simulated"),
     ("return", _F, "undiscounted"),
     *_MEASURES,
-    (
-        "time_lost_s",
-        _F,
-        "against the planner on the same mission; null unless both arrived",
-    ),
+    ("time_lost_s", _F, "against the planner on the same mission; null unless both arrived"),
     ("end_x_m", _F, "where it ended"),
     ("end_y_m", _F, "where it ended"),
     ("failure", _S, "null | stuck | timeout | bump | cut"),
