@@ -14,7 +14,8 @@ from restock.ingest.profile.inputs import (
     check_command_source,
     check_input,
 )
-from restock.ingest.task.conditions import Kind, label_with_probabilities, shipped
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import Kind, label_with_probabilities
 from restock.ingest.task.robot import beyond_limits
 from restock.ingest.task.schema import steps_schema
 

@@ -47,15 +47,8 @@ from restock.ingest.profile.inputs import (
 from restock.ingest.profile.robot_file import with_robot_file
 from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
 from restock.ingest.profile.tag_rules import TagRules
-from restock.ingest.task.condition_files import with_files
-from restock.ingest.task.conditions import (
-    Condition,
-    Kind,
-    Noise,
-    labels_version,
-    of_kind,
-    shipped,
-)
+from restock.ingest.task.condition_files import shipped, with_files
+from restock.ingest.task.conditions import Condition, Kind, Noise, labels_version, of_kind
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.limiter import Limiter
 from restock.ingest.task.robot import Robot, refuse_beyond_steering

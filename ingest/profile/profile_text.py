@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 
 from restock.ingest.profile.profile import Profile, parse_profile
-from restock.ingest.task.conditions import Condition, of_kind, shipped
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import Condition, of_kind
 from restock.toml import toml_value
 
 

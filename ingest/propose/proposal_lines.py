@@ -28,7 +28,8 @@ from restock.ingest.propose.evidence.roles import (
 )
 from restock.ingest.propose.evidence.scanned_outline import range_lines
 from restock.ingest.propose.trial import Trial
-from restock.ingest.task.conditions import shipped, unseen
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import unseen
 from restock.ingest.task.robot import Robot
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice

@@ -1,4 +1,6 @@
-"""What a condition's .sql file says: its rule, in parts, and of its comments the settings.
+"""Conditions that are .sql files: those that come with Restock, and those beside a profile.
+
+A file says the rule, in parts, and in comments the settings:
 
     -- What it is, and why the rule is as it is.
     -- timing: post
@@ -18,14 +20,36 @@ are not.
 from __future__ import annotations
 
 import re
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from restock.errors import ConfigError
+from restock.ingest.task.conditions import Condition, Kind, Noise
 
 LARGEST_BYTES = 100_000  # of a condition's file
 _PART = re.compile(r"-- (?:let ([A-Za-z]\w*)|(label|probability)):\s*")
 _SETTINGS = ("kind", "timing", "priority", "uncertain")
+
+
+def shipped(noise: Noise | None = None, kind: Kind = "outcome") -> dict[str, Condition]:
+    """The conditions of a kind that come with Restock, by name: `ingest/task/conditions/*.sql`.
+
+    `noise` is of the sensors of the robot whose steps they label; None: as the profile's defaults.
+    """
+    constants = (noise or Noise()).constants
+    folder = files("restock.ingest.task") / "conditions"
+    conditions = {}
+    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
+        if entry.name.endswith(".sql"):
+            name = entry.name.removesuffix(".sql")
+            text = entry.read_text(encoding="utf-8")
+            made = msgspec.convert({"name": name, **settings_of(text)}, Condition)
+            if made.kind == kind:
+                conditions[name] = made.with_constants(constants)
+    return conditions
 
 
 def settings_of(text: str) -> dict[str, Any]:

@@ -33,7 +33,6 @@ import hashlib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from importlib.resources import files
 from typing import Annotated, Any, Literal
 
 import duckdb
@@ -44,7 +43,6 @@ from msgspec import Meta
 
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
-from restock.ingest.task.condition_files import settings_of
 from restock.ingest.task.condition_sql import WINDOW, refusal, sandbox, select_of
 from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.toml import Checked
@@ -116,24 +114,6 @@ class Noise(Checked, frozen=True):
         """Each by the name that SQL has for it."""
         named = msgspec.structs.asdict(self)
         return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
-
-
-def shipped(noise: Noise | None = None, kind: Kind = "outcome") -> dict[str, Condition]:
-    """The conditions of a kind that come with Restock, by name: `ingest/task/conditions/*.sql`.
-
-    `noise` is of the sensors of the robot whose steps they label; None: as the profile's defaults.
-    """
-    constants = (noise or Noise()).constants
-    folder = files("restock.ingest.task") / "conditions"
-    conditions = {}
-    for entry in sorted(folder.iterdir(), key=lambda item: item.name):
-        if entry.name.endswith(".sql"):
-            name = entry.name.removesuffix(".sql")
-            text = entry.read_text(encoding="utf-8")
-            made = msgspec.convert({"name": name, **settings_of(text)}, Condition)
-            if made.kind == kind:
-                conditions[name] = made.with_constants(constants)
-    return conditions
 
 
 def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:

@@ -21,15 +21,8 @@ from restock import __version__
 from restock.errors import PanelError, StoreError
 from restock.files import is_running
 from restock.ingest.store.location import Location
-from restock.ingest.task.conditions import (
-    NOMINAL,
-    Condition,
-    Kind,
-    Timing,
-    labels_version,
-    of_kind,
-    shipped,
-)
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION

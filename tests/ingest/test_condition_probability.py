@@ -16,14 +16,13 @@ from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.relabel import relabel_store
 from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.condition_files import settings_of
+from restock.ingest.task.condition_files import settings_of, shipped
 from restock.ingest.task.conditions import (
     Condition,
     Noise,
     label,
     labels_version,
     probabilities,
-    shipped,
     too_near_to_call,
 )
 from restock.ingest.task.schema import COVERAGE, steps_schema

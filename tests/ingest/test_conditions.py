@@ -14,14 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import (
-    Condition,
-    label,
-    labels_version,
-    let_values,
-    primary,
-    shipped,
-)
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 
 SHIPPED = list(shipped().values())

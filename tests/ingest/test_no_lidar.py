@@ -27,7 +27,8 @@ from restock.ingest.steps.steps import steps_of
 from restock.ingest.store.commits import delta_columns
 from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import shipped, told, unseen
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import told, unseen
 from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS

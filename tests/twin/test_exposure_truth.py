@@ -8,7 +8,8 @@ import numpy as np
 import pyarrow as pa
 
 from restock.ingest.store.episode_rows import label_table
-from restock.ingest.task.conditions import label, shipped
+from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.conditions import label
 from restock.ingest.task.label_scores import true_names
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.train.twin.env.policies import PlannerFollower
