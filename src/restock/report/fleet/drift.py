@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -10,8 +9,14 @@ import altair as alt
 
 from restock import __version__
 from restock.replay.fleet.drift import OWN, Drift
-from restock.replay.store.column_docs import UNITS
-from restock.replay.store.column_docs import unit as unit_of
+from restock.report.fleet.drift_signals import (
+    by_part,
+    change_text,
+    meanings,
+    signal_name,
+    signed_size,
+    value_text,
+)
 from restock.report.look import charts
 from restock.report.look.blocks import MOST_ROWS, Figure, Rows, Section, Table, words
 
@@ -21,20 +26,6 @@ MOST_FINDINGS = 8  # with a chart of their own
 _BEYOND = 3.0  # sizes past it look alike
 _BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
 _VERDICTS = ("changed", "undecided", "unchanged", "too few")
-_MEANINGS = {  # what a signal tells of; docs/drift.md has how each is measured
-    "odometry_scale": "metres localised a metre that the wheels report, straight",
-    "wheel_yaw_scale": "yaw rate of the gyroscope over that of the wheels, turning",
-    "wheel_pull_radpm": "turn that the wheels did not report, a metre of straight driving",
-    "command_gain": "wheel speed over the command, once held",
-    "command_response": "share of a changed command that is reached within one step",
-    "gyro_bias_radps": "gyroscope less the pose's turn, straight",
-    "accel_bias_mps2": "acceleration at a steady speed: bias, or a slope of the floor",
-    "vibration_mps2": "spread of the acceleration at a steady speed",
-    "localiser_jitter_mps": "sideways speed of the poses, straight",
-    "localiser_age_s": "age of the pose at a step",
-    "lidar_noise_m": "unevenness of a sector's range over three steps, straight",
-    "silent_sectors": "lidar sectors that show nothing, or the same, for a whole episode",
-}
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
@@ -95,7 +86,7 @@ def headline(drift: Drift) -> str:
         hardware = [row for row in drift.findings if row["part"] not in _BESIDE]
         if len(hardware) == 1:
             (row,) = hardware
-            text += f", {_signal(row)} {_change(row)} since {row['since']}"
+            text += f", {signal_name(row)} {change_text(row)} since {row['since']}"
         return text
     if all(row["p"] is None for row in drift.tests):
         return "Too little to compare: no robot has a reference and enough later episodes"
@@ -109,8 +100,8 @@ def findings_section(drift: Drift) -> Section:
         {
             "robot": row["robot"],
             "part": row["part"],
-            "signal": _signal(row),
-            "change": _change(row),
+            "signal": signal_name(row),
+            "change": change_text(row),
             "since": str(row["since"]),
             f"{drift.every}s": f"{row['periods']} of {row['periods_tested']}",
             "scope": _SCOPE[row["scope"]],
@@ -151,14 +142,14 @@ def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
             xOffset=alt.XOffset("robot:N", sort=robots),
         )
         bars = base.mark_rule(strokeWidth=3, opacity=0.4).encode(
-            y=alt.Y("p25:Q", title=_signal(finding), scale=alt.Scale(zero=False)), y2="p75:Q"
+            y=alt.Y("p25:Q", title=signal_name(finding), scale=alt.Scale(zero=False)), y2="p75:Q"
         )
         dots = base.mark_circle(size=55, opacity=1).encode(y=alt.Y("median:Q"))
         return alt.layer(bars, dots).properties(height=190)
 
     return Figure(
         charts.draw(chart),
-        f"{finding['robot']}: {_signal(finding)}",
+        f"{finding['robot']}: {signal_name(finding)}",
         "Median and middle half of the episodes.",
     )
 
@@ -171,10 +162,10 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
         [
             {
                 "robot": row["robot"],
-                "signal": _signal(row),
+                "signal": signal_name(row),
                 "part": row["part"],
                 "period": str(row["period"]),
-                "size": max(-_BEYOND, min(_BEYOND, _signed_size(row))),
+                "size": max(-_BEYOND, min(_BEYOND, signed_size(row))),
                 "mark": "●" if row["verdict"] == "changed" else "",
             }
             for row in own
@@ -183,7 +174,7 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
     )
     if not rows:
         return None
-    signals = list(dict.fromkeys(row["signal"] for row in sorted(rows, key=_by_part)))
+    signals = list(dict.fromkeys(row["signal"] for row in sorted(rows, key=by_part)))
     periods = len({row["period"] for row in rows})
     robots = sorted({row["robot"] for row in rows})
 
@@ -288,11 +279,11 @@ def _differences_section(drift: Drift) -> Section | None:
         {
             "robot": row["robot"],
             "site": row["site"],
-            "signal": _signal(row),
+            "signal": signal_name(row),
             drift.every: str(row["period"]),
-            "the others": _figure(row["reference_value"]),
-            "this robot": _figure(row["value"]),
-            "difference": _change(row),
+            "the others": value_text(row["reference_value"]),
+            "this robot": value_text(row["value"]),
+            "difference": change_text(row),
         }
         for row in sorted(newest.values(), key=lambda row: -row["size"])
     ]
@@ -317,13 +308,13 @@ def _comparisons_section(own: Rows) -> Section | None:
     rows = [
         {
             "robot": row["robot"],
-            "signal": _signal(row),
-            "reference": _figure(row["reference_value"]),
-            "now": _figure(row["value"]),
-            "change": _change(row),
+            "signal": signal_name(row),
+            "reference": value_text(row["reference_value"]),
+            "now": value_text(row["value"]),
+            "change": change_text(row),
             "verdict": row["verdict"],
-            "Cliff's delta": _figure(row["cliffs_delta"]),
-            "KS": _figure(row["ks_distance"]),
+            "Cliff's delta": value_text(row["cliffs_delta"]),
+            "KS": value_text(row["ks_distance"]),
             "corrected p": "" if row["q"] is None else f"{row['q']:.1g}",
             "samples": f"{row['n']} / {row['n_reference']} {row['samples']}",
         }
@@ -344,56 +335,9 @@ def _comparisons_section(own: Rows) -> Section | None:
                 title=_count(min(len(rows), 120), "comparison"),
                 folded=len(rows) > MOST_ROWS,
             ),
-            Table(_meanings(newest.values()), title="What the signals are", folded=True),
+            Table(meanings(newest.values()), title="What the signals are", folded=True),
         ],
     )
-
-
-def _signal(row: dict[str, Any]) -> str:
-    name, unit = row["signal"], unit_of(row["signal"])
-    ending = next((ending for ending, _ in UNITS if unit and name.endswith(ending)), "")
-    name = words(name.removesuffix(ending)) + (f" ({unit})" if unit else "")
-    if row["part"] == "conditions":
-        name += " events"
-    zone = row.get("zone")
-    return f"{name} in {zone}" if zone else name
-
-
-def _by_part(row: dict[str, Any]) -> tuple[str, str]:
-    return str(row["part"]), str(row["signal"])
-
-
-def _meanings(rows: Iterable[dict[str, Any]]) -> Rows:
-    """What the signals of these rows are, in the order of their parts."""
-    signals = {row["signal"]: row for row in sorted(rows, key=_by_part)}
-    return [
-        {"signal": _signal(row), "part": row["part"], "what it is": _MEANINGS[name]}
-        for name, row in signals.items()
-        if name in _MEANINGS
-    ]
-
-
-def _change(row: dict[str, Any]) -> str:
-    """`× 0.942 [0.935, 0.950]`, or a difference with its sign."""
-    if row["change"] is None:
-        return ""
-    ratio = row["compared"] == "ratio"
-    values = [row["change"], row["change_low"], row["change_high"]]
-    least = 0.0 if ratio else 1e-3 * max(abs(row["change_low"]), abs(row["change_high"]))
-    value, low, high = (  # what is far below the interval's width is nothing
-        f"{v:.3f}" if ratio else f"{v if abs(v) >= least else 0.0:+.3g}" for v in values
-    )
-    unit = " sd" if row["compared"] == "spread" else ""
-    return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
-
-
-def _signed_size(row: dict[str, Any]) -> float:
-    neutral = 1.0 if row["compared"] == "ratio" else 0.0
-    return float(row["size"]) * (1 if row["change"] >= neutral else -1)
-
-
-def _figure(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 def _chosen(robots: set[str], first: set[str]) -> list[str]:

@@ -1,0 +1,79 @@
+"""The signals of drift in words: the name and unit of each, what it tells of, how it changed.
+
+A row compares one signal of a robot in a period, as `restock.replay.fleet.drift` gives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from restock.replay.store.column_docs import UNITS
+from restock.replay.store.column_docs import unit as unit_of
+from restock.report.look.blocks import Rows, words
+
+_MEANINGS = {  # what a signal tells of; docs/drift.md has how each is measured
+    "odometry_scale": "metres localised a metre that the wheels report, straight",
+    "wheel_yaw_scale": "yaw rate of the gyroscope over that of the wheels, turning",
+    "wheel_pull_radpm": "turn that the wheels did not report, a metre of straight driving",
+    "command_gain": "wheel speed over the command, once held",
+    "command_response": "share of a changed command that is reached within one step",
+    "gyro_bias_radps": "gyroscope less the pose's turn, straight",
+    "accel_bias_mps2": "acceleration at a steady speed: bias, or a slope of the floor",
+    "vibration_mps2": "spread of the acceleration at a steady speed",
+    "localiser_jitter_mps": "sideways speed of the poses, straight",
+    "localiser_age_s": "age of the pose at a step",
+    "lidar_noise_m": "unevenness of a sector's range over three steps, straight",
+    "silent_sectors": "lidar sectors that show nothing, or the same, for a whole episode",
+}
+
+
+def signal_name(row: dict[str, Any]) -> str:
+    """`wheel pull (rad/m)`; of a condition its events, and the zone where there is one."""
+    name, unit = row["signal"], unit_of(row["signal"])
+    ending = next((ending for ending, _ in UNITS if unit and name.endswith(ending)), "")
+    name = words(name.removesuffix(ending)) + (f" ({unit})" if unit else "")
+    if row["part"] == "conditions":
+        name += " events"
+    zone = row.get("zone")
+    return f"{name} in {zone}" if zone else name
+
+
+def by_part(row: dict[str, Any]) -> tuple[str, str]:
+    """The order of signals on a page."""
+    return str(row["part"]), str(row["signal"])
+
+
+def meanings(rows: Iterable[dict[str, Any]]) -> Rows:
+    """What the signals of these rows are, in the order of their parts."""
+    signals = {row["signal"]: row for row in sorted(rows, key=by_part)}
+    return [
+        {"signal": signal_name(row), "part": row["part"], "what it is": _MEANINGS[name]}
+        for name, row in signals.items()
+        if name in _MEANINGS
+    ]
+
+
+def change_text(row: dict[str, Any]) -> str:
+    """`× 0.942 [0.935, 0.950]`, or a difference with its sign."""
+    if row["change"] is None:
+        return ""
+    ratio = row["compared"] == "ratio"
+    values = [row["change"], row["change_low"], row["change_high"]]
+    least = 0.0 if ratio else 1e-3 * max(abs(row["change_low"]), abs(row["change_high"]))
+    value, low, high = (  # what is far below the interval's width is nothing
+        f"{v:.3f}" if ratio else f"{v if abs(v) >= least else 0.0:+.3g}" for v in values
+    )
+    unit = " sd" if row["compared"] == "spread" else ""
+    return f"{'× ' if ratio else ''}{value}{unit} [{low}, {high}]"
+
+
+def signed_size(row: dict[str, Any]) -> float:
+    """The size of a change in least changes that matter, below 0 where the signal fell."""
+    neutral = 1.0 if row["compared"] == "ratio" else 0.0
+    return float(row["size"]) * (1 if row["change"] >= neutral else -1)
+
+
+def value_text(value: float | None) -> str:
+    """Three digits; nothing where there is no value."""
+    return "" if value is None else f"{value:.3g}"
