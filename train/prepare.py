@@ -13,8 +13,6 @@ import msgspec
 from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.task.signals import LIDAR_SIGNALS
-from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
@@ -48,7 +46,7 @@ from restock.train.run.run_profile import (
 )
 from restock.train.run.trackers import require_trackers
 from restock.train.session import Session, open_session
-from restock.train.twin.env.floor_report import refuse_unfit, sealed
+from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.physics.episode import KINDS
@@ -114,47 +112,6 @@ class Prepared:
             return None
         env = make_twin(self.config, self.profile, _EVALUATION_ENVS, nthread=0)
         return reference_success(self.config, env, self.profile.task)
-
-    def describe(self) -> str:
-        """What is about to happen, for people."""
-        config, schedule = self.config, self.config.schedule
-        fed = "no panel: online only"
-        if self.panel is not None:
-            share = self.document["panel"].get("logs_share", 0.0)
-            few = share < 0.1
-            fed = f"panel {self.panel.id} ({len(self.panel):,} rows), "
-            part = f"{share:.{int(few)}%} of each batch{_short(self.panel, config, share)}"
-            fed += part if config.env.twin else "all of each batch"
-        steps = f"up to {schedule.env_steps:,} environment steps"
-        if not config.env.twin:
-            steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
-        return (
-            f"run {self.path}: {fed}; target {config.target}; {steps}"
-            + (f" or {schedule.seconds:g} s" if schedule.seconds is not None else "")
-            + f"; seed {config.seed}, {config.device}"
-            + (
-                f"\na ring of {chosen['ring_rows']:,} rows: {chosen['reason']}"
-                if (chosen := self.document.get("ring_capacity"))
-                else ""
-            )
-            + _describe_teacher(config, self.panel)
-            + "".join(
-                f"\ncondition {name!r} is not evaluated in the twin, which has no"
-                f" {', '.join(signals)}: "
-                + (
-                    "no log tells it"
-                    if LIDAR_SIGNALS.issuperset(signals)
-                    else "its stratum is of logs alone"
-                )
-                for name, signals in self.document.get("not_evaluated", {}).items()
-                if config.env.twin
-            )
-            + "".join(f"\n{line}" for line in self._sealed())
-        )
-
-    def _sealed(self) -> list[str]:
-        """What of the floors was closed, where anything drives on them."""
-        return sealed(open_floors(self.config.env.layouts)) if self.config.env.twin else []
 
 
 def train(
@@ -239,7 +196,8 @@ def prepare_new(
         config = without_twin(config, panel)
     check_missions(config, profile, panel)
     config = resolve_teacher(config, profile)
-    refuse_nothing_to_learn(config.teacher, None if panel is None else sorted(_policies(panel)))
+    drivers = None if panel is None else sorted(rows_by_policy(panel))
+    refuse_nothing_to_learn(config.teacher, drivers)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     written = _document(config, profile, panel)
     if ring is not None:
@@ -341,6 +299,11 @@ def make_twin(
     return twin
 
 
+def rows_by_policy(panel: Panel) -> Counter[str]:
+    """Rows by behaviour policy."""
+    return Counter(name for name in panel.meta_column("behaviour_policy").tolist() if name)
+
+
 def _evaluation_layouts(config: TrainConfig) -> str:
     return config.evaluation.layouts or layouts_of_split(config.env.layouts, "validation")
 
@@ -351,42 +314,6 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
         planned_draws(config),
         config.loss.huber_delta,
         as_of_ns=int(document["created_ns"]),
-    )
-
-
-def _policies(panel: Panel) -> Counter[str]:
-    """Rows by behaviour policy."""
-    return Counter(name for name in panel.meta_column("behaviour_policy").tolist() if name)
-
-
-def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
-    """Why logs get less of an online batch than they are to; "" where they do not."""
-    wanted = config.replay.logs_share
-    if wanted is None:
-        schedule = config.schedule
-        parts = panel.header.mixture.sources.parts.values()
-        span = (min(schedule.warmup_env_steps, schedule.env_steps), schedule.env_steps)
-        wanted = sum(mean_over(part, *span) for part in parts)
-    most = panel.header.mixture.max_replays_per_row
-    if most is None or not config.schedule.env_steps or logs_share > 0.99 * wanted:
-        return ""
-    return (
-        f" (of {wanted:.0%} that the mixture wants: a row may be drawn {most:g} times,"
-        f" {config.schedule.offline_updates:,} offline updates draw first, and the rest is spread"
-        f" over {config.schedule.env_steps:,} steps; log more, lower the schedule, or raise"
-        " max_replays_per_row)"
-    )
-
-
-def _describe_teacher(config: TrainConfig, panel: Panel | None) -> str:
-    teacher = config.teacher
-    if not teacher.filters:
-        return ""
-    rows = 0 if panel is None else sum(_policies(panel)[name] for name in teacher.policies)
-    cloned = f"{rows:,} logged rows of {', '.join(teacher.policies)} are cloned first"
-    mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
-    return f"\nteacher {teacher.source}: Q chooses among what is plausible to it; " + (
-        (cloned if rows else "no logged rows to clone, so at first everything is") + mirrored
     )
 
 

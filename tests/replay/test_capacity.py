@@ -19,6 +19,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows, recommend_capacity
 from restock.replay.store.store import Store
 from restock.train import ring_capacity
+from restock.train.describe import describe_run
 from restock.train.dqn.config import load_config
 from restock.train.prepare import prepare_new
 
@@ -161,7 +162,7 @@ def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> No
     assert prepared.document["config"]["replay"]["ring_capacity"] == found.recommended
     assert chosen["reason"] == found.reason
     assert chosen["curve"][-1]["capacity"] == found.rows == len(panel)
-    assert f"a ring of {found.recommended:,} rows" in prepared.describe()
+    assert f"a ring of {found.recommended:,} rows" in describe_run(prepared)
     # A ring that could not hold a batch would be refused: it is as large as one.
     wide = [*auto, f"replay.batch_size={len(panel) + 1}"]
     least = prepare_new(tmp_path / "run", panel.path, None, wide)

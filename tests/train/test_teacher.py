@@ -27,6 +27,7 @@ from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import Facts
 from restock.state import restored, saved
 from restock.train.comparison.arms import differences
+from restock.train.describe import describe_run
 from restock.train.dqn.behaviour import (
     UNKNOWN,
     FilteredNetwork,
@@ -546,4 +547,4 @@ def test_the_operator_teaches_where_there_is_a_goal(tmp_path: Path) -> None:
         ['teacher.ratio={schedule = "linear", start = 0.3, end = 0.1, to_env_steps = 9}'],
     )
     assert loosened.config.teacher.ratio == Linear(0.3, 0.1, 9)
-    assert "teacher operator: Q chooses among what is plausible to it" in loosened.describe()
+    assert "teacher operator: Q chooses among what is plausible to it" in describe_run(loosened)

@@ -25,6 +25,7 @@ from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
+from restock.train.describe import describe_run
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
@@ -90,15 +91,15 @@ def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_pa
     rows = recording_transitions(1, episodes=40, task=task)
     few = build_panel(rows, parse_mixture(text), tmp_path / "panel", task=task)
     settings = [word for word in TINY if word != "--set"]
-    said = prepare_new(
-        tmp_path / "a", few.path, None, [*settings, "schedule.env_steps=9000"]
-    ).describe()
+    longer = [*settings, "schedule.env_steps=9000"]
+    said = describe_run(prepare_new(tmp_path / "a", few.path, None, longer))
     share = (len(few) * 4 - 30 * 32) / (8900 * 0.25 * 32)
     assert f"{share:.1%} of each batch (of 50% that the mixture wants" in said
     assert "a row may be drawn 4 times" in said
-    said = prepare_new(tmp_path / "a", panel, None, settings).describe()
+    said = describe_run(prepare_new(tmp_path / "a", panel, None, settings))
     assert "50% of each batch;" in said
-    alone = prepare_new(tmp_path / "a", panel, None, [*settings, "env.twin=false"]).describe()
+    untwinned = [*settings, "env.twin=false"]
+    alone = describe_run(prepare_new(tmp_path / "a", panel, None, untwinned))
     assert "all of each batch;" in alone
     assert "in the twin" not in alone
 

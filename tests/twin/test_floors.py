@@ -22,6 +22,7 @@ import restock  # noqa: F401 - registers the environment
 from restock.cli import main
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
+from restock.train.describe import describe_run
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -272,7 +273,7 @@ def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
     prepared = prepare_new(
         tmp_path / "run", None, None, [f"env.layouts={hall}", "env.conditions={nominal=1}"]
     )
-    assert "60 of 120 goals cannot be reached" in prepared.describe()
+    assert "60 of 120 goals cannot be reached" in describe_run(prepared)
     assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
 
 

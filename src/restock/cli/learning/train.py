@@ -98,12 +98,13 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     """Train to the end; then flush the twin's episodes, where a store is given."""
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
+    from restock.train.describe import describe_run
     from restock.train.flush_fresh import flush
     from restock.train.loop import train
 
     config = prepared.config
     session = prepared.open()
-    say(prepared.describe())
+    say(describe_run(prepared))
     if store is not None or (session.run.path / "fresh").is_dir():
         session.collector.keep(session.run.path / "fresh")
     try:

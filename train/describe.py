@@ -1,0 +1,84 @@
+"""What a run is about to do, in words: `restock train` says it before anything is learnt."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from restock.ingest.task.signals import LIDAR_SIGNALS
+from restock.replay.mixture.schedules import mean_over
+from restock.replay.panel.panel import Panel
+from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.prepare import Prepared, rows_by_policy
+from restock.train.twin.env.floor_report import sealed
+from restock.train.twin.floors.floors import open_floors
+
+
+def describe_run(prepared: Prepared) -> str:
+    """The run, and what of it one may not expect: a line each."""
+    config, panel, document = prepared.config, prepared.panel, prepared.document
+    schedule = config.schedule
+    fed = "no panel: online only"
+    if panel is not None:
+        share = document["panel"].get("logs_share", 0.0)
+        few = share < 0.1
+        fed = f"panel {panel.id} ({len(panel):,} rows), "
+        part = f"{share:.{int(few)}%} of each batch{_short(panel, config, share)}"
+        fed += part if config.env.twin else "all of each batch"
+    steps = f"up to {schedule.env_steps:,} environment steps"
+    if not config.env.twin:
+        steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
+    if schedule.seconds is not None:
+        steps += f" or {schedule.seconds:g} s"
+    lines = [
+        f"run {prepared.path}: {fed}; target {config.target}; {steps};"
+        f" seed {config.seed}, {config.device}"
+    ]
+    if ring := document.get("ring_capacity"):
+        lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
+    if config.teacher.filters:
+        lines.append(_teacher(config.teacher, panel))
+    if config.env.twin:
+        lines += _not_evaluated(document)
+        lines += sealed(open_floors(config.env.layouts))
+    return "\n".join(lines)
+
+
+def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
+    """Why logs get less of an online batch than they are to; "" where they do not."""
+    wanted = config.replay.logs_share
+    if wanted is None:
+        schedule = config.schedule
+        parts = panel.header.mixture.sources.parts.values()
+        span = (min(schedule.warmup_env_steps, schedule.env_steps), schedule.env_steps)
+        wanted = sum(mean_over(part, *span) for part in parts)
+    most = panel.header.mixture.max_replays_per_row
+    if most is None or not config.schedule.env_steps or logs_share > 0.99 * wanted:
+        return ""
+    return (
+        f" (of {wanted:.0%} that the mixture wants: a row may be drawn {most:g} times,"
+        f" {config.schedule.offline_updates:,} offline updates draw first, and the rest is spread"
+        f" over {config.schedule.env_steps:,} steps; log more, lower the schedule, or raise"
+        " max_replays_per_row)"
+    )
+
+
+def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
+    rows = 0 if panel is None else sum(rows_by_policy(panel)[name] for name in teacher.policies)
+    cloned = f"{rows:,} logged rows of {', '.join(teacher.policies)} are cloned first"
+    mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
+    return f"teacher {teacher.source}: Q chooses among what is plausible to it; " + (
+        (cloned if rows else "no logged rows to clone, so at first everything is") + mirrored
+    )
+
+
+def _not_evaluated(document: dict[str, Any]) -> list[str]:
+    """The conditions that the twin cannot show, and why."""
+    return [
+        f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}: "
+        + (
+            "no log tells it"
+            if LIDAR_SIGNALS.issuperset(signals)
+            else "its stratum is of logs alone"
+        )
+        for name, signals in document.get("not_evaluated", {}).items()
+    ]
