@@ -13,11 +13,11 @@ from restock.arrays import F32, F64
 from restock.errors import RecordingError, StoreError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import RawMessage
-from restock.ingest.steps.seen_at_ticks import Seen, SeenScan, seen_between
 from restock.ingest.task.scan import outline_reach
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
 from restock.replay.trace.origin import Origin, profile_of, rows_of, sql_file
+from restock.replay.trace.seen_at_ticks import Seen, SeenScan, seen_between
 
 NS = 1_000_000_000
 

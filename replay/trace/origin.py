@@ -18,12 +18,12 @@ from restock.errors import ConfigError, StoreError
 from restock.files import first_line
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.profile.profile_text import read_profile_toml
-from restock.ingest.steps.messages_at_tick import MessageAtTick, messages_at_tick
 from restock.ingest.store.location import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store, is_store
+from restock.replay.trace.messages_at_tick import MessageAtTick, messages_at_tick
 
 # Where in log time the messages of a tick lie: it takes a while until the next ones come, and
 # some take longer than others to be received.

@@ -47,7 +47,8 @@ MAY_IMPORT = {
     "replay/fleet": "mixture panel store ingest/task",
     "replay/review": "store ingest ingest/store",
     "replay/trace": (
-        "replay panel store ingest/containers ingest/store ingest/profile ingest/steps ingest/task"
+        "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
+        " ingest/store ingest/task"
     ),
     "replay/export": "replay panel store ingest/camera ingest/store ingest/profile ingest/task",
     "train": (
@@ -78,9 +79,7 @@ MAY_IMPORT = {
         " replay/ring replay/store ingest/profile ingest/task"
     ),
     "train/study": "comparison dqn evaluation libraries run twin/physics ingest",
-    "train/view": (
-        "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding ingest/steps"
-    ),
+    "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",

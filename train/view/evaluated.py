@@ -14,8 +14,8 @@ import numpy as np
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
-from restock.ingest.steps.seen_at_ticks import Seen
 from restock.replay.trace.moment import NS, Moment
+from restock.replay.trace.seen_at_ticks import Seen
 from restock.train.evaluation.evaluate import Stepper
 from restock.train.evaluation.evaluation_plan import (
     CLEAN,

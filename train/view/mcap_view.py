@@ -18,8 +18,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from restock.ingest.decoding.messages import Channel
-from restock.ingest.steps.seen_at_ticks import SeenScan
 from restock.replay.trace.moment import Moment
+from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.twin.recording.messages import build, serialise, stamp, typestore
 from restock.train.view.critic import Critic
 from restock.train.view.told import about, about_evaluated, numbers_of, texts_of

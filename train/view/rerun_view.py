@@ -10,8 +10,8 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.imports import import_extra
-from restock.ingest.steps.seen_at_ticks import SeenScan
 from restock.replay.trace.moment import Moment
+from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.view.critic import Critic
 from restock.train.view.told import about, about_evaluated, numbers_of, texts_of
 
