@@ -1,0 +1,140 @@
+"""The inputs of a profile that a recording has, by name: their fields as columns.
+
+Positions are in the fixed frame: a pose by latitude and longitude is projected into it, and goals
+and plans that were given in another frame are put into it by their `Placement`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+
+from restock.arrays import F64, Ints
+from restock.errors import RecordingError
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.profile import Profile
+from restock.ingest.profile.signal_paths import element_of
+from restock.ingest.steps.align import NS
+from restock.ingest.steps.fixes import FixedPoses, fixes_of
+from restock.ingest.steps.frames import FRAME_ID, Placement, plain
+from restock.ingest.task.signals import yaw_of
+
+
+class InputColumns:
+    """The inputs of a profile that a recording has, and their columns."""
+
+    def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
+        self.topics = topics
+        self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
+        self.by_name: dict[str, Input] = {  # those whose topic the recording has
+            name: source
+            for name, source in profile.sources.items()
+            if source.topic in topics and not (source.optional and not len(topics[source.topic]))
+        }
+
+    def column(self, name: str, key: str) -> FieldColumn:
+        """A field of an input as it was read."""
+        source = self.by_name[name]
+        path, place = element_of(source.fields[key])
+        column = self.topics[source.topic].fields[path]
+        return column if place is None else _element(column, place)
+
+    def numbers(self, name: str, key: str) -> F64:
+        """A field of an input, one number a message (N,)."""
+        if self.by_name[name].by_fix and key in ("x_m", "y_m", "yaw_rad"):
+            return np.asarray(getattr(self.fixed, key), np.float64)
+        if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
+            return self._yaw(name)
+        if key == "yaw_rate_radps" and self.by_name[name].wheelbase_m is not None:
+            turn = np.tan(self.numbers(name, "steering_rad")) / self.by_name[name].wheelbase_m
+            return self.numbers(name, "speed_mps") * turn
+        column = self.column(name, key)
+        if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
+            source = self.by_name[name]
+            raise RecordingError(
+                f"{source.fields[key]!r} of {source.topic} is not one number a message",
+                remedy=f"mend `inputs.{name}.fields.{key}` in the profile",
+            )
+        return np.asarray(column, np.float64)
+
+    def texts(self, name: str) -> list[str]:
+        """The text of an input, one a message."""
+        return [str(text) for text in np.asarray(self.column(name, "text"), object)]
+
+    @cached_property
+    def fixed(self) -> FixedPoses:
+        """The pose of each message, where it is by latitude and longitude."""
+        source = self.by_name["pose"]
+        columns, yaw = self.topics[source.topic], None
+        if "heading" in self.by_name:
+            yaw = self._heading_at(columns.log_time_ns)
+        fixes = fixes_of(columns, source.fields, yaw)
+        return fixes.poses(source.origin_deg, source.max_std_m, source.track_m)
+
+    def _heading_at(self, time_ns: Ints) -> F64:
+        """The heading (N,) received last at these log times; NaN where none is known."""
+        source = self.by_name["heading"]
+        said_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
+        order = np.argsort(said_ns, kind="stable")
+        said_ns, yaw = said_ns[order], yaw[order]
+        last = np.searchsorted(said_ns, time_ns, "right") - 1
+        known = last >= 0
+        if source.max_age_s is not None and len(said_ns):
+            known &= time_ns - said_ns[last] <= source.max_age_s * NS
+        return np.where(known, yaw[last], np.nan) if len(yaw) else np.full(len(time_ns), np.nan)
+
+    @cached_property
+    def plans(self) -> list[F64]:
+        """Each plan's points (P, 2); P is 0 where the planner found none."""
+        x, y = self.column("plan", "x_m"), self.column("plan", "y_m")
+        points = [
+            np.stack([np.asarray(x[row], np.float64), np.asarray(y[row], np.float64)], axis=-1)
+            for row in range(len(x))
+        ]
+        if "plan" not in self.placed:
+            return points
+        at = self.placed["plan"]
+        return [
+            plan @ at.rotation[row, :2, :2].T + at.translation_m[row, :2]
+            for row, plan in enumerate(points)
+        ]
+
+    @cached_property
+    def goals(self) -> F64:
+        """Each goal (G, 2)."""
+        goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
+        if "goal" not in self.placed:
+            return goals
+        at = self.placed["goal"]
+        return np.asarray(
+            np.einsum("nij,nj->ni", at.rotation[:, :2, :2], goals) + at.translation_m[:, :2]
+        )
+
+    def frames_of(self, name: str) -> list[str]:
+        """The frame that each message of an input is in; empty where messages do not say."""
+        source = self.by_name.get(name)
+        column = None if source is None else self.topics[source.topic].fields.get(FRAME_ID)
+        if column is None:
+            return []
+        return [plain(str(frame)) for frame in np.asarray(column, object)]
+
+    def _yaw(self, name: str) -> F64:
+        """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
+        source = self.by_name[name]
+        fields = self.topics[source.topic].fields
+        path = source.fields["orientation"]
+        x, y, z, w = (np.asarray(fields[f"{path}.{axis}"], np.float64) for axis in "xyzw")
+        return yaw_of(x, y, z, w)
+
+
+def _element(column: FieldColumn, place: int) -> F64:
+    """One element of each row's list (N,); NaN where a list is shorter."""
+    if not isinstance(column, Ragged):
+        return np.asarray(column[:, place], np.float64)
+    values = np.full(len(column), np.nan)
+    has = column.lengths > place
+    values[has] = np.asarray(column.values)[column.offsets[:-1][has] + place]
+    return values
