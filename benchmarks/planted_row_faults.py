@@ -30,7 +30,7 @@ from restock.ingest.containers.discover import recordings_in
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps import steps as steps_module
-from restock.ingest.steps.steps import Filling
+from restock.ingest.steps.filling import Filling
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.signals import Signals
 from restock.train.diagnosis.before_training import diagnose_rows, open_rows

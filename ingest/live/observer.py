@@ -22,9 +22,9 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
-from restock.ingest.steps.steps import Filling
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import nearest_action, observe
 

@@ -17,7 +17,8 @@ from support.driven_robot import (
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
-from restock.ingest.steps.steps import parse_policy, steps_of
+from restock.ingest.steps.filling import parse_policy
+from restock.ingest.steps.steps import steps_of
 
 PROFILE = load_profile("warehouse_amr")
 

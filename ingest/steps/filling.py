@@ -1,0 +1,349 @@
+"""Every signal at every tick of the control clock, causally held, from the inputs on one clock.
+
+What makes a tick unusable (an input that is stale, a plan for another goal, a value that is not
+finite) is kept beside it as a reason, so that everything left out can be counted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.containers.topic_reading import Fields
+from restock.ingest.steps.align import NS, LatestMessages, Samples
+from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.steps.clearance import BEAMS, SECTORS, scan_reduction
+from restock.ingest.steps.motion import motion_at
+from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
+from restock.ingest.task.hindsight import missions
+from restock.ingest.task.perturbation_columns import Perturbed
+from restock.ingest.task.signals import Signals, localised_velocity
+from restock.ingest.task.surroundings import SCANNED, came_nearer, steps_remembered
+
+_CHUNK = 4096  # steps
+
+
+class Filling:
+    """Every signal at every tick, from the latest messages at it; a tick's first problem stays."""
+
+    def __init__(self, aligned: AlignedInputs) -> None:
+        self.aligned, self.inputs = aligned, aligned.inputs
+        self.profile, self.task = aligned.profile, aligned.profile.task
+        self.tick_ns = np.concatenate(aligned.ticks)
+        lengths = [len(stamps) for stamps in aligned.ticks]
+        self.segment = np.repeat(np.arange(len(lengths)), lengths)
+        self.problem = np.full(len(self.tick_ns), "", object)
+        self.route_problem = np.full(len(self.tick_ns), "", object)
+        self.break_reason = np.full(len(self.tick_ns), "", object)  # why one does not follow
+        self.signals: Signals = {"stamp_ns": self.tick_ns}
+        self.routing = Routing.none(len(self.tick_ns))
+        self.located = np.zeros(len(self.tick_ns), np.bool_)  # the pose is known
+        self.notes: list[str] = []
+
+    def fill(self) -> Signals:
+        """Every signal; what else is known of the ticks is in the attributes afterwards."""
+        self._numbers(
+            "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
+        )
+        self._pose()
+        lateral_by_poses = self._wheels()
+        if "imu" in self.inputs.by_name:
+            self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
+        else:
+            self.signals["gyro_yaw_rate_radps"] = self.signals["wheel_yaw_rate_radps"].copy()
+            self.signals["accel_x_mps2"] = np.zeros(len(self.tick_ns))
+        self._scan()
+        self._bumper()
+        self._nav_command()
+        if self.profile.goal_source == "hindsight":
+            self._hindsight()
+        elif self.task.goal == "route":
+            self._route()
+        signals, routing = self.signals, self.routing
+        signals |= routing.signals(self.task, routing.goal, routing.plan, signals)
+        self._find_breaks()
+        before = np.arange(len(self.follows)) - self.follows  # the tick before, or itself
+        forward, lateral = localised_velocity(
+            signals, {name: signals[name][before] for name in signals if name.startswith("pose_")}
+        )
+        if lateral_by_poses is not None:
+            # Speeds of one and the same poses: no second witness, so never slip.
+            forward, lateral = signals["wheel_speed_mps"].copy(), lateral_by_poses
+        signals |= {"localised_speed_mps": forward, "localised_lateral_mps": lateral}
+        scanned = {name: signals[name] for name in SCANNED}
+        came = [
+            came_nearer(
+                self.task, *_with_earlier(scanned, rows, before, steps_remembered(self.task))
+            )
+            for rows in _chunks(len(before))
+        ]
+        signals["came_nearer_m"] = np.concatenate([np.zeros(0), *came])
+        return signals
+
+    @property
+    def follows(self) -> Bools:
+        """(T,) whether each tick comes directly after the one before, and both are usable."""
+        return np.asarray(self.break_reason == "", np.bool_)
+
+    def behaviour(self) -> list[tuple[str, str | None, float | None]]:
+        """Who acted at each tick: policy, version, probability of the action."""
+        default, by = self.profile.behaviour_policy, self.aligned.commanded_by()
+        return [
+            (source or default, None, None) if text is None else parse_policy(text)
+            for text, source in zip(self.texts("behaviour_policy"), by, strict=True)
+        ]
+
+    def texts(self, name: str) -> list[str | None]:
+        """The latest text of an input at each tick, or None."""
+        if name not in self.inputs.by_name:
+            return [None] * len(self.tick_ns)
+        texts, latest = self.inputs.texts(name), self.aligned.latest(name)
+        rows = zip(latest.row, latest.fresh, strict=True)
+        return [texts[row] if fresh else None for row, fresh in rows]
+
+    def perturbed(self) -> Perturbed:
+        """The simulator's parameters in force at each tick, and what could not be read."""
+        if "perturbation" not in self.inputs.by_name:
+            return Perturbed.unknown(len(self.tick_ns))
+        latest = self.aligned.latest("perturbation")
+        row = np.where(latest.fresh, latest.row, -1).astype(np.int64)
+        return Perturbed.read(self.inputs.texts("perturbation"), row)
+
+    def _find_breaks(self) -> None:
+        reasons = self.break_reason
+        reasons[:1] = "start of the recording"
+        xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
+        jump = self._too_far(xy_m)
+        gap = np.diff(self.tick_ns) > round(self.profile.clock.max_gap_s * NS)
+        unusable = (self.problem[1:] != "") | (self.problem[:-1] != "")
+        for bad, reason in (
+            (np.diff(self.segment) != 0, "clock jump"),
+            (gap, "gap"),
+            (unusable, "unusable step"),
+            (jump, "pose jump"),
+        ):
+            reasons[1:][bad & (reasons[1:] == "")] = reason
+
+    def _too_far(self, xy_m: F64) -> Bools:
+        """Between positions (N, 2), which of the steps (N - 1,) are too long to be driven."""
+        moved_m = np.hypot(*np.diff(xy_m, axis=0).T)
+        return np.asarray(moved_m > self.profile.episodes.max_pose_jump_m, np.bool_)
+
+    def _mark_invalid(self, bad: Bools, reason: str, *, route: bool = False) -> None:
+        problems = self.route_problem if route else self.problem
+        problems[bad & (problems == "")] = reason
+
+    def _mark_reasons(self, name: str, reasons: NDArray[Any], *, route: bool = False) -> None:
+        """Mark the ticks that have a reason (T,), which is "" elsewhere."""
+        for reason in sorted(set(reasons) - {""}):
+            said = f"{name}: {reason}" if name else reason
+            self._mark_invalid(reasons == reason, said, route=route)
+
+    def _required(self, name: str, *, route: bool = False) -> LatestMessages:
+        latest = self.aligned.latest(name)
+        self._mark_invalid(~latest.known, f"{name}: not yet received", route=route)
+        self._mark_invalid(~latest.fresh, f"{name}: stale", route=route)
+        return latest
+
+    def _numbers(self, name: str, **signal_of: str) -> None:
+        """Fields of a required input straight into signals; 0 where the tick is unusable."""
+        latest = self._required(name)
+        for key, signal in signal_of.items():
+            values = self.inputs.numbers(name, key)
+            column = values[latest.row] if len(values) else np.zeros(len(latest.row))
+            self._set(name, signal, column, latest.known)
+
+    def _set(self, name: str, signal: str, values: F64, known: Bools) -> None:
+        sane = np.abs(values) <= LARGEST  # False for NaN
+        self._mark_invalid(~sane, f"{name}: not finite")
+        self.signals[signal] = np.where(sane & known, values, 0.0)
+
+    def _wheels(self) -> F64 | None:
+        """The wheels' speeds; where they come from poses, the speed sideways (T,) as well."""
+        motion = self.profile.motion
+        if motion is None:
+            speeds = {"speed_mps": "wheel_speed_mps", "yaw_rate_radps": "wheel_yaw_rate_radps"}
+            self._numbers("wheels", **speeds)
+            return None
+        jump_m = self.profile.episodes.max_pose_jump_m
+        parts = [
+            motion_at(poses, ticks, motion.window_s, jump_m)
+            for poses, ticks in zip(self.aligned.poses(), self.aligned.ticks, strict=True)
+        ]
+        for signal, name in (("speed_mps", "forward_mps"), ("yaw_rate_radps", "yaw_rate_radps")):
+            column = np.concatenate([getattr(part, name) for part in parts])
+            self._set("wheels", f"wheel_{signal}", column, np.ones(len(column), np.bool_))
+        self._mark_reasons("wheels", np.concatenate([part.problem for part in parts]))
+        return np.concatenate([part.lateral_mps for part in parts])
+
+    def _pose(self) -> None:
+        if "pose" in self.inputs.by_name:
+            latest = self.aligned.latest("pose")
+            usable = latest.known & latest.fresh
+            if self.inputs.by_name["pose"].by_fix and latest.known.any():
+                problem = np.where(usable, self.inputs.fixed.problem[latest.row], "")
+                self._mark_reasons("pose", problem)
+                usable &= problem == ""
+            self._numbers("pose", x_m="pose_x_m", y_m="pose_y_m", yaw_rad="pose_yaw_rad")
+            self.signals["pose_stamp_ns"] = self.tick_ns - latest.age_ns
+            self.located = usable
+            return
+        tree = self.aligned.tree
+        assert tree is not None  # the profile is refused otherwise
+        at = tree.place(tree.frames.base, self.aligned.ticks)
+        self._mark_reasons("pose", at.problem)
+        x, y, _ = at.translation_m.T
+        for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
+            self._set("pose", f"pose_{signal}", values, at.problem == "")
+        self.located = np.asarray(at.problem == "", np.bool_)
+        self.signals["pose_stamp_ns"] = at.stamp_ns
+
+    def _scan(self) -> None:
+        """Clearance by the scan. A robot without a lidar has none, and what has one may not go
+        without: recordings without scans are read by `as_recorded`, of a task without sectors."""
+        count = len(self.tick_ns)
+        source = self.inputs.by_name.get("scan")
+        sectors = np.full((count, self.task.sectors), float(self.task.range_max_m))
+        if source is None and self.task.lidar:
+            self._mark_invalid(np.ones(count, np.bool_), "scan: not yet received")
+        if source is not None:
+            latest = self._required("scan")
+            fields: Fields = self.inputs.topics[source.topic].fields
+            if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
+                fields = scan_reduction(self.task, source.topic, source.fields).apply(fields)
+            fresh, rows = latest.fresh, latest.row[latest.fresh]
+            if len(rows):
+                beams = np.zeros(count, np.int64)
+                beams[fresh] = np.asarray(fields[BEAMS])[rows]
+                self._mark_invalid(fresh & (beams == 0), "scan: no beams")
+                sectors[fresh] = np.asarray(fields[SECTORS])[rows]
+        nearest = sectors.min(axis=1) if self.task.sectors else np.full(count, np.nan)
+        self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
+
+    def _bumper(self) -> None:
+        bumped = [np.zeros(len(self.tick_ns), np.bool_)]
+        source = self.inputs.by_name.get("bumper")
+        if source is not None:
+            self._required("bumper")
+            pressed = self.inputs.numbers("bumper", "pressed") > 0
+            bumped = [
+                pressed_since(segment.topics[source.topic], pressed, ticks)
+                for segment, ticks in zip(self.aligned.segments, self.aligned.ticks, strict=True)
+            ]
+        self.signals["bumped"] = np.concatenate(bumped)
+
+    def _nav_command(self) -> None:
+        """What navigation proposes; a tick at which that is not known stays usable."""
+        count, name = len(self.tick_ns), "nav_command"
+        unknown = np.full(count, np.nan)
+        source = self.inputs.by_name.get(name)
+        if source is None or not len(self.inputs.topics[source.topic]):
+            self.signals |= {"nav_speed_mps": unknown, "nav_yaw_rate_radps": unknown.copy()}
+            return
+        latest = self.aligned.latest(name)
+        keys = ("speed_mps", "yaw_rate_radps")
+        values = np.stack([self.inputs.numbers(name, key)[latest.row] for key in keys])
+        sane = (np.abs(values) <= LARGEST).all(axis=0)  # False for NaN
+        known = latest.fresh & sane
+        for key, column in zip(keys, values, strict=True):
+            self.signals[f"nav_{key}"] = np.where(known, column, np.nan)
+        reasons = {
+            "not yet received": ~latest.known,
+            "stale": latest.known & ~latest.fresh,
+            "not finite": latest.fresh & ~sane,
+        }
+        counted = [f"{reason} {int(bad.sum()):,}" for reason, bad in reasons.items() if bad.any()]
+        if counted:
+            unknown_at = f"{int((~known).sum()):,} of {count:,} ticks"
+            self.notes.append(f"{name}: unknown at {unknown_at} ({', '.join(counted)})")
+
+    def _route(self) -> None:
+        latest = {name: self._required(name, route=True) for name in ("goal", "plan")}
+        goals, plans = self.inputs.goals, self.inputs.plans
+        for name, one in latest.items():
+            if name in self.inputs.placed:
+                reasons = np.where(one.known, self.inputs.placed[name].problem[one.row], "")
+                self._mark_reasons(name, reasons, route=True)
+        settings = self.profile.episodes
+        goal, plan = (np.where(one.known, one.row, -1) for one in latest.values())
+        if len(goals):
+            goal = np.where(goal >= 0, same_goals(goals, settings.goal_moved_m)[goal], -1)
+            sane = (np.abs(goals[goal]) <= LARGEST).all(axis=1)
+            self._mark_invalid((goal >= 0) & ~sane, "goal: not finite", route=True)
+        if len(plans):
+            reasons = np.where(plan >= 0, np.array(plan_problems(plans), object)[plan], "")
+            self._mark_reasons("plan", reasons, route=True)
+        usable = self.route_problem == ""
+        if usable.any():
+            away = np.linalg.norm(plan_ends(plans)[plan[usable]] - goals[goal[usable]], axis=-1)
+            other = np.zeros(len(usable), np.bool_)
+            other[usable] = away > settings.plan_goal_tolerance_m
+            self._mark_invalid(other, "plan: for another goal", route=True)
+        usable = self.route_problem == ""
+        goal, plan = np.where(usable, goal, -1), np.where(usable, plan, -1)
+        self.routing = Routing(goals, plans, goal, plan, latest["goal"].row.astype(np.int64))
+
+    def _hindsight(self) -> None:
+        """Goals and routes from where the robot went: they, and no other signal, see ahead."""
+        xy_m = np.stack([self.signals["pose_x_m"], self.signals["pose_y_m"]], axis=1)
+        at = np.flatnonzero(self.located)
+        carried = np.zeros(len(self.tick_ns), np.bool_)
+        carried[at[1:]] = self._too_far(xy_m[at]) | (np.diff(self.segment[at]) != 0)
+        rules, leg = self.profile.goal, np.cumsum(carried, dtype=np.int64)
+        found = missions(rules, self.task, xy_m, self.tick_ns, self.located, leg)
+        self._mark_reasons("", np.array(found.problem, object), route=True)
+        self.routing = Routing(
+            found.goals_m, found.routes_m, found.mission, found.mission, found.mission
+        )
+        self.notes.append(str(found))
+
+
+def _chunks(steps: int) -> Iterator[Ints]:
+    """Steps, some at a time: what is made of scans takes memory."""
+    for start in range(0, steps, _CHUNK):
+        yield np.arange(start, min(start + _CHUNK, steps))
+
+
+def _with_earlier(
+    signals: Signals, rows: Ints, before: Ints, count: int
+) -> tuple[Signals, list[Signals]]:
+    """Signals of these steps, and of the `count` steps before each, the last one first."""
+    at = [rows]
+    for _ in range(count):
+        at.append(before[at[-1]])
+    now, *earlier = ({name: column[one] for name, column in signals.items()} for one in at)
+    return now, earlier
+
+
+def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
+    """Whether the bumper was pressed since the tick before (or is), (T,)."""
+    if not len(bumper.row) or not len(tick_ns):
+        return np.zeros(len(tick_ns), np.bool_)
+    counts = np.concatenate([[0], np.cumsum(pressed[bumper.row])])
+    upto = counts[np.searchsorted(bumper.stamp_ns, tick_ns, "right")]
+    since = np.diff(upto, prepend=upto[:1])
+    latest = bumper.hold(tick_ns, None)
+    return (since > 0) | (pressed[latest.row] & latest.known)
+
+
+@lru_cache(maxsize=1024)
+def parse_policy(text: str) -> tuple[str, str | None, float | None]:
+    """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three."""
+    try:
+        message = json.loads(text)
+    except json.JSONDecodeError:
+        return text.strip() or "unknown", None, None
+    if not isinstance(message, dict):
+        return str(message), None, None
+    version, probability = message.get("version"), message.get("probability")
+    return (
+        str(message.get("policy", "unknown")),
+        None if version is None else str(version),
+        float(probability) if isinstance(probability, int | float) else None,
+    )
