@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-from restock.ingest.containers.mcap_records import crc32
+from restock.ingest.containers.formats.mcap_records import crc32
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import FieldColumn, Ragged, equal, join, take
 from restock.ingest.decoding.definitions import message_type

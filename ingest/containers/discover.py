@@ -11,7 +11,8 @@ from typing import Literal, TypeVar
 from ruamel.yaml import YAML
 
 from restock.errors import RecordingError, visible
-from restock.ingest.containers import mcap_records, sqlite_file
+from restock.ingest.containers import sqlite_file
+from restock.ingest.containers.formats import mcap_records
 from restock.ingest.containers.storage import (
     INVALID_YAML,
     NOT_KEPT,

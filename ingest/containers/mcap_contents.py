@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from restock.errors import visible
-from restock.ingest.containers.mcap_chunk import HEAD_SIZE, Chunk, Definitions
-from restock.ingest.containers.mcap_records import (
+from restock.ingest.containers.formats.mcap_chunk import HEAD_SIZE, Chunk, Definitions
+from restock.ingest.containers.formats.mcap_records import (
     MAGIC,
     PREFIX,
     FileBytes,

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from restock.errors import RecordingError
 from restock.files import cores
-from restock.ingest.containers import mcap_chunk
-from restock.ingest.containers.mcap_chunk import LATEST_NS, Chunk, Messages
+from restock.ingest.containers.formats import mcap_chunk
+from restock.ingest.containers.formats.mcap_chunk import LATEST_NS, Chunk, Messages
+from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, FileBytes, crc32
 from restock.ingest.containers.mcap_contents import ROSBAG2, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
-from restock.ingest.containers.mcap_records import MAGIC, PREFIX, FileBytes, crc32
 from restock.ingest.containers.mcap_salvage import resume
 from restock.ingest.containers.storage import (
     NOT_KEPT,

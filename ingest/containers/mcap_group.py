@@ -13,9 +13,15 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.ingest.containers import mcap_chunk
-from restock.ingest.containers.mcap_chunk import BadChunk, Chunk, Indexed, Messages, Positions
-from restock.ingest.containers.mcap_records import FileBytes
+from restock.ingest.containers.formats import mcap_chunk
+from restock.ingest.containers.formats.mcap_chunk import (
+    BadChunk,
+    Chunk,
+    Indexed,
+    Messages,
+    Positions,
+)
+from restock.ingest.containers.formats.mcap_records import FileBytes
 from restock.ingest.containers.storage import Damage, Integrity
 from restock.ingest.decoding.messages import MessageBatch
 

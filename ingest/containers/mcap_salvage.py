@@ -10,15 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from restock.ingest.containers.mcap_chunk import Chunk
-from restock.ingest.containers.mcap_contents import (
-    Contents,
-    Statistics,
-    cut_chunk_at,
-    statistics_at,
-    take_record,
-)
-from restock.ingest.containers.mcap_records import (
+from restock.ingest.containers.formats.mcap_chunk import Chunk
+from restock.ingest.containers.formats.mcap_records import (
     MAGIC,
     PREFIX,
     FileBytes,
@@ -27,6 +20,13 @@ from restock.ingest.containers.mcap_records import (
     crc32,
     parse,
     walk,
+)
+from restock.ingest.containers.mcap_contents import (
+    Contents,
+    Statistics,
+    cut_chunk_at,
+    statistics_at,
+    take_record,
 )
 
 FOOTER_SIZE = PREFIX + 20

@@ -403,7 +403,7 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
 
 
 def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
-    from restock.ingest.containers.mcap_records import Op, walk
+    from restock.ingest.containers.formats.mcap_records import Op, walk
 
     file = write_mcap(tmp_path / "run.mcap")
     content = bytearray(file.read_bytes())
@@ -424,7 +424,7 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
 
 def without_summary(path: Path, *, missing: int) -> Path:
     """The file without what comes after its data, and without one of its message indexes."""
-    from restock.ingest.containers.mcap_records import MAGIC, PREFIX, Op, walk
+    from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, Op, walk
 
     content = path.read_bytes()
     kept, indexes = [MAGIC], 0

@@ -25,7 +25,8 @@ SHARED = {
 MAY_IMPORT = {
     "ingest": "camera containers profile steps store task",
     "ingest/decoding": "",
-    "ingest/containers": "decoding",
+    "ingest/containers": "containers/formats decoding",
+    "ingest/containers/formats": "decoding",
     "ingest/camera": "containers decoding profile task",
     "ingest/task": "",
     "ingest/urdf": "",

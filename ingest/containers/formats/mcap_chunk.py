@@ -14,7 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
-from restock.ingest.containers.mcap_records import (
+from restock.ingest.containers.formats.mcap_records import (
     PREFIX,
     Buffer,
     Malformed,

@@ -1,0 +1,1 @@
+"""How recordings lie in bytes: the records and chunks of MCAP, the pages of SQLite."""

@@ -1,0 +1,244 @@
+"""The pages of a SQLite file's tables, and the rows in them, read without trusting the file.
+
+A leaf page of a table is recognised by its form, wherever it lies, and its rows by their columns.
+Where pages were inserted or removed, the page numbers in a file are off: by how much shows in the
+interior pages, which name the leaf of each row number. See https://www.sqlite.org/fileformat2.html.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from restock.arrays import Bools, Ints
+
+LEAF, INTERIOR = 0x0D, 0x05  # of a table
+SMALLEST_CELL = 4  # bytes
+INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # by serial type
+
+
+class Cell(NamedTuple):
+    """A row in a leaf page: its number, the types of its columns, and where its content is."""
+
+    rowid: int
+    types: tuple[int, ...]
+    body: int  # where the columns start in the payload
+    size: int  # of the whole payload
+    local: bytes  # as much of it as is in the page
+    overflow: int  # the page where it goes on; 0: nowhere
+
+
+class NotAPage(Exception):
+    """A page that is no whole page of a table."""
+
+
+@dataclass(frozen=True)
+class Moves:
+    """By how many pages what is named as page `named` lies further on: at some pages, in order."""
+
+    named: Ints
+    by: Ints
+
+    def of(self, page: int) -> int | None:
+        """How far a page moved; None where those around it moved differently."""
+        if not len(self.named):
+            return 0
+        at = int(np.searchsorted(self.named, page))
+        around = {int(self.by[near]) for near in (at - 1, at) if 0 <= near < len(self.by)}
+        return around.pop() if len(around) == 1 else None
+
+
+class Pages:
+    """The pages of a sqlite file, read one by one."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        head = self._file.read(100)
+        size = int.from_bytes(head[16:18], "big")
+        self.page_size = 65536 if size == 1 else size
+        if self.page_size < 512 or self.page_size & (self.page_size - 1):
+            self.page_size = 4096  # which is not what the damaged header says
+        self.usable = self.page_size - (head[20] if head[20] < 32 else 0)
+        self.count = path.stat().st_size // self.page_size
+
+    def page(self, number: int) -> bytes:
+        """A page; the first is number 1."""
+        self._file.seek((number - 1) * self.page_size)
+        return self._file.read(self.page_size)
+
+    def tables(self) -> Iterator[tuple[int, int, bytes]]:
+        """The number, kind and content of every page that starts like one of a table."""
+        for number in range(1, self.count + 1):
+            content = self.page(number)
+            kind = content[0] if number > 1 and content else 0
+            if kind in (LEAF, INTERIOR):
+                yield number, kind, content
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def cells(self, page: bytes) -> list[Cell]:
+        """The rows of a leaf page.
+
+        Raises:
+            NotAPage: not all of it has the form of one.
+        """
+        cells = [self.cell(page, at) for at in _pointers(page, 8)]
+        if any(left.rowid >= right.rowid for left, right in itertools.pairwise(cells)):
+            raise NotAPage
+        return cells
+
+    def cell(self, page: bytes, at: int) -> Cell:
+        """The row that starts at a place of a leaf page."""
+        size, start = _varint(page, at)
+        rowid, start = _varint(page, start)
+        rowid -= (rowid >> 63) << 64
+        most = self.usable - 35
+        local = size
+        if size > most:
+            least = (self.usable - 12) * 32 // 255 - 23
+            local = least + (size - least) % (self.usable - 4)
+            local = local if local <= most else least
+        stop = start + local
+        if stop + (4 if local < size else 0) > self.usable:
+            raise NotAPage
+        content = page[start:stop]
+        overflow = int.from_bytes(page[stop : stop + 4], "big") if local < size else 0
+        return Cell(rowid, *_types(content, size), size, content, overflow)
+
+    def payload(self, cell: Cell, moves: Moves, taken: Bools) -> bytes | None:
+        """The whole content of a row; None where pages of it are missing, or not surely its own.
+
+        `taken` marks the pages that belong to something; those of this row are added.
+        """
+        parts, left, number = [cell.local], cell.size - len(cell.local), cell.overflow
+        used = list[int]()
+        while left:
+            by = moves.of(number)
+            place = number + by if by is not None else 0
+            if 1 < place <= self.count and not taken[place]:
+                taken[place] = True
+                used.append(place)
+                page = self.page(place)
+                number = int.from_bytes(page[:4], "big")
+                parts.append(page[4 : min(self.usable, left + 4)])
+                left -= len(parts[-1])
+                if bool(left) == bool(number):
+                    continue
+            taken[used] = False
+            return None
+        return b"".join(parts)
+
+
+def children(page: bytes) -> list[tuple[int, int]]:
+    """The pages below an interior page, each with the last row number it may hold.
+
+    Raises:
+        NotAPage: not all of it has the form of one.
+    """
+    found = []
+    for at in _pointers(page, 12):
+        if at + 4 >= len(page):
+            raise NotAPage
+        found.append((int.from_bytes(page[at : at + 4], "big"), _varint(page, at + 4)[0]))
+    if any(left[1] >= right[1] for left, right in itertools.pairwise(found)):
+        raise NotAPage
+    return found
+
+
+def moves_of(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
+    """How far pages moved: from the leaves (last row number, page), and interior pages.
+
+    An interior page counts where it is the one right above leaves: each of its rows' numbers is
+    the last of the leaf that comes next.
+    """
+    leaves = sorted(leaves)
+    place = {last: (order, page) for order, (last, page) in enumerate(leaves)}
+    named: dict[int, int] = {}
+    for below in interiors:
+        known = [(child, *place[key]) for child, key in below if key in place]
+        for one, (child, order, page) in enumerate(known):
+            beside = one and order == known[one - 1][1] + 1
+            beside = beside or (one + 1 < len(known) and known[one + 1][1] == order + 1)
+            if child == page or beside:
+                named[child] = page - child
+    items = sorted(named.items())
+    pages, by = zip(*items, strict=True) if items else ((), ())
+    return Moves(np.array(pages, np.int64), np.array(by, np.int64))
+
+
+def integer(cell: Cell, column: int) -> int | None:
+    """The integer in a column of a row; None where it holds something else."""
+    at = cell.body + sum(map(_size, cell.types[:column]))
+    kind = cell.types[column]
+    if kind not in INT_SIZES or at + INT_SIZES[kind] > len(cell.local):
+        return None
+    return (
+        kind - 8
+        if kind in (8, 9)
+        else int.from_bytes(cell.local[at : at + INT_SIZES[kind]], "big", signed=True)
+    )
+
+
+def column(cell: Cell, payload: bytes, number: int) -> bytes:
+    """The bytes of a column that holds a text or a blob."""
+    at = cell.body + sum(map(_size, cell.types[:number]))
+    return payload[at : at + _size(cell.types[number])]
+
+
+def is_blob(kind: int) -> bool:
+    return kind >= 12 and kind % 2 == 0
+
+
+def is_text(kind: int) -> bool:
+    return kind >= 13 and kind % 2 == 1
+
+
+def _pointers(page: bytes, start: int) -> tuple[int, ...]:
+    count = int.from_bytes(page[3:5], "big")
+    if not count or start + 2 * count > len(page):
+        raise NotAPage
+    places: tuple[int, ...] = struct.unpack_from(f">{count}H", page, start)
+    if min(places) < start + 2 * count or max(places) + SMALLEST_CELL > len(page):
+        raise NotAPage
+    return places
+
+
+def _types(content: bytes, size: int) -> tuple[tuple[int, ...], int]:
+    """The types of a record's columns, and where they start."""
+    stop, at = _varint(content, 0)
+    if not at <= stop <= len(content):
+        raise NotAPage
+    types = []
+    while at < stop:
+        kind, at = _varint(content, at)
+        types.append(kind)
+    if at != stop or stop + sum(map(_size, types)) != size:
+        raise NotAPage
+    return tuple(types), stop
+
+
+def _size(kind: int) -> int:
+    if kind >= 12:
+        return (kind - 12) // 2
+    return 8 if kind == 7 else INT_SIZES.get(kind, 0)
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """A number of one to nine bytes, and where it ends."""
+    value = 0
+    for place in range(at, min(at + 8, len(data))):
+        byte = data[place]
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            return value, place + 1
+    if at + 9 > len(data):
+        raise NotAPage
+    return value << 8 | data[at + 8], at + 9
