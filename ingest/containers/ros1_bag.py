@@ -1,0 +1,261 @@
+"""A ROS 1 bag's bytes: `rosbags` reads its index; here its sizes are checked and chunks inflated.
+
+A bag that was cut short has no index: what it holds is found by walking its chunks, which carry
+their own message definitions.
+"""
+
+from __future__ import annotations
+
+import bz2
+import io
+import struct
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import lz4.frame
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType, normalize
+from rosbags.typesys.msg import normalize_msgtype
+
+from restock.ingest.containers.storage import Packed, Watch
+
+# A chunk's size is the file's claim: what decompresses to more than both is refused.
+PLAUSIBLE_SIZE = 64 << 20
+PLAUSIBLE_RATIO = 1000
+# Of chunks that are read again: who proposes a profile reads topic after topic, and bz2 is slow.
+KEPT_BYTES = 128 << 20
+
+# What reading a damaged bag raises, here and in rosbags.
+BROKEN = (
+    *(ReaderError, AssertionError, ValueError, KeyError, IndexError, struct.error),
+    *(OSError, EOFError, RuntimeError, OverflowError),
+)
+
+_KNOWN = frozenset(int(kind) for kind in RecordType)
+_MESSAGE, _CONNECTION = bytes([RecordType.MSGDATA]), bytes([RecordType.CONNECTION])
+
+
+@dataclass
+class Walked:
+    """What the chunks of a bag without an index hold."""
+
+    counts: dict[int, Counter[int]] = field(default_factory=dict)  # by position and connection
+    spans: list[tuple[int, int]] = field(default_factory=list)
+    stop: int = 0  # of what was read
+
+
+def walk(
+    data: bytes, named: dict[int, tuple[dict[bytes, bytes], dict[bytes, bytes]]] | None = None
+) -> tuple[dict[int, list[tuple[int, int, int]]], int | None]:
+    """Start, end and stamp of every message of a chunk, by connection; and where it is damaged.
+
+    `named` gets the connections that it defines, as the fields of a record's header and data.
+    """
+    found: dict[int, list[tuple[int, int, int]]] = {}
+    at, end = 0, len(data)
+    while at < end:
+        start = at + 4 + int.from_bytes(data[at : at + 4], "little")
+        stop = start + 4 + int.from_bytes(data[start : start + 4], "little")
+        if start + 4 > end or stop > end:
+            return found, at
+        fields = _fields(data, at + 4, start)
+        kind = fields.get(b"op", b"")
+        if kind == _MESSAGE and len(fields.get(b"conn", b"")) == 4 == len(fields[b"time"]) // 2:
+            seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+            channel = int.from_bytes(fields[b"conn"], "little")
+            rows = found.setdefault(channel, [])
+            rows.append((start + 4, stop, seconds * 1_000_000_000 + nanoseconds))
+        elif kind != _CONNECTION:
+            return found, at
+        elif named is not None:
+            channel = int.from_bytes(fields.get(b"conn", b""), "little")
+            named.setdefault(channel, (fields, _fields(data, start + 4, stop)))
+        at = stop
+    return found, None
+
+
+def _fields(data: bytes, at: int, stop: int) -> dict[bytes, bytes]:
+    """The fields of a record's header."""
+    fields = {b"time": b""}
+    while at < stop:
+        end = at + 4 + int.from_bytes(data[at : at + 4], "little")
+        name, _, value = data[at + 4 : min(end, stop)].partition(b"=")
+        fields[name] = value
+        at = end
+    return fields
+
+
+class Bag(Reader):
+    """rosbags' reader, which trusts the sizes in a bag, with these checked."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(_BoundedPath(path))  # type: ignore[arg-type]
+        self._size = path.stat().st_size
+        self._entries = 0
+        self._chunks: dict[int, tuple[str, int]] = {}  # position -> compression, size inside
+        self._cut: set[int] = set()  # chunks of which the file ends before they do
+        self._read: set[int] = set()
+        self._kept: dict[int, bytes] = {}
+
+    def read_chunk(self) -> Chunk:
+        assert self.bio
+        position = self.bio.tell()
+        if position in self._chunks:
+            raise ReaderError("two chunks at the same position")
+        header = Header.read(self.bio, RecordType.CHUNK)
+        self._chunks[position] = header.get_string("compression"), header.get_uint32("size")
+        self.bio.seek(position)
+        return super().read_chunk()
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        assert self.bio
+        start = self.bio.tell()
+        super().read_index_data(pos, indexes)
+        # Index records that lie over each other could hold more than the file has bytes.
+        self._entries += self.bio.tell() - start
+        if self._entries > self._size:
+            raise ReaderError("its index is larger than the bag")
+
+    def open_without_index(self, watch: Watch) -> Walked:
+        """Find what its chunks hold, up to where the file makes no sense.
+
+        Raises:
+            ReaderError: it is no bag of format 2.0.
+        """
+        self.bio = self.path.open("rb")
+        if self.bio.readline() != b"#ROSBAG V2.0\n":
+            raise ReaderError("File magic is invalid.")
+        walked = Walked()
+        named: dict[int, tuple[dict[bytes, bytes], dict[bytes, bytes]]] = {}
+        while (at := self.bio.tell()) < self._size:
+            watch("looking through the file, bytes", at, self._size)
+            try:
+                header = Header.read(self.bio)
+                kind = header.get_uint8("op")
+                if kind != RecordType.CHUNK:
+                    data = self.bio.tell()
+                    length = int.from_bytes(self.bio.read(4), "little")
+                    if data + 4 + length > self._size or kind not in _KNOWN:
+                        break
+                    self.bio.seek(length, 1)
+                    walked.stop = self.bio.tell()
+                    continue
+                self.bio.seek(at)
+                chunk = self.read_chunk()
+            except BROKEN:
+                break
+            stop = chunk.datapos + chunk.datasize
+            if stop > self._size:
+                self._cut.add(at)
+            self.chunks[at] = chunk
+            try:
+                found, _ = walk(self.inflated(at), named)
+            except BROKEN:  # said when it is read
+                found = {}
+            walked.counts[at] = Counter({key: len(rows) for key, rows in found.items()})
+            times = [time for rows in found.values() for _, _, time in rows]
+            walked.spans += [(min(times), max(times))] if times else []
+            walked.stop = min(stop, self._size)
+            self.bio.seek(walked.stop)
+        self._read.clear()  # who reads a bag once keeps nothing of it
+        self.connections = [self._connection(key, *one) for key, one in sorted(named.items())]
+        return walked
+
+    def _connection(
+        self, key: int, outer: dict[bytes, bytes], inner: dict[bytes, bytes]
+    ) -> Connection:
+        """A connection, as a chunk defines it."""
+        texts = {
+            name: (inner.get(name) or outer.get(name) or b"").decode(errors="replace")
+            for name in (b"topic", b"type", b"md5sum", b"message_definition")
+        }
+        return Connection(
+            key,
+            normalize(outer.get(b"topic", b"").decode(errors="replace") or texts[b"topic"]),
+            normalize_msgtype(texts[b"type"]),
+            MessageDefinition(MessageDefinitionFormat.MSG, texts[b"message_definition"]),
+            texts[b"md5sum"],
+            0,
+            ConnectionExtRosbag1(None, None),
+            self,
+        )
+
+    def packed(self) -> list[Packed]:
+        """Its chunks, by how they are compressed."""
+        by: dict[str, list[int]] = {}
+        for position, (compression, _) in self._chunks.items():
+            by.setdefault("" if compression == "none" else compression, []).append(position)
+        return [
+            Packed(
+                name,
+                len(some),
+                sum(self.chunks[one].datasize for one in some if one in self.chunks),
+                sum(self._chunks[one][1] for one in some),
+            )
+            for name, some in by.items()
+        ]
+
+    def inflated(self, position: int) -> bytes:
+        """A chunk's records; from the second time on kept, while there is room."""
+        if (kept := self._kept.get(position)) is not None:
+            return kept
+        data = self._inflated(position)
+        room = KEPT_BYTES - sum(map(len, self._kept.values()))
+        if position in self._read and len(data) <= room and self._chunks[position][0] == "bz2":
+            self._kept[position] = data
+        self._read.add(position)
+        return data
+
+    def _inflated(self, position: int) -> bytes:
+        assert self.bio
+        chunk = self.chunks[position]
+        compression, size = self._chunks[position]
+        cut = position in self._cut
+        if chunk.datasize > self._size and not cut:
+            raise ReaderError("it is longer than the bag")
+        if size > max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * chunk.datasize):
+            raise ReaderError(f"{chunk.datasize:,} bytes that claim to hold {size:,}")
+        self.bio.seek(chunk.datapos)
+        stored = self.bio.read(chunk.datasize)
+        if compression == "none":
+            data = stored
+        elif compression == "bz2":
+            data = bz2.BZ2Decompressor().decompress(stored, max_length=size + 1)
+        else:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size + 1)
+        if len(data) != size and not (cut and len(data) < size):
+            raise ReaderError(f"{len(data):,} bytes, where it claims {size:,}")
+        return bytes(data)
+
+
+class _BoundedPath:
+    """A file of which no more can be read than it has."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def exists(self) -> bool:
+        return self._path.exists()
+
+    def open(self, mode: str) -> io.BufferedReader:
+        return _BoundedFile(io.FileIO(self._path, mode), self._path.stat().st_size)
+
+
+class _BoundedFile(io.BufferedReader):
+    def __init__(self, raw: io.RawIOBase, size: int) -> None:
+        super().__init__(raw)
+        self._size = size
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = max(self._size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
