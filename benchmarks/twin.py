@@ -199,13 +199,13 @@ def parts(count: int, steps: int) -> dict[str, float]:
         ("lidar", sim, "cast"),
         ("sensors and their noise", env.sensing, "sense"),
         ("sensors and their noise", env.sensing, "add_motion"),
+        ("route", env.navigation, "add_route"),
         ("navigation: plans, blocked aisles", env.navigation, "update"),
         ("traffic", sim.traffic, "advance"),
         ("traffic", sim.scenery, "walk"),
         ("controller and friction", sim, "drive"),
-        ("truth", env.truth, "look"),
-        ("truth", env.truth, "conclude"),
-        ("info", env, "_info_after"),
+        ("truth", env.truth, "note_situation"),
+        ("truth", env.truth, "condition"),
         ("autoreset: episodes laid out", env, "_begin"),
         ("the rest of step", env, "step"),
     ):
@@ -213,8 +213,8 @@ def parts(count: int, steps: int) -> dict[str, float]:
     swapped = {
         "observe": "observation",
         "reward": "reward and termination",
-        "terminated": "reward and termination",
-        "add_route": "route",
+        "is_terminated": "reward and termination",
+        "info_after": "info",
     }
     before = {name: getattr(vector_env, name) for name in swapped}
     rng = np.random.default_rng(0)

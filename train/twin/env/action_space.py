@@ -1,8 +1,9 @@
-"""The two action spaces of the task: an index into its table, or any command within its reach.
+"""What may be done in the twin: an index into the task's table, or any command within its reach.
 
 There is one task. In the continuous space the base gets the very command of the action, while
 the observation's previous action and the reward's change of action are those of the nearest action
-of the table: what `restock ingest` does to the continuous commands of a log.
+of the table: what `restock ingest` does to the continuous commands of a log. The same holds where a
+limiter in front changes a command.
 """
 
 from __future__ import annotations
@@ -15,9 +16,13 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
 from restock.errors import ConfigError
+from restock.ingest.task.limiter import Limits, limit
+from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, nearest_action
 
 ActionKind = Literal["discrete", "continuous"]
+# Task actions (N,), commands (N, 2) in m/s and rad/s, and what to add to `info`.
+Chosen = tuple[Ints, F64, dict[str, NDArray[Any]]]
 
 
 class DiscreteActions:
@@ -28,8 +33,8 @@ class DiscreteActions:
         self._table = np.asarray(task.actions, np.float64)
         self.space = gymnasium.spaces.Discrete(len(task.actions))
 
-    def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
-        """Task actions (N,), commands (N, 2) in m/s and rad/s, and what to add to `info`."""
+    def read(self, actions: NDArray[Any]) -> Chosen:
+        """What these actions (N,) are."""
         action = np.asarray(actions, np.int64).reshape(self._num_envs)
         return action, self._table[action], {}
 
@@ -46,7 +51,7 @@ class ContinuousActions:
         table = np.asarray(task.actions, np.float32)
         self.space = gymnasium.spaces.Box(table.min(axis=0), table.max(axis=0), dtype=np.float32)
 
-    def read(self, actions: NDArray[Any]) -> tuple[Ints, F64, dict[str, NDArray[Any]]]:
+    def read(self, actions: NDArray[Any]) -> Chosen:
         """As for discrete ones. Raises ConfigError for an action that is not finite."""
         requested = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
         if not np.isfinite(requested).all():
@@ -72,3 +77,18 @@ def action_space(
     raise ConfigError(
         f"unknown action space {kind!r}", where="the twin", remedy="discrete, or continuous"
     )
+
+
+def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
+    """What becomes of the chosen actions behind a limiter; `info["limiter"]` has the rule of each.
+
+    The action of a command that was held back is the nearest, as a log of it would have it.
+    """
+    action, command, told = chosen
+    before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
+    limited = limit(limits, command, now["sector_clearance_m"], before)
+    held, command = limited.intervened, limited.command
+    nearest, residual = nearest_action(task, *command.T)
+    action = np.where(held, nearest, action)
+    residual = np.where(held, residual, told.get("action_residual", 0.0))
+    return action, command, {"action": action, "action_residual": residual, "limiter": limited.rule}

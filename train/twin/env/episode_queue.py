@@ -13,7 +13,7 @@ import numpy as np
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.state import Stateful
-from restock.train.twin.env.mission_arms import MissionArms, floor_place, perturbed
+from restock.train.twin.env.mission_arms import MissionArm, MissionArms, floor_place, perturbed
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
@@ -50,7 +50,8 @@ class EpisodeQueue(Stateful):
         self.next_fixed = 0
         self._orders: MissionOrders | None = None
         self._orders_share = 0.0
-        self._arms: MissionArms | None = None
+        self._asked: MissionArms | None = None  # the last that were asked for
+        self._arms: MissionArms | None = None  # in force
         self._arm_shares = np.zeros(0)  # cumulative
         self.set_conditions(conditions)
 
@@ -72,12 +73,14 @@ class EpisodeQueue(Stateful):
         """From now on this share of the drawn episodes is of these orders, each at its part."""
         self._orders, self._orders_share = orders, share
 
-    def practise(self, arms: MissionArms, shares: Sequence[float]) -> None:
-        """From now on the drawn episodes are of these arms, in these shares.
+    def practise(self, shares: Sequence[float]) -> None:
+        """From now on the drawn episodes are of the last `arms`, in these shares.
 
         Raises:
             ConfigError: they are not one share an arm, numbers of at least 0 and not all 0.
         """
+        if (arms := self._asked) is None:
+            raise ConfigError("has no arms yet: ask for `mission_arms` first", where="the twin")
         parts = np.asarray(shares, np.float64)
         if parts.shape != (len(arms.arms),) or not (parts >= 0).all() or not parts.sum() > 0:
             raise ConfigError(
@@ -85,9 +88,9 @@ class EpisodeQueue(Stateful):
             )
         self._arms, self._arm_shares = arms, np.cumsum(parts) / parts.sum()
 
-    def arms(self, by: Sequence[str], planners: Sequence[Planner]) -> MissionArms:
+    def arms(self, by: Sequence[str], planners: Sequence[Planner]) -> list[MissionArm]:
         """The arms that its drawn episodes can be of. Raises ConfigError as `MissionArms`."""
-        return MissionArms(
+        self._asked = MissionArms(
             self._layouts,
             planners,
             self.conditions,
@@ -96,6 +99,7 @@ class EpisodeQueue(Stateful):
             orders=self._orders,
             orders_share=self._orders_share,
         )
+        return self._asked.arms
 
     def restored(self) -> None:
         """What the shares add up to follows from them."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RunError
 from restock.ingest.task.scan import Body
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
@@ -68,6 +68,24 @@ def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
                 remedy="choose a floor with wider aisles (env.layouts, `restock twin layout`), or"
                 " correct the outline in [task.body]",
             )
+
+
+def names_and_hashes(floors: Iterable[Warehouse]) -> list[list[str]]:
+    """What a saved state holds of the floors that it is of."""
+    return [[floor.name, floor.hash] for floor in floors]
+
+
+def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehouse]) -> None:
+    """Raises RunError where a saved state, by its `names_and_hashes`, is not of these floors."""
+    here = names_and_hashes(floors)
+    if saved != here:
+        changed = [floor[0] for floor in saved if floor not in here]
+        raise RunError(
+            f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
+            f" {len(saved)} floors, not among this one's {len(here)}",
+            where="state of the twin",
+            remedy="make the environment with the layouts of then; a file may have changed",
+        )
 
 
 def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:

@@ -19,7 +19,7 @@ from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
 from restock.train.twin.physics.episode import Episode
-from restock.train.twin.physics.sensing import Sensing
+from restock.train.twin.physics.sensing import Sensing, add_route
 
 STRAYED_M = 0.6
 LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
@@ -60,8 +60,15 @@ class Navigation(Stateful):
         self.plan_number[env] += 1
         self.finder.reset(np.array([env]))
 
-    def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> Ints:
-        """Look at the new signals; returns whose plan changed."""
+    def add_route(self, signals: Signals, ids: Ints | slice = slice(None)) -> F64:
+        """Add what robots see of their plans and goals; returns how far off plan they are."""
+        return add_route(self.task, signals, self.plans_m[ids], self.goals_m[ids])
+
+    def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> None:
+        """Look at the new signals, and show the new plan of those whose plan is made again.
+
+        It counts from this step on: a new plan never makes progress jump.
+        """
         again = set(np.flatnonzero(offset_m > STRAYED_M).tolist())
         again |= self._find_blocks(signals, sensing)
         for env in again:
@@ -72,7 +79,12 @@ class Navigation(Stateful):
                 self.closures[env],
             )
             self.plan_number[env] += 1
-        return np.array(sorted(again), np.int64)
+        if again:
+            ids = np.array(sorted(again), np.int64)
+            rows: Signals = {name: column[ids] for name, column in signals.items()}
+            self.add_route(rows, ids)
+            for name, column in rows.items():
+                signals[name][ids] = column
 
     def propose(self, signals: Signals) -> None:
         """Add what it would do next, whoever drives: by the plan in force and this step's scan."""

@@ -30,20 +30,25 @@ from numpy.typing import NDArray
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.limiter import Limits, limit
+from restock.ingest.task.limiter import Limits
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, nearest_action, observe, reward
+from restock.ingest.task.task import Task, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
-from restock.train.twin.env.action_space import ActionKind, action_space
+from restock.train.twin.env.action_space import ActionKind, action_space, behind_limiter
 from restock.train.twin.env.camera import Renderer, View
 from restock.train.twin.env.episode_queue import EpisodeQueue
-from restock.train.twin.env.floor_report import refuse_too_large, refuse_unfit
+from restock.train.twin.env.floor_report import (
+    names_and_hashes,
+    refuse_other_floors,
+    refuse_too_large,
+    refuse_unfit,
+)
 from restock.train.twin.env.info import info_after, info_now
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
-from restock.train.twin.env.mission_arms import MissionArm, MissionArms
+from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.floors.floors import floors_of
@@ -51,7 +56,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_trial import robot_model
-from restock.train.twin.physics.sensing import Sensing, add_route
+from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 from restock.train.twin.physics.truth import Truth
 
@@ -168,7 +173,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             planners = self.navigation.planners
             orders = MissionOrders(missions, self.floors, planners, where="env.missions")
             self.queue.follow(orders, missions_share)
-        self._arms: MissionArms | None = None
         self.limits: Limits | None = None  # a limiter in front of whoever drives; None: none
         self.specs: list[EpisodeSpec] = [EpisodeSpec("nominal", 0)] * num_envs
         self.diverged = 0  # episodes that ended in a NaN or beyond MuJoCo's limits
@@ -216,8 +220,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         Raises:
             ConfigError: `by` names something else.
         """
-        self._arms = self.queue.arms(by, self.navigation.planners)
-        return self._arms.arms
+        return self.queue.arms(by, self.navigation.planners)
 
     def set_mission_shares(self, shares: Sequence[float]) -> None:
         """Shares of the last `mission_arms`, for episodes that begin from now on.
@@ -225,9 +228,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         Raises:
             ConfigError: they are not one share an arm.
         """
-        if self._arms is None:
-            raise ConfigError("has no arms yet: ask for `mission_arms` first", where="the twin")
-        self.queue.practise(self._arms, shares)
+        self.queue.practise(shares)
 
     def set_episodes(self, specs: Iterable[EpisodeSpec]) -> None:
         """Run these episodes, in order, from the next reset on; then episodes drawn as usual.
@@ -246,7 +247,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.steps[ids] = self.bumps[ids] = self.previous_action[ids] = 0
         first = self.sensing.sense(ids, self.steps[ids])
         self.sensing.add_motion(ids, first)
-        add_route(self.task, first, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
+        self.navigation.add_route(first, ids)
         self.navigation.propose(first)
         observed = observe(self.task, first, first, self.previous_action[ids])
         self.observation[ids] = _bounded(observed)
@@ -302,16 +303,11 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     def step(self, actions: NDArray[Any]) -> Step:
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
-        action, command, chosen = self._actions.read(actions)
         now, sim, task = self.signals, self.simulation, self.task
+        chosen = self._actions.read(actions)
         if self.limits is not None:
-            before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
-            limited = limit(self.limits, command, now["sector_clearance_m"], before)
-            held, command = limited.intervened, limited.command
-            nearest, residual = nearest_action(task, *command.T)
-            action = np.where(held, nearest, action)  # as a log of the command would have it
-            residual = np.where(held, residual, chosen.get("action_residual", 0.0))
-            chosen = {"action": action, "action_residual": residual, "limiter": limited.rule}
+            chosen = behind_limiter(self.limits, task, now, chosen)
+        action, command, told = chosen
         everyone = np.arange(self.num_envs)
         self.truth.note_situation(sim, self.navigation.plans_m)
         sim.drive(command)
@@ -319,23 +315,20 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
         after = self.sensing.sense(everyone, self.steps)
         self.sensing.add_motion(everyone, after, now)
-        plans, goals = self.navigation.plans_m, self.navigation.goals_m
-        offset = add_route(task, after, plans, goals)
+        offset = self.navigation.add_route(after)
         progress = now["route_remaining_m"] - after["route_remaining_m"]
         earned = reward(task, now, after, progress, action, self.previous_action)
         terminated = is_terminated(task, after)
         invalid = sim.diverged
         self.bumps += sim.bumped
-        changed = self.navigation.update(after, offset, self.sensing)
-        if len(changed):  # a new plan counts from t + 1 on: it never makes progress jump
-            self._see_new_plans(after, changed)
+        self.navigation.update(after, offset, self.sensing)
         self.navigation.propose(after)
 
         terminated &= ~invalid
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
         observed = _bounded(observe(task, after, now, action))
         truth = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
-        info = info_after(self, after, progress, truth, terminated) | chosen
+        info = info_after(self, after, progress, truth, terminated) | told
         if invalid.any():
             self.diverged += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)
@@ -347,12 +340,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             self.signals = {name: column.copy() for name, column in after.items()}
             self._begin(np.flatnonzero(done))
         return self.observation.copy(), earned, terminated, truncated, info
-
-    def _see_new_plans(self, after: Signals, ids: Ints) -> None:
-        rows: Signals = {name: column[ids] for name, column in after.items()}
-        add_route(self.task, rows, self.navigation.plans_m[ids], self.navigation.goals_m[ids])
-        for name, column in rows.items():
-            after[name][ids] = column
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
@@ -383,7 +370,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a bit-exact continuation needs, and what it must be continued on."""
-        floors = [[floor.name, floor.hash] for floor in self.floors]
+        floors = names_and_hashes(self.floors)
         return {"task_hash": self.task.hash, "floors": floors, **super().state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -400,15 +387,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
                 where="state of the twin",
                 remedy="make the environment as it was made when the state was saved",
             )
-        floors = [[floor.name, floor.hash] for floor in self.floors]
-        if state["floors"] != floors:
-            changed = [floor[0] for floor in state["floors"] if floor not in floors]
-            raise RunError(
-                f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
-                f" {len(state['floors'])} floors, not among this one's {len(floors)}",
-                where="state of the twin",
-                remedy="make the environment with the layouts of then; a file may have changed",
-            )
+        refuse_other_floors(state["floors"], self.floors)
         for env, spec in enumerate(specs):
             self._lay_out(env, spec)
         super().load_state_dict(state)
