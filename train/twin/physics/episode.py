@@ -21,7 +21,8 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.model import NO_PATCH, PALLET_HALF_M, PALLETS, PARKED_M, PATCHES
+from restock.train.twin.physics.contact import NO_PATCH, PATCHES
+from restock.train.twin.physics.model import PALLET_HALF_M, PALLETS, PARKED_M
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.traffic import AGENTS, Walk, draw_walks
 

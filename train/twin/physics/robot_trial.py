@@ -19,14 +19,11 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
-from restock.train.twin.physics.model import (
-    FLOOR_FRICTION,
-    actuator_places,
-    build_robot_alone,
-    wheel_geoms,
-)
+from restock.train.twin.physics.contact import FLOOR_FRICTION
+from restock.train.twin.physics.model import build_robot_alone
 from restock.train.twin.physics.own_model import own_model
 from restock.train.twin.physics.robot_model import RobotModel, design, stand_in
+from restock.train.twin.physics.robot_parts import actuator_places, wheels_of
 
 TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5
@@ -165,7 +162,7 @@ def _driven(
 ) -> tuple[float, float]:
     """The steady speed (m/s) and yaw rate (rad/s) under a command."""
     model = build_robot_alone(robot, TIMESTEP_S)
-    for geom in wheel_geoms(model, robot):
+    for geom in wheels_of(model, robot).geoms:
         model.geom_friction[geom, 0] = friction
     data = mujoco.MjData(model)
     data.qpos[2] = robot.rest_z_m

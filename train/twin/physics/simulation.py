@@ -23,17 +23,16 @@ from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.episode import Episode
-from restock.train.twin.physics.model import (
+from restock.train.twin.physics.contact import (
     FLOOR_FRICTION,
     NO_PATCH,
     OBSTACLE_GROUP,
     PATCHES,
     SLIPPERY_BELOW,
-    build_model,
     friction_at,
-    yaw_of,
 )
+from restock.train.twin.physics.episode import Episode
+from restock.train.twin.physics.model import build_model, yaw_of
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import RobotBody, SteeringController, base_controller
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in

@@ -1,0 +1,239 @@
+"""The robot's part of the MuJoCo model: built of chassis, casters, wheels and motors, or its own.
+
+Wheels collide as spheres, because a sphere's one contact point costs less than a cylinder's, and
+are drawn as cylinders. A mecanum wheel is a sphere that is driven about one diagonal and rolls
+freely about the other, as its rollers do. A model of its own (`own_model`) gets the outline, the
+sensors and the grip that every robot has.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+
+from restock.train.twin.physics.contact import (
+    CHASSIS_MASK,
+    DRAWN_GROUP,
+    FLOOR,
+    NO_MASK,
+    ROBOT_GROUP,
+    ROLLING_MASK,
+    SOFT,
+)
+from restock.train.twin.physics.own_model import (
+    actuators,
+    attach_own,
+    steering_joints,
+    wheel_geom,
+    wheel_joints,
+)
+from restock.train.twin.physics.robot_model import RobotModel
+
+CASTER_LIFT_M = 0.001  # so that the driven wheels carry most of the load
+STEERING_RADPS = 50.0  # the natural frequency of a steering motor with its wheel
+
+
+def add_robot(spec: Any, robot: RobotModel) -> None:
+    """Put the robot into the twin's model: built, or its own in that place."""
+    if robot.mjcf is not None:
+        _add_own(spec, robot)
+        return
+    axle_z = robot.contact_radius_m
+    chassis = spec.worldbody.add_body(name="chassis", pos=[1, 1, axle_z])
+    chassis.add_freejoint()
+    chassis.add_geom(
+        name="chassis",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0.0 - robot.axle_x_m, 0, robot.chassis_z_m - axle_z],
+        size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 2],
+        mass=0 if robot.ballast else robot.chassis_kg,
+        rgba=[0.95, 0.55, 0.15, 1],
+        group=ROBOT_GROUP,
+        **CHASSIS_MASK,
+    )
+    if robot.ballast:
+        chassis.add_geom(
+            name="ballast",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[-robot.axle_x_m, 0, robot.chassis_z_m - robot.chassis_height_m / 4 - axle_z],
+            size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 4],
+            mass=robot.chassis_kg,
+            group=DRAWN_GROUP + 1,
+            **NO_MASK,
+        )
+    chassis.add_site(name="imu", pos=[0, 0, 0])
+    for name, (x, y) in zip(_caster_names(len(robot.casters_m)), robot.casters_m, strict=True):
+        chassis.add_geom(
+            name=f"caster_{name}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[x, y, robot.caster_radius_m - axle_z + CASTER_LIFT_M],
+            size=[robot.caster_radius_m, 0, 0],
+            mass=robot.caster_kg,
+            condim=1,
+            priority=3,
+            group=ROBOT_GROUP,
+            **SOFT,
+            **ROLLING_MASK,
+        )
+    places = zip(_wheel_names(robot), robot.wheels_m.tolist(), strict=True)
+    for number, (name, (x, y)) in enumerate(places):
+        wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
+        rolls_free = robot.steers and name.startswith("front")
+        if rolls_free:
+            _add_steering(spec, wheel, name, robot)
+        rollers = robot.roller_axes
+        wheel.add_joint(
+            name=f"{name}_wheel_joint",
+            type=mujoco.mjtJoint.mjJNT_HINGE if rollers is None else mujoco.mjtJoint.mjJNT_BALL,
+            axis=[0, 1, 0],
+            armature=robot.armature,
+            damping=[robot.damping, 0, 0],
+        )
+        wheel.add_geom(
+            name=f"{name}_wheel",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[axle_z, 0, 0],
+            mass=robot.wheel_kg,
+            condim=3,
+            priority=3,
+            friction=FLOOR,
+            group=DRAWN_GROUP + 1,  # hidden by default: the cylinder is what is drawn
+            **SOFT,
+            **ROLLING_MASK,
+        )
+        wheel.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[axle_z, 0.25 * axle_z, 0],
+            quat=[0.7071068, 0.7071068, 0, 0],
+            mass=0,
+            contype=0,
+            conaffinity=0,
+            rgba=[0.1, 0.1, 0.1, 1],
+            group=ROBOT_GROUP,
+        )
+        if rolls_free:
+            continue
+        motor = spec.add_actuator(
+            name=f"{name}_motor",
+            target=f"{name}_wheel_joint",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-robot.motor_limit_nm, robot.motor_limit_nm],
+            forcelimited=True,
+        )
+        if rollers is not None:
+            motor.trntype = mujoco.mjtTrn.mjTRN_JOINTINPARENT
+            motor.gear = [*rollers[number], 0, 0, 0]
+        motor.set_to_velocity(kv=robot.motor_kv)
+    if robot.steers:
+        _add_steering_motors(spec, robot)
+    _add_sensors(spec)
+
+
+def _add_steering(spec: Any, wheel: Any, name: str, robot: RobotModel) -> None:
+    wheel.add_joint(
+        name=f"{name}_steering",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0, 0, 1],
+        armature=robot.armature,
+    )
+
+
+def _add_steering_motors(spec: Any, robot: RobotModel) -> None:
+    """Critically damped, and much faster than wheels are steered."""
+    inertia = robot.armature + 0.4 * robot.wheel_kg * robot.contact_radius_m**2
+    for side in ("left", "right"):
+        motor = spec.add_actuator(
+            name=f"{side}_steering_motor",
+            target=f"front_{side}_steering",
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-2 * robot.motor_limit_nm, 2 * robot.motor_limit_nm],
+            forcelimited=True,
+        )
+        motor.set_to_position(kp=inertia * STEERING_RADPS**2, kv=2 * inertia * STEERING_RADPS)
+
+
+def _add_own(spec: Any, robot: RobotModel) -> None:
+    """A model of its own, with the outline, the sensors and the grip that every robot has."""
+    base = attach_own(spec, robot)
+    base.add_geom(
+        name="chassis",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[-robot.axle_x_m, 0, robot.chassis_z_m - base.pos[2]],
+        size=[robot.length_m / 2, robot.width_m / 2, robot.chassis_height_m / 2],
+        mass=0,
+        group=DRAWN_GROUP + 1,
+        **CHASSIS_MASK,
+    )
+    base.add_site(name="imu", pos=[0, 0, 0])
+    _add_sensors(spec)
+
+
+def _add_sensors(spec: Any) -> None:
+    spec.add_sensor(
+        name="accelerometer",
+        type=mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname="imu",
+    )
+    spec.add_sensor(
+        name="bumper",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_GEOM,
+        objname="chassis",
+        intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1],
+    )
+
+
+def grip(model: mujoco.MjModel, robot: RobotModel) -> None:
+    """The floor's friction under the wheels of its own model, which is theirs to say, as of built
+    ones."""
+    if robot.mjcf is None:
+        return
+    for geom in _own_wheels(model, robot).geoms:
+        model.geom_priority[geom] = 3
+        model.geom_friction[geom] = FLOOR
+
+
+class Wheels(NamedTuple):
+    """Where a model has the wheels: left before right, front before rear."""
+
+    bodies: list[int]
+    geoms: list[int]  # that touch the floor
+    joints: list[int]
+    steering: list[int]  # joints of the front wheels that steer, left and right
+
+
+def wheels_of(model: mujoco.MjModel, robot: RobotModel) -> Wheels:
+    """The wheels of a compiled model."""
+    if robot.mjcf is not None:
+        return _own_wheels(model, robot)
+    names = [f"{name}_wheel" for name in _wheel_names(robot)]
+    sides = ("left", "right") if robot.steers else ()
+    return Wheels(
+        [model.body(name).id for name in names],
+        [model.geom(name).id for name in names],
+        [model.joint(f"{name}_joint").id for name in names],
+        [model.joint(f"front_{side}_steering").id for side in sides],
+    )
+
+
+def _own_wheels(model: mujoco.MjModel, robot: RobotModel) -> Wheels:
+    joints = wheel_joints(model, robot.drive)
+    bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
+    geoms = [geom for body in bodies if (geom := wheel_geom(model, body)) is not None]
+    return Wheels(bodies, geoms, joints, steering_joints(model) if robot.steers else [])
+
+
+def actuator_places(model: mujoco.MjModel, robot: RobotModel) -> tuple[int, ...]:
+    """Where in ctrl what drives and steers is."""
+    return tuple(range(model.nu)) if robot.mjcf is None else tuple(actuators(model, robot))
+
+
+def _caster_names(count: int) -> list[str]:
+    return ["front", "back"] if count == 2 else [str(index) for index in range(count)]
+
+
+def _wheel_names(robot: RobotModel) -> list[str]:
+    axles = ("front_", "rear_") if robot.wheelbase_m else ("",)
+    return [axle + side for axle in axles for side in ("left", "right")]
