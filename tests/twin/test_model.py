@@ -90,7 +90,7 @@ def test_a_stop_on_slippery_floor_takes_what_coulomb_says(friction: float) -> No
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(friction_scale=1.0, **QUIET))
     drive(sim, 1.0, 0.0, 2.0)
-    sim.set_floor_friction(0, friction)
+    sim.friction.set_floor(0, friction)
     before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
     sim.controller.set_point[0] = 0.0  # a brake, not the base controller's ramp
     drive(sim, 0.0, 0.0, 3.0)
@@ -105,7 +105,7 @@ def test_acceleration_is_what_friction_gives(friction: float) -> None:
     scale = friction / 0.8
     floor = Perturbation(friction_scale=max(scale, 0.05), **QUIET)
     start(sim, (6.0, 1.0, np.pi / 2), floor)
-    sim.set_floor_friction(0, friction)
+    sim.friction.set_floor(0, friction)
     drive(sim, 1.0, 0.0, 0.4)  # wheels spin from here on
     before = sim.qvel[0, 1]
     drive(sim, 1.0, 0.0, 0.4)
@@ -119,7 +119,7 @@ def test_slip_in_the_first_second_is_what_coulomb_leaves(friction: float) -> Non
     # a = mu g share: the robot comes a / 2 m far, or 1 - 1 / (2 a) where it reaches 1 m/s.
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
-    sim.set_floor_friction(0, friction)
+    sim.friction.set_floor(0, friction)
     drive(sim, 1.0, 0.0, 1.0)
     rolled = sim.qpos[0, 7:9].mean() * WHEEL_RADIUS_M
     given = friction * GRAVITY * wheel_share()
@@ -133,7 +133,7 @@ def test_slip_falls_with_friction() -> None:
     for friction in (0.8, 0.4, 0.2, 0.1, 0.05):
         sim = simulation(0.01)
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
-        sim.set_floor_friction(0, friction)
+        sim.friction.set_floor(0, friction)
         drive(sim, 1.0, 0.0, 1.0)
         rolled = sim.qpos[0, 7:9].mean() * WHEEL_RADIUS_M
         slips.append(1 - (sim.pose()[0, 1] - 1.0) / rolled)
@@ -146,7 +146,7 @@ def test_yaw_under_split_friction_is_what_the_two_forces_turn() -> None:
     floor, left = 0.1, 0.5
     sim = simulation(0.01)
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(left_friction_scale=left, **QUIET))
-    sim.set_floor_friction(0, floor)
+    sim.friction.set_floor(0, floor)
     drive(sim, 1.0, 0.0, 0.2)
     before = sim.qvel[0, 5]
     drive(sim, 1.0, 0.0, 0.2)
@@ -206,7 +206,7 @@ def test_a_stop_on_a_slope_is_shorter_uphill_and_longer_downhill(rise: float) ->
     start(sim, (6.0, 1.0, np.pi / 2), Perturbation(**QUIET))
     drive(sim, 1.0, 0.0, 2.0)
     sim.apply(0, Perturbation(slope_y=rise, **QUIET))
-    sim.set_floor_friction(0, friction)
+    sim.friction.set_floor(0, friction)
     before, speed = sim.pose()[0, 1], sim.qvel[0, 1]
     sim.controller.set_point[0] = 0.0
     drive(sim, 0.0, 0.0, 0.4)
@@ -266,7 +266,7 @@ def test_a_wider_track_turns_slower_by_its_scale() -> None:
 def test_a_worn_left_wheel_turns_a_robot_that_brakes_on_a_wet_floor() -> None:
     sim = simulation(0.01)
     start(sim, (6.0, 2.0, np.pi / 2), Perturbation(left_friction_scale=0.3, **QUIET))
-    sim.set_floor_friction(0, 0.1)
+    sim.friction.set_floor(0, 0.1)
     drive(sim, 1.0, 0.0, 0.6)
     assert sim.pose()[0, 2] > np.pi / 2 + 0.05  # the right wheel pulls harder
 
@@ -288,7 +288,7 @@ def test_a_slalom_converges_as_the_timestep_shrinks(friction: float) -> None:
     for timestep in (0.01, 0.005, 0.001):
         sim = simulation(timestep)
         start(sim, (6.0, 1.0, np.pi / 2), Perturbation(timestep_s=timestep))
-        sim.set_floor_friction(0, friction)
+        sim.friction.set_floor(0, friction)
         for turn in (0.7, -0.7, 0.7, -0.7):
             drive(sim, 0.8, turn, 1.0)
         ends[timestep] = sim.pose()[0, :2]

@@ -6,9 +6,11 @@ then do not converge with the timestep; these soft ones do (see docs/twin.md).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from restock.arrays import F64
+from restock.arrays import F64, Bools, Ints
 
 FLOOR_FRICTION = 0.8
 FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)
@@ -29,6 +31,72 @@ def _mask(kind: int, touches: int) -> dict[str, int]:
 FLOOR_MASK, ROLLING_MASK = _mask(1, 0), _mask(0, 1)
 OBSTACLE_MASK, CHASSIS_MASK = _mask(2, 0), _mask(0, 2)
 NO_MASK = _mask(0, 0)
+
+
+class FloorFriction:
+    """Friction under the wheels of N robots: the floor's, less on patches, and under worn tyres.
+
+    It is looked up by where the wheels stand, and written into the batch's geoms.
+    """
+
+    def __init__(self, geom_friction: F64, wheel_geoms: Sequence[int], wheels_m: F64) -> None:
+        """`geom_friction` (N, geoms, 3) is the batch's; wheels stand at `wheels_m` (W, 2)."""
+        self._written, self._geoms, self._wheels_m = geom_friction, wheel_geoms, wheels_m
+        count = len(geom_friction)
+        self.patches = np.tile(NO_PATCH, (count, PATCHES, 1)).astype(np.float64)
+        self.base = np.full(count, FLOOR_FRICTION)  # of the floor, where no patch lies
+        self.left = np.ones(count)  # times it, under the wheels on the left
+        self._has_patches = np.zeros(count, np.bool_)
+
+    @property
+    def icy(self) -> Ints:
+        """The environments that have patches."""
+        return np.flatnonzero(self._has_patches)
+
+    def lay(self, env: int, patches: F64) -> None:
+        """Lay the patches (PATCHES, 5) of an episode."""
+        self.patches[env] = patches
+        self._has_patches[env] = (patches[:, 2] > 0).any()
+
+    def set_floor(self, env: int, friction: float) -> None:
+        """The floor's friction coefficient where no patch lies."""
+        self.base[env] = friction
+        for wheel, geom in enumerate(self._geoms):
+            left = self.left[env] if wheel % 2 == 0 else 1.0
+            self._written[env, geom, 0] = friction * left
+
+    def write(self, ids: Ints, pose: F64) -> Bools:
+        """Friction under the wheels of `ids` at poses (n, 3); returns (n, W) which of them stand
+        on a patch."""
+        friction = self._under(ids, pose)
+        for wheel, geom in enumerate(self._geoms):
+            left = self.left[ids] if wheel % 2 == 0 else 1.0
+            self._written[ids, geom, 0] = friction[:, wheel] * left
+        return self._slippery(ids, friction)
+
+    def on_patch(self, pose: F64) -> Bools:
+        """Whose wheel stands on a slippery patch, (N,), at poses (N, 3)."""
+        stands = np.zeros(len(pose), np.bool_)
+        icy = self.icy
+        if len(icy):
+            stands[icy] = self._slippery(icy, self._under(icy, pose[icy])).any(axis=1)
+        return stands
+
+    def _under(self, ids: Ints, pose: F64) -> F64:
+        return friction_at(self._wheel_points(pose), self.patches[ids], self.base[ids])
+
+    def _slippery(self, ids: Ints, friction: F64) -> Bools:
+        """Which wheels (n, W) stand on a patch, by the friction under them and the floor's."""
+        least = np.minimum(SLIPPERY_BELOW, self.base[ids, None] - 1e-9)
+        return np.asarray(friction < least, np.bool_)
+
+    def _wheel_points(self, pose: F64) -> F64:
+        """Where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        ahead, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
+        x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
+        points: F64 = pose[:, None, :2] + across[:, None] * y
+        return points if len(self._wheels_m) == 2 else points + ahead[:, None] * x
 
 
 def friction_at(points_m: F64, patches: F64, base: F64) -> F64:

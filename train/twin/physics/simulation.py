@@ -23,14 +23,7 @@ from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.contact import (
-    FLOOR_FRICTION,
-    NO_PATCH,
-    OBSTACLE_GROUP,
-    PATCHES,
-    SLIPPERY_BELOW,
-    friction_at,
-)
+from restock.train.twin.physics.contact import FLOOR_FRICTION, OBSTACLE_GROUP, FloorFriction
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import build_model, yaw_of
 from restock.train.twin.physics.perturbation import Perturbation
@@ -111,11 +104,9 @@ class Simulation(Stateful):
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
-        self._friction = self.batch.expand("geom_friction")
         fastest = float(np.abs(np.asarray(task.actions)[:, 0]).max())
         self._slip_mps = SLIP_MPS * (min(fastest, 1.0) if robot.own else 1.0)
         self._wheels_m = robot.wheels_m
-        self._wheels = len(self._wheels_m)
         self._wheel_qpos = np.array(self.handles.wheel_qpos)
         self._wheel_qvel = np.array(self.handles.wheel_qvel)
         self._rollers = robot.roller_axes
@@ -133,7 +124,10 @@ class Simulation(Stateful):
         )
         self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
         self.body = RobotBody(self.batch, self.model, self.handles, num_envs, robot)
-        self.patches = np.tile(NO_PATCH, (num_envs, PATCHES, 1)).astype(np.float64)
+        self.friction = FloorFriction(
+            self.batch.expand("geom_friction"), self.handles.wheel_geoms, self._wheels_m
+        )
+        self.patches = self.friction.patches
         self.controller = base_controller(
             num_envs, robot, task.control_period_s, timestep_s, self.substeps
         )
@@ -143,15 +137,12 @@ class Simulation(Stateful):
         self.slipped = np.zeros(num_envs, np.bool_)  # on a patch, in the last control period
         self.travelled_m = np.zeros(num_envs)  # in the last control period, over ground
         self.diverged = np.zeros(num_envs, np.bool_)
-        self.base_friction = np.full(num_envs, FLOOR_FRICTION)
-        self.left_friction = np.ones(num_envs)
 
         self.bearings_rad = np.array(robot.bearings_rad)  # (beams,) in the lidar's own frame
         ahead = self.bearings_rad + task.body.lidar_yaw_rad
         self._beam = np.stack([np.cos(ahead), np.sin(ahead)], axis=-1)
         self._groups = np.zeros(6, np.uint8)
         self._groups[OBSTACLE_GROUP] = 1
-        self._has_patches = np.zeros(num_envs, np.bool_)
         self.callback: Callable[[BodyState], None] | None = None
         self.callback_period_s = 0.02
 
@@ -166,9 +157,8 @@ class Simulation(Stateful):
         self.apply(env, perturbation)
         patches = episode.patches.copy()
         patches[:, 4] *= perturbation.patch_friction_scale
-        self.patches[env] = patches
+        self.friction.lay(env, patches)
         self.scenery.reset(env, episode)
-        self._has_patches[env] = (patches[:, 2] > 0).any()
         self.controller.reset(env)
         self.accel[env] = 0.0
         self.time_s[env] = 0.0
@@ -184,19 +174,12 @@ class Simulation(Stateful):
 
     def apply(self, env: int, perturbation: Perturbation) -> None:
         """Write a perturbation's physics into one environment."""
-        self.left_friction[env] = perturbation.left_friction_scale
-        self.set_floor_friction(env, FLOOR_FRICTION * perturbation.friction_scale)
+        self.friction.left[env] = perturbation.left_friction_scale
+        self.friction.set_floor(env, FLOOR_FRICTION * perturbation.friction_scale)
         self.controller.latency_s[env] = perturbation.latency_s
         self.controller.gain[env] = perturbation.gain
         self.controller.left_gain[env] = perturbation.left_gain
         self.body.apply(env, perturbation)
-
-    def set_floor_friction(self, env: int, friction: float) -> None:
-        """The floor's friction coefficient where no patch lies."""
-        self.base_friction[env] = friction
-        for wheel, geom in enumerate(self.handles.wheel_geoms):
-            left = self.left_friction[env] if wheel % 2 == 0 else 1.0
-            self._friction[env, geom, 0] = friction * left
 
     # -- motion ---------------------------------------------------------------------------------
 
@@ -211,8 +194,8 @@ class Simulation(Stateful):
             pose = self.pose()
             middle = self.middle(pose)
             self.scenery.walk(self.traffic.advance(middle, self.qvel[:, :2], touched, self.block_s))
-            icy = np.flatnonzero(self._has_patches)
-            slippery = self._write_friction(icy, pose[icy])
+            icy = self.friction.icy
+            slippery = self.friction.write(icy, pose[icy])
             touched = self._run(self.controller.controls(block * self.block_s))
             self.bumped |= touched
             if slippery.any():
@@ -318,33 +301,6 @@ class Simulation(Stateful):
     def _yaw(self, ids: Ints) -> F64:
         return yaw_of(self.qpos[ids, 3:7])
 
-    def _write_friction(self, ids: Ints, pose: F64) -> Bools:
-        """Friction under the wheels of `ids`; returns (n, W) which of them stand on a patch."""
-        base = self.base_friction[ids]
-        friction = friction_at(self._wheel_points(pose), self.patches[ids], base)
-        for wheel, geom in enumerate(self.handles.wheel_geoms):
-            left = self.left_friction[ids] if wheel % 2 == 0 else 1.0
-            self._friction[ids, geom, 0] = friction[:, wheel] * left
-        return _slippery(friction, base)
-
-    def on_patch(self) -> Bools:
-        """Whose wheel stands on a slippery patch now, (N,)."""
-        stands = np.zeros(self.num_envs, np.bool_)
-        icy = np.flatnonzero(self._has_patches)
-        if len(icy):
-            base = self.base_friction[icy]
-            friction = friction_at(self._wheel_points(self.pose()[icy]), self.patches[icy], base)
-            stands[icy] = _slippery(friction, base).any(axis=1)
-        return stands
-
-    def _wheel_points(self, pose: F64) -> F64:
-        """Where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
-        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        ahead, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
-        x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
-        points: F64 = pose[:, None, :2] + across[:, None] * y
-        return points if self._wheels == 2 else points + ahead[:, None] * x
-
     def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
         """Whose wheel (n, W) is on a patch and moves over the floor by more than `_slip_mps`."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
@@ -396,11 +352,6 @@ class Simulation(Stateful):
     @_physics.setter
     def _physics(self, state: NDArray[Any]) -> None:
         self.batch.state[:] = state
-
-
-def _slippery(friction: F64, base: F64) -> Bools:
-    """Which wheels (n, W) stand on a patch, by the friction under them and the floor's (n,)."""
-    return np.asarray(friction < np.minimum(SLIPPERY_BELOW, base[:, None] - 1e-9), np.bool_)
 
 
 def _batch(physics: Physics) -> Any:

@@ -86,7 +86,7 @@ class Truth(Stateful):
         came = np.isfinite(came_m) & (came_m > CLOSING_MPS * self._period_s)
         self.exposed[:, 0] = (came & (gaps_m < CLOSING_WITHIN_M)).any(axis=1)
         self.exposed[:, 1] = ahead.any(axis=1)
-        self.exposed[:, 2] = simulation.on_patch()
+        self.exposed[:, 2] = simulation.friction.on_patch(pose)
         self.traffic_gap_m = gaps_m
 
     def exposure(self) -> NDArray[np.str_]:
