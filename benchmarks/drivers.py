@@ -48,8 +48,8 @@ TARGETS = {  # (driver, condition): lowest and highest success that will do
     ("planner", "blocked_aisle partial"): (0.0, 0.3),
     ("operator", "nominal"): (0.8, 1.0),
     ("operator", "wheel_slip"): (0.8, 1.0),
-    ("operator", "blocked_aisle partial"): (0.8, 1.0),
-    ("operator", "blocked_aisle full"): (0.8, 1.0),
+    ("operator", "blocked_aisle partial"): (0.95, 1.0),
+    ("operator", "blocked_aisle full"): (0.95, 1.0),
     ("operator", "near_collision"): (0.8, 1.0),
     ("random", "nominal"): (0.0, 0.1),
 }

@@ -8,6 +8,7 @@ from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.feed.cloned_rows import cloned
 from restock.train.prepare import Prepared, rows_by_policy
 from restock.train.twin.env.floor_report import sealed
 from restock.train.twin.floors.floors import open_floors
@@ -63,11 +64,17 @@ def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
 
 
 def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
+    drivers = ", ".join(teacher.policies)
     rows = 0 if panel is None else sum(rows_by_policy(panel)[name] for name in teacher.policies)
-    cloned = f"{rows:,} logged rows of {', '.join(teacher.policies)} are cloned first"
+    cloned_rows = f"{rows:,} logged rows of {drivers}"
+    if panel is not None and teacher.successes:
+        others = int(cloned(panel, teacher).sum()) - rows
+        cloned_rows += f", and {others:,} of episodes that others brought to their goal alone,"
+        rows += others
+    first = f"{cloned_rows} are cloned first"
     mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
     return f"teacher {teacher.source}: Q chooses among what is plausible to it; " + (
-        (cloned if rows else "no logged rows to clone, so at first everything is") + mirrored
+        (first if rows else "no logged rows to clone, so at first everything is") + mirrored
     )
 
 

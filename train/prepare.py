@@ -34,7 +34,7 @@ from restock.train.missions import (
     reference_success,
     ways_to_evaluate,
 )
-from restock.train.resolve import planned_draws, resolve_config, resolve_teacher
+from restock.train.resolve import mirrors, planned_draws, resolve_config, resolve_teacher
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
@@ -195,7 +195,7 @@ def prepare_new(
     if not config.env.twin:
         config = without_twin(config, panel)
     check_missions(config, profile, panel)
-    config = resolve_teacher(config, profile)
+    config = resolve_teacher(config, profile, panel)
     drivers = None if panel is None else sorted(rows_by_policy(panel))
     refuse_nothing_to_learn(config.teacher, drivers)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
@@ -230,7 +230,7 @@ def prepare_resumed(
             remedy="start a new run: values of one task mean nothing in another",
         )
     if config.teacher.mirror:
-        config = resolve_teacher(config, profile)
+        mirrors(config.teacher, profile.task)
     panel = None
     if (fed := run.document["panel"]) is not None:
         panel = open_panel(Path(fed["path"]), config, profile)

@@ -10,6 +10,7 @@ from restock.ingest.task.task import Mirror, Task
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.feed.cloned_rows import cloned
 from restock.train.missions import mission_orders
 from restock.train.twin.env.interface import AFTER_LOGS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
@@ -42,26 +43,51 @@ def planned_draws(config: TrainConfig) -> PlannedDraws:
     )
 
 
-def resolve_teacher(config: TrainConfig, profile: Profile) -> TrainConfig:
+_ROWS_OF_UPDATES = 5_000  # as many cloned rows want as many updates as the critic makes
+_MOST_UPDATES = 10.0  # times the critic's
+
+
+def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) -> TrainConfig:
     """What the config leaves open: the operator drives to goals; where there are none, nobody.
 
-    Raises ConfigError where rows are to be mirrored, and an action has no opposite.
+    Raises:
+        ConfigError: rows are to be mirrored, and an action has no opposite; successes are to be
+            cloned where no goals are logged.
     """
     teacher = config.teacher
     if teacher.source is None:
         soft = config.loss.munchausen > 0 and teacher.target == "filtered"
         source = "operator" if profile.task.goal == "route" and not soft else "none"
         teacher = msgspec.structs.replace(teacher, source=source)
+    teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:
-        count = config.schedule.offline_updates
+        rows = 0 if panel is None or not teacher.filters else int(cloned(panel, teacher).sum())
+        times = min(max(rows / _ROWS_OF_UPDATES, 1.0), _MOST_UPDATES)
+        count = round(config.schedule.offline_updates * times)
         teacher = msgspec.structs.replace(teacher, offline_updates=count)
     if teacher.mirror is not False:
-        teacher = msgspec.structs.replace(teacher, mirror=_mirrors(teacher, profile.task))
+        teacher = msgspec.structs.replace(teacher, mirror=mirrors(teacher, profile.task))
     return msgspec.structs.replace(config, teacher=teacher)
 
 
-def _mirrors(teacher: TeacherConfig, task: Task) -> bool:
-    """Whether the behaviour network learns from mirror images, where that is asked or left open."""
+def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
+    logged = profile.goal_source == "logged"
+    if teacher.successes and not logged:
+        goals = "are found in hindsight" if profile.goal_source else "do not exist"
+        raise ConfigError(
+            f"goals {goals} in these logs, so no episode of theirs shows a success",
+            where="teacher.successes",
+            remedy="leave it out, or name more drivers in teacher.policies",
+        )
+    # Where the twin's operator answers from the first step on, they slow it down: docs/teacher.md.
+    return logged and not teacher.asks if teacher.successes is None else teacher.successes
+
+
+def mirrors(teacher: TeacherConfig, task: Task) -> bool:
+    """Whether the behaviour network learns from mirror images, where that is asked or left open.
+
+    Raises ConfigError where it is asked, and an action has no opposite.
+    """
     try:
         Mirror.of(task)
     except ValueError as error:

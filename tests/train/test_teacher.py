@@ -264,7 +264,7 @@ def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> 
     live = session(tmp_path / "a", config(teacher={"source": "logs"}))
     imitation, shelf = live.imitation, logs()
     assert imitation is not None
-    chance = np.diff(imitation._cumulative, prepend=0.0)
+    chance = np.diff(imitation._online.cumulative, prepend=0.0)
     for share, members in zip(shelf.shares, shelf.stratum_rows, strict=True):
         inside = np.isin(imitation.cloned, members)
         assert chance[inside].sum() == pytest.approx(share)

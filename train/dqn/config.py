@@ -121,8 +121,13 @@ class TeacherConfig(Checked, frozen=True):
     ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; a number, or a schedule
     target: Literal["filtered", "all"] = "filtered"  # actions that the target's maximum looks at
     policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
+    # And rows of other drivers' episodes that reached their goal without one of `policies`: before
+    # the first environment step, and for good where nobody is asked. None: where goals are logged
+    # and nobody is asked in the twin.
+    successes: bool | None = None
     logs_share: Share = 0.25  # of the behaviour network's online batch, where there are such rows
-    # Of it on those rows, before any of the critic's; None: as many as the critic's will be.
+    # Of it on those rows, before any of the critic's; None: as many as the critic's will be, and
+    # of more than 5,000 rows in proportion, up to ten times as many.
     offline_updates: NonNegativeInt | None = None
     learning_rate: Positive = 1e-3
     hidden: tuple[Count, ...] = (256, 256)  # widths of the behaviour network

@@ -1,4 +1,4 @@
-"""What the behaviour network learns from: logged rows of named policies, and fresh labelled ones.
+"""What the behaviour network learns from: logged rows that are cloned, and fresh labelled ones.
 
 Logged rows are drawn by the shares of their strata, as the critic's are: a network that clones the
 majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn alike.
@@ -9,12 +9,13 @@ as that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from restock.arrays import F32, F64, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.task import Mirror
 from restock.replay.ring.ring import FreshRing
@@ -22,6 +23,7 @@ from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import TeacherConfig
 from restock.train.dqn.learner import Learner
+from restock.train.feed.cloned_rows import of_policies, of_successes
 from restock.train.feed.logs import Logs
 
 _MEASURED = 128  # rows a condition
@@ -55,29 +57,36 @@ class Imitation(Stateful):
         self.logs, self.ring, self.device, self._mirror = logs, ring, device, mirror
         self.batch_size, self._seed = batch_size, seed
         self._rng = np.random.default_rng([seed, 7])
-        self.cloned: Ints = np.empty(0, np.int64)  # rows of the logs
-        self._cumulative: F64 = np.empty(0)
+        self._offline = self._online = _Drawn(np.empty(0, np.int64), np.empty(0))
         if logs is not None:
-            self.cloned, self._cumulative = _cloned(logs, config.policies)
-        if not len(self.cloned):
+            by_teacher = of_policies(logs.behaviour_policy, config.policies)
+            every = by_teacher | _successes(logs, config) if config.successes else by_teacher
+            self._offline = _Drawn.of(logs, every)
+            # A teacher who is asked says more of the agent's states than what others did.
+            self._online = _Drawn.of(logs, by_teacher) if config.asks else self._offline
+        if not len(self._offline.rows):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown
             refuse_nothing_to_learn(config, names)
-        self.offline_updates = (config.offline_updates or 0) if len(self.cloned) else 0
+        self.offline_updates = (config.offline_updates or 0) if len(self._offline.rows) else 0
         self._logged = 0  # of an online batch
-        if len(self.cloned):
+        if len(self._online.rows):
             self._logged = round(batch_size * config.logs_share) if config.asks else batch_size
+
+    @property
+    def cloned(self) -> Ints:
+        """The rows (n,) of the logs that online batches are drawn from."""
+        return self._online.rows
 
     def draw_offline(self) -> Labelled:
         """A batch (M,) of logged rows alone."""
-        return self._gather(self.batch_size)
+        return self._gather(self._offline, self.batch_size)
 
     def draw_online(self) -> Labelled:
         """A batch (M,): the logged share of it, then fresh rows."""
-        return self._gather(self._logged if len(self.ring) else self.batch_size)
+        return self._gather(self._online, self._logged if len(self.ring) else self.batch_size)
 
-    def _gather(self, logged: int) -> Labelled:
-        place = np.searchsorted(self._cumulative, self._rng.random(logged), side="right")
-        rows = self.cloned[np.minimum(place, len(self.cloned) - 1)]
+    def _gather(self, drawn: _Drawn, logged: int) -> Labelled:
+        rows = drawn.sample(logged, self._rng)
         fresh = self.batch_size - logged
         slots = self.ring.sample(fresh, self._rng) if fresh else np.empty(0, np.int64)
         parts = [self._logged_states(rows), self._fresh_states(slots)]
@@ -175,19 +184,32 @@ def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None)
     )
 
 
-def _cloned(logs: Logs, policies: tuple[str, ...]) -> tuple[Ints, F64]:
-    """Rows (n,) of these behaviour policies, and where the probability of each ends: by strata."""
-    policy = logs.behaviour_policy
-    codes = [policy.names.index(name) for name in policies if name in policy.names]
-    rows = np.flatnonzero(np.isin(policy.codes, codes))
-    weight = np.zeros(len(logs))
-    for share, members in zip(logs.shares, logs.stratum_rows, strict=True):
-        inside = members[np.isin(members, rows)]
-        if len(inside):
-            weight[inside] += share / len(inside)
-    drawn = rows[weight[rows] > 0]
-    cumulative = np.cumsum(weight[drawn])
-    return drawn, cumulative / cumulative[-1] if len(drawn) else cumulative
+@dataclass(frozen=True)
+class _Drawn:
+    """Logged rows (n,), and where the probability of each ends: by the shares of their strata."""
+
+    rows: Ints
+    cumulative: F64
+
+    @classmethod
+    def of(cls, logs: Logs, chosen: Bools) -> _Drawn:
+        weight = np.zeros(len(logs))
+        for share, members in zip(logs.shares, logs.stratum_rows, strict=True):
+            inside = members[chosen[members]]
+            if len(inside):
+                weight[inside] += share / len(inside)
+        rows = np.flatnonzero(weight > 0)
+        cumulative = np.cumsum(weight[rows])
+        return cls(rows, cumulative / cumulative[-1] if len(rows) else cumulative)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Ints:
+        place = np.searchsorted(self.cumulative, rng.random(count), side="right")
+        return self.rows[np.minimum(place, len(self.rows) - 1)]
+
+
+def _successes(logs: Logs, config: TeacherConfig) -> Bools:
+    reward, discount = logs.rows[:, -2].numpy(), logs.rows[:, -1].numpy()
+    return of_successes(logs.behaviour_policy, logs.episode, reward, discount, config.policies)
 
 
 __all__ = ["Imitation", "refuse_nothing_to_learn"]

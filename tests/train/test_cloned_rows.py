@@ -1,0 +1,138 @@
+"""Which logged rows are cloned: those of named drivers, and others' successful episodes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support.paths import ROOT
+from support.toy_run import config, logs, session
+
+from restock.errors import ConfigError
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.mixture.mixture import load_mixture
+from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
+from restock.replay.store.store import Store
+from restock.train.describe import describe_run
+from restock.train.dqn.config import TeacherConfig
+from restock.train.feed.cloned_rows import cloned, of_policies, of_successes
+from restock.train.feed.logs import Coded
+from restock.train.prepare import prepare_new
+
+# An episode a line: who drove its steps, and how it ended.
+EPISODES = {
+    "planner's own": (["planner"] * 3, "goal"),
+    "helped": (["planner", "operator", "planner"], "goal"),
+    "bumped": (["planner"] * 2, "bump"),
+    "cut": (["planner"] * 2, "cut"),
+    "operator's own": (["operator"] * 2, "cut"),
+    "another's": (["teleop"] * 2, "goal"),
+}
+
+
+def coded(values: list[str | None]) -> Coded:
+    return Coded.of(pa.chunked_array([pa.array(values, pa.string())]))
+
+
+def rows_of_episodes() -> tuple[Coded, Coded, np.ndarray, np.ndarray]:
+    drivers, episodes, reward, discount = [], [], [], []
+    for name, (steps, end) in EPISODES.items():
+        drivers += steps
+        episodes += [name] * len(steps)
+        last = {"goal": (5.0, 0.0), "bump": (-6.0, 0.0), "cut": (0.1, 0.99)}[end]
+        for place in range(len(steps)):
+            of_step = last if place == len(steps) - 1 else (0.1, 0.99)
+            reward.append(of_step[0])
+            discount.append(of_step[1])
+    return coded(drivers), coded(episodes), np.float32(reward), np.float32(discount)
+
+
+def test_successes_are_whole_episodes_that_reached_their_goal_without_the_teacher() -> None:
+    policy, episode, reward, discount = rows_of_episodes()
+    found = of_successes(policy, episode, reward, discount, ["operator"])
+    assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "another's"}
+    assert found.sum() == 5
+    everyone = of_successes(policy, episode, reward, discount, ["operator", "teleop"])
+    assert {episode.name(row) for row in np.flatnonzero(everyone)} == {"planner's own"}
+    assert not (found & of_policies(policy, ["operator"])).any()
+    assert not of_policies(policy, ["nobody", "unknown"]).any()
+
+
+def test_rows_of_no_known_episode_are_nobodys_success() -> None:
+    policy = coded(["planner"] * 2)
+    found = of_successes(policy, coded([None, None]), np.ones(2, np.float32), np.zeros(2), [])
+    assert not found.any()
+
+
+def test_who_is_asked_in_the_twin_learns_online_from_the_teachers_rows_alone(
+    tmp_path: Path,
+) -> None:
+    """Every other episode is the planner's own way to the end of the corridor."""
+    shelf = logs()
+    half = len(shelf) // 2
+    names = ["planner"] * half + ["operator"] * half
+    shelf = replace(
+        shelf,
+        behaviour_policy=coded(names),
+        episode=coded(["alone"] * half + ["operators"] * half),
+    )
+    for source, online in (("logs", len(shelf)), ("operator", half)):
+        teacher = {"source": source, "successes": True, "hidden": [16]}
+        live = session(
+            tmp_path / source,
+            config(teacher=teacher, schedule={"env_steps": 4}),
+            logs=shelf,
+            teacher=lambda env, observation: np.zeros(len(observation), np.int64),
+        )
+        assert live.imitation is not None
+        assert len(live.imitation._offline.rows) == len(shelf)
+        assert len(live.imitation.cloned) == online
+        live.close()
+
+
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
+    folder = tmp_path_factory.mktemp("cloned")
+    logs_of = ROOT / "sample_logs/amr_monday.mcap"
+    ingest(logs_of, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
+    with Store(folder / "store") as store:
+        return build_panel(store, load_mixture("coverage"), folder / "panel")
+
+
+def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -> None:
+    asked = prepare_new(tmp_path / "run", panel.path, None).config.teacher
+    assert asked.source == "operator"
+    assert asked.successes is False
+    logged = ["teacher.source=logs"]
+    prepared = prepare_new(tmp_path / "run", panel.path, None, logged)
+    teacher = prepared.config.teacher
+    assert teacher.successes is True
+    rows = cloned(panel, teacher)
+    alone = cloned(panel, TeacherConfig(policies=teacher.policies, successes=False))
+    assert alone.sum() < rows.sum() < len(panel)
+    others = int((rows & ~alone).sum())
+    assert f"{alone.sum():,} logged rows of operator, and {others:,} of" in describe_run(prepared)
+    # 2,000 updates of the critic; as many again for each 5,000 rows.
+    assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
+    fewer = prepare_new(
+        tmp_path / "run", panel.path, None, [*logged, "schedule.offline_updates=100"]
+    )
+    assert fewer.config.teacher.offline_updates == round(100 * rows.sum() / 5000)
+
+
+def test_goals_in_hindsight_show_no_success(tmp_path: Path) -> None:
+    text = (ROOT / "src/restock/ingest/profile/profiles/warehouse_amr.toml").read_text()
+    changed = tmp_path / "hindsight.toml"
+    text = re.sub(r"(?ms)^\[inputs\.(?:goal|plan)\].*?(?=^\[)", "", text)
+    changed.write_text(text.replace("[clock]", '[goal]\nsource = "hindsight"\n\n[clock]', 1))
+    settings = [f"profile={changed}"]
+    assert prepare_new(tmp_path / "r", None, None, settings).config.teacher.successes is False
+    with pytest.raises(ConfigError, match=r"teacher\.successes: goals are found in hindsight"):
+        prepare_new(tmp_path / "r", None, None, [*settings, "teacher.successes=true"])
