@@ -136,6 +136,21 @@ def test_help_has_no_noise(verb: str, capsys: pytest.CaptureFixture[str]) -> Non
     assert "{None" not in text
     assert "None)" not in text
     assert "(default: False)" not in text
+    assert "(default: True)" not in text
+
+
+def test_what_an_option_says_is_one_paragraph(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Wrapped to the window, without the line breaks of the source."""
+    monkeypatch.setenv("COLUMNS", "120")
+    assert cli.main(["ingest", "--help"]) == 0
+    words = capsys.readouterr().out.replace("│", " ").split()
+    assert " ".join(words).count("a copy, a drive recorded again): keep it and say so") == 1
+    assert cli.main(["eval", "--help"]) == 0
+    text = capsys.readouterr().out
+    (line,) = (line for line in text.splitlines() if "--no-drive" in line)
+    assert line.strip("│ ").endswith("Drive nothing: use the episodes in RUN/eval/episodes.parquet.")
 
 
 def test_a_long_recording_shows_how_far_it_is(

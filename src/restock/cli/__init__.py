@@ -128,7 +128,7 @@ def _dispatch(args: list[str]) -> int:
 
     try:
         parsed = tyro.cli(
-            prepared(command_of(verb)),
+            prepared(command_of(verb), explained=bool({"-h", "--help"} & set(args))),
             prog=f"restock {verb}",
             args=_without_ros(args[1:]) if verb == "node" else args[1:],
             use_underscores=False,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import inspect
+import textwrap
 import types
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -13,24 +17,59 @@ import tyro
 from restock.errors import ConfigError
 
 _PREPARED: list[type[Any]] = []
+_EXPLAINED: list[type[Any]] = []
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
-def prepared(command: type[Any]) -> type[Any]:
+def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     """The dataclass with its types written so that its help is plain and its parsing quick.
+
+    Args:
+        explained: its help is about to be printed: also read what each option says.
 
     `X | None` becomes `Optional[X]`, whose values tyro checks itself: for `X | None` it imports
     typeguard, and with that asyncio. An option that may be left out shows what it takes, not
     `{None}|STR`, and no default where that says nothing.
     """
-    if command in _PREPARED:
-        return command
-    _PREPARED.append(command)
-    hints = typing.get_type_hints(command, include_extras=True)
-    for field in dataclasses.fields(command):
-        field.type = _prepared(hints[field.name], field.default)
-        command.__annotations__[field.name] = field.type
+    if command not in _PREPARED:
+        _PREPARED.append(command)
+        hints = typing.get_type_hints(command, include_extras=True)
+        for field in dataclasses.fields(command):
+            field.type = _prepared(hints[field.name], field.default)
+            command.__annotations__[field.name] = field.type
+    if explained and command not in _EXPLAINED:
+        _EXPLAINED.append(command)
+        texts = _texts(command)
+        for field in dataclasses.fields(command):
+            for job in _jobs_in(field.type):
+                prepared(job, explained=True)
+            if text := texts.get(field.name):
+                field.type = Annotated[field.type, tyro.conf.arg(help=text)]
+                command.__annotations__[field.name] = field.type
     return command
+
+
+def _texts(command: type[Any]) -> dict[str, str]:
+    """What stands below each field, in one line: tyro would keep the line breaks of the source."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(command))).body
+    assert isinstance(tree, ast.ClassDef)
+    texts = {}
+    for field, below in pairwise(tree.body):
+        match field, below:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ):
+                texts[name] = " ".join(text.split())
+    return texts
+
+
+def _jobs_in(hint: Any) -> Iterator[type[Any]]:
+    """The dataclasses in a type: a verb's jobs, each a command of its own."""
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        yield hint
+    for part in typing.get_args(hint):
+        yield from _jobs_in(part)
 
 
 def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
@@ -59,7 +98,7 @@ def _prepared(hint: Any, default: Any) -> Any:
             extras.insert(0, tyro.conf.arg(metavar=_metavar(kinds[0])))
     elif bare in _METAVARS:
         extras.insert(0, tyro.conf.arg(metavar=_METAVARS[bare]))
-    if default in (None, False, ()) or typing.get_origin(bare) is tuple:
+    if default in (None, ()) or isinstance(default, bool) or typing.get_origin(bare) is tuple:
         extras.insert(0, tyro.conf.arg(help_behavior_hint=""))
     return Annotated[(bare, *extras)] if extras else bare
 

@@ -42,12 +42,12 @@ class DiagnoseCommand:
     perturbation: Path | None = None
     """With --before-training: the calibrated twin, e.g. what `restock twin fit` wrote."""
     twin: bool = True
-    """With --before-training: hold rows against the twin. Without it only what holds by definition
-    is checked."""
+    """With --before-training: do not compare rows with the twin; check only what holds by
+    definition."""
     seed: int = 0
     """With --before-training: of the twin's episodes and the bootstrap."""
     rows: bool = True
-    """Hold the rows of the runs' panel against the twin too: some seconds."""
+    """Do not compare the rows of the runs' panel with the twin, which takes some seconds."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None

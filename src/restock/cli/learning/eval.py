@@ -54,7 +54,7 @@ class EvalCommand:
     save_as_baseline: str | None = None
     """Keep the evaluation as baselines/NAME.parquet (or in the .parquet file that is named)."""
     drive: bool = True
-    """--no-drive uses the episodes in RUN/eval/episodes.parquet."""
+    """Drive nothing: use the episodes in RUN/eval/episodes.parquet."""
     video: bool = False
     """Film the agent's worst failure and a rescue of each condition, from above, into
     RUN/eval/films: episodes of the evaluation, driven again. `restock report` shows them."""
