@@ -4,69 +4,69 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from support.pages import Block, blocks
 from support.paths import ROOT
 
 from restock.cli import main
 
-PAGE = (ROOT / "docs" / "profile.md").read_text(encoding="utf-8")
+PATH = ROOT / "docs" / "profile.md"
+PAGE = PATH.read_text(encoding="utf-8")
+FIRST_LINE = PAGE[: PAGE.index("\n## The same on sample_logs/\n")].count("\n")
+BLOCKS = [block for block in blocks(PATH) if block.line > FIRST_LINE]
+FILES = {block.marks["file"]: block.text for block in BLOCKS if "file" in block.marks}
 
 
-def block(start: str) -> str:
-    """An indented block of the page, by how it starts, without its indentation."""
-    found = re.search(rf"^    {re.escape(start)}.*?(?=\n\S)", PAGE, re.M | re.S)
-    assert found is not None, start
-    return re.sub(r"^    ", "", found[0], flags=re.M).strip() + "\n"
+def assert_prints_as_shown(block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    """Run the commands of a console block: each prints the lines below it, in that order.
 
-
-def printed(capsys: pytest.CaptureFixture[str]) -> dict:
-    return json.loads(capsys.readouterr().out)
+    `…` stands for lines, or for the end of one, that the page leaves out. The page leaves out the
+    rule under a table's header too.
+    """
+    for part in block.text.removeprefix("$ ").split("\n$ "):
+        command, *shown = part.splitlines()
+        capsys.readouterr()
+        main(shlex.split(command)[1:])
+        output = capsys.readouterr().out
+        printed = iter(line.rstrip() for line in output.splitlines())
+        for line in shown:
+            start, left_out, _ = line.partition("…")
+            found = any(one.startswith(start) if left_out else one == line for one in printed)
+            assert found, f"{block.place}: {command}: no line {line!r} in\n{output}"
 
 
 @pytest.mark.slow  # two ingests of all sample logs
 def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     monkeypatch.chdir(tmp_path)
+    ingested, audited, labelled = [block for block in BLOCKS if block.language == "console"]
+
     assert main(["profile", "new", "sample_logs/amr_tuesday", "--out", "amr.toml"]) == 0
     profile, sql = Path("amr.toml"), Path("sagging.sql")
     name = "diagnostics_battery_voltage_v"
-    assert f"uncomment `[signals.{name}]` as `battery_v`" in PAGE
-    text = profile.read_text().replace("length_m = 0.6", "length_m = 0.7")
+    assert f"uncomment `[signals.{name}]` as `battery_v`, set `length_m` to\n`0.7`" in PAGE
+    text = re.sub(r"(?m)^length_m = [\d.]+", "length_m = 0.7", profile.read_text())
     table = re.search(rf"^# \[signals\.{name}\].*?(?=\n\n)", text, re.M | re.S)
     assert table is not None
     taken = re.sub(r"^# ", "", table[0], flags=re.M).replace(name, "battery_v")
-    own = '\n[[condition]]\nfile = "sagging.sql"\n'
-    assert own.strip() in block("[[condition]]\n    file")
-    profile.write_text(text.replace(table[0], taken) + own)
-    sql.write_text(block("-- The battery's voltage sags").split("\n$ ")[0])
-    ingest = ["ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store"]
-    assert main([*ingest, "--json"]) == 0
-    first = {one["path"]: one for one in printed(capsys)["recordings"]}
-    assert all(one["conditions"]["sagging"] == 0 for one in first.values())
-    for path, one in first.items():
-        assert re.search(rf"^     {re.escape(path)} .* {one['transitions']:,}$", PAGE, re.M)
+    profile.write_text(text.replace(table[0], taken) + FILES["sagging.toml"])
+    sql.write_text(FILES["sagging.sql"])
+    assert_prints_as_shown(ingested, capsys)
 
     assert "With 26.25 V in the file" in PAGE
     sql.write_text(sql.read_text().replace("25.8", "26.25"))
-    assert main([*ingest[:1], "sample_logs/amr_tuesday", *ingest[2:], "--json"]) == 0
-    capsys.readouterr()
+    assert_prints_as_shown(audited, capsys)
+    assert_prints_as_shown(labelled, capsys)
+
     main(["audit", "store", "--json"])
-    (stale,) = [one for one in printed(capsys)["audits"] if one["audit"] == "stale_labels"]
-    assert [row["source_file"] for row in stale["sample"]] == ["sample_logs/amr_monday.mcap"]
-    assert stale["advice"] in PAGE
-    assert main(["label", "store", "--profile", "amr.toml", "--json"]) == 0
-    for row in printed(capsys)["recordings"]:
-        same = row["before"] == row["after"]
-        labels = f"{row['after']}, unchanged" if same else f"{row['before']} -> {row['after']}"
-        shown = rf"{re.escape(row['source_file'])} +{re.escape(labels)} +{row['changed']:,}$"
-        assert re.search(shown, PAGE, re.M), shown
-    main(["audit", "store", "--json"])
-    (stale,) = [one for one in printed(capsys)["audits"] if one["audit"] == "stale_labels"]
-    assert stale["rows"] == 0
-    assert main([*ingest, "--json"]) == 0
-    assert {one["status"] for one in printed(capsys)["recordings"]} == {"unchanged"}
+    audits = json.loads(capsys.readouterr().out)["audits"]
+    assert [one["rows"] for one in audits if one["audit"] == "stale_labels"] == [0]
+    main(["ingest", "sample_logs/", "--profile", "amr.toml", "--store", "store", "--json"])
+    recordings = json.loads(capsys.readouterr().out)["recordings"]
+    assert {one["status"] for one in recordings} == {"unchanged"}
 
 
 def test_every_key_of_a_signal_and_every_reduction_is_on_the_page():
