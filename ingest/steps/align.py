@@ -305,7 +305,6 @@ __all__ = [
     "CLOCK_FIELD",
     "CLOCK_TOPIC",
     "NS",
-    "STAMP",
     "ClockReport",
     "ClockSegment",
     "LatestMessages",

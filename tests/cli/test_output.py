@@ -150,7 +150,9 @@ def test_what_an_option_says_is_one_paragraph(
     assert cli.main(["eval", "--help"]) == 0
     text = capsys.readouterr().out
     (line,) = (line for line in text.splitlines() if "--no-drive" in line)
-    assert line.strip("│ ").endswith("Drive nothing: use the episodes in RUN/eval/episodes.parquet.")
+    assert line.strip("│ ").endswith(
+        "Drive nothing: use the episodes in RUN/eval/episodes.parquet."
+    )
 
 
 def test_a_long_recording_shows_how_far_it_is(

@@ -13,7 +13,8 @@ from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.clock import LiveClock
 from restock.ingest.profile.tables import Clock
-from restock.ingest.steps.align import NS, STAMP, align
+from restock.ingest.steps.align import NS, align
+from restock.ingest.steps.clocks import STAMP
 
 HUSKY, ODOMETRY = SHARED / "sim-time-husky", "/husky_velocity_controller/odom"
 WARM_UP_NS = 3 * NS

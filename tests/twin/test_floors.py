@@ -26,6 +26,7 @@ from restock.train.describe import describe_run
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.floor_file import read_floor, write_floor
 from restock.train.twin.floors.floors import (
     RECIPES,
@@ -45,7 +46,7 @@ from restock.train.twin.floors.occupancy_map import (
     write_map,
     write_pgm,
 )
-from restock.train.twin.floors.planner import BlockFinder, Planner
+from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
 
 SEEDS = st.integers(0, 10_000)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.layout import default_warehouse
-from restock.train.twin.floors.planner import CELL_M, PLAN_POINTS, BlockFinder, Planner
+from restock.train.twin.floors.planner import CELL_M, PLAN_POINTS, Planner
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, length_m
 
 FLOOR = default_warehouse()

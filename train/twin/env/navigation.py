@@ -16,8 +16,9 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.state import Stateful
+from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.planner import PLAN_POINTS, BlockFinder, Closure, Planner, planners
+from restock.train.twin.floors.planner import PLAN_POINTS, Closure, Planner, planners
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.sensing import Sensing, add_route
 

@@ -17,7 +17,7 @@ termination.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -200,11 +200,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     def floor_of(self, env: int) -> Warehouse:
         """The floor that an environment's episode is on."""
         return self.floors[int(self.layout[env])]
-
-    def by_floor(self) -> Iterator[tuple[Ints, Warehouse]]:
-        """The environments on each floor, and the floor."""
-        for index in np.unique(self.layout):
-            yield np.flatnonzero(self.layout == index), self.floors[index]
 
     # -- episodes -------------------------------------------------------------------------------
 

@@ -81,7 +81,7 @@ def add_robot(spec: Any, robot: RobotModel) -> None:
         wheel = chassis.add_body(name=f"{name}_wheel", pos=[x, y, 0])
         rolls_free = robot.steers and name.startswith("front")
         if rolls_free:
-            _add_steering(spec, wheel, name, robot)
+            _add_steering(wheel, name, robot)
         rollers = robot.roller_axes
         wheel.add_joint(
             name=f"{name}_wheel_joint",
@@ -130,7 +130,7 @@ def add_robot(spec: Any, robot: RobotModel) -> None:
     _add_sensors(spec)
 
 
-def _add_steering(spec: Any, wheel: Any, name: str, robot: RobotModel) -> None:
+def _add_steering(wheel: Any, name: str, robot: RobotModel) -> None:
     wheel.add_joint(
         name=f"{name}_steering",
         type=mujoco.mjtJoint.mjJNT_HINGE,
