@@ -41,79 +41,93 @@ IDENTITY: tuple[Column, ...] = (
     Column("transition_id", pa.int64(), "unique in the store; the same after a re-ingest"),
     Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
     Column("episode_id", pa.string(), "<recording_id>/<episode_index>"),
-    Column("episode_index", pa.int32(), "of the episode in its recording, from 0"),
-    Column("step_index", pa.int32(), "of the step in its episode, from 0"),
+    Column("episode_index", pa.int32(), "number of the episode in its recording, from 0"),
+    Column("step_index", pa.int32(), "number of the step in its episode, from 0"),
 )
 TRANSITION: tuple[Column, ...] = (
-    Column("observation", _F32_LIST, "what the robot knew at t; float32[D], see the task"),
+    Column(
+        "observation", _F32_LIST, "observation at t: what the robot knew; float32[D], see the task"
+    ),
     Column("action", pa.int16(), "index of the discrete action in force over [t, t + 1)"),
-    Column("reward", pa.float32(), "of [t, t + 1)"),
-    Column("next_observation", _F32_LIST, "what the robot knew at t + 1; float32[D]"),
+    Column("reward", pa.float32(), "reward of [t, t + 1)"),
+    Column("next_observation", _F32_LIST, "observation at t + 1; float32[D]"),
     Column("terminated", pa.bool_(), "the episode terminated at t + 1: do not bootstrap"),
     Column(
         "truncated", pa.bool_(), "the episode was truncated at t + 1: time, gap, end of recording"
     ),
 )
 COVERAGE: tuple[Column, ...] = (
-    Column("condition", pa.string(), "the one condition of highest priority, or 'nominal'"),
-    Column("conditions", pa.list_(pa.string()), "every condition that holds; empty if nominal"),
+    Column("condition", pa.string(), "the condition of highest priority, or 'nominal'"),
+    Column("conditions", pa.list_(pa.string()), "all conditions that hold; empty if nominal"),
     Column(
         "true_condition",
         pa.string(),
-        "all that a simulator knows to be so, sorted, commas between; or nominal",
+        "all conditions that are true in the simulator, sorted, comma-separated; or nominal",
         nullable=True,
     ),
     Column(
         "probabilities",
         pa.map_(pa.string(), pa.float32()),
-        "of each condition that has a rule for it; null: older than such rules",
+        "probability of each condition that has a rule for it; null: from a Restock without such "
+        "rules",
         nullable=True,
     ),
     Column(
         "uncertain",
         pa.list_(pa.string()),
-        "conditions too near to call by their probability; null: older than such rules",
+        "conditions that are uncertain by their probability; null: from a Restock without such "
+        "rules",
         nullable=True,
     ),
     Column(
         "exposures",
         pa.list_(pa.string()),
-        "every exposure that holds, whatever the condition; null: older than exposures",
+        "all exposures that hold, whatever the condition; null: from a Restock without exposures",
         nullable=True,
     ),
     Column(
         "true_exposure",
         pa.string(),
-        "all exposures that a simulator knows to be so, sorted, commas between; or nominal",
+        "all exposures that are true in the simulator, sorted, comma-separated; or nominal",
         nullable=True,
     ),
     Column("perturbation", pa.string(), "name of the twin's parameters in force", nullable=True),
     Column(
         "perturbation_values",
         pa.map_(pa.string(), pa.float64()),
-        "those that are not the nominal twin's; null for hardware",
+        "parameters that differ from the nominal twin's; null for hardware",
         nullable=True,
     ),
     Column("zone", pa.string(), "named part of the map, or 'elsewhere'"),
-    Column("behaviour_policy", pa.string(), "who acted: planner, operator, dqn, …"),
+    Column("behaviour_policy", pa.string(), "policy that acted: planner, operator, dqn, …"),
     Column("behaviour_version", pa.string(), "version of that policy", nullable=True),
-    Column("action_probability", pa.float32(), "behaviour policy's, of the action", nullable=True),
-    Column("action_residual", pa.float32(), "from the command to the discrete action, scaled"),
-    Column("progress_m", pa.float32(), "how much shorter the plan became over [t, t + 1)"),
+    Column(
+        "action_probability",
+        pa.float32(),
+        "the behaviour policy's probability of the action",
+        nullable=True,
+    ),
+    Column(
+        "action_residual", pa.float32(), "scaled distance from the command to the discrete action"
+    ),
+    Column("progress_m", pa.float32(), "decrease of the length of the plan over [t, t + 1)"),
     Column(
         "goal_source",
         pa.string(),
-        "logged: the goal was ordered; hindsight: where the robot got to; null: no goal, or older",
+        "logged: a recorded goal; hindsight: where the robot arrived; null: no goal, or an older "
+        "row",
         nullable=True,
     ),
 )
 PROVENANCE: tuple[Column, ...] = (
     Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),
     Column("source_file", pa.string(), "path of the recording as it was given"),
-    Column("profile_hash", pa.string(), "of the profile that read it, 12 hex digits"),
-    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
-    Column("labels_version", pa.string(), "of the conditions that labelled it"),
-    Column("restock_version", pa.string(), "of the software that wrote the row"),
+    Column(
+        "profile_hash", pa.string(), "hash of the profile with which it was ingested, 12 hex digits"
+    ),
+    Column("task_hash", pa.string(), "hash of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "version of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "version of Restock that wrote the row"),
 )
 
 
@@ -179,46 +193,47 @@ def _rows_of(**fields: pa.DataType) -> pa.DataType:
 # One row an ingest: what was read, by which definitions, and what became of it.
 RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
-    Column("ingest_id", pa.string(), "of this ingest; joins `transitions`"),
+    Column("ingest_id", pa.string(), "id of this ingest; joins `transitions`"),
     Column("ingested_at", pa.timestamp("us", "UTC"), "when it was ingested"),
     Column("source_file", pa.string(), "path of the recording as it was given"),
-    Column("format", pa.string(), "of its container: mcap, rosbag2-sqlite3, rosbag2-mcap, …"),
+    Column("format", pa.string(), "container: mcap, rosbag2-sqlite3, rosbag2-mcap, …"),
     Column("integrity", pa.string(), "checksums: verified, unverified or damaged"),
-    Column("duration_s", pa.float64(), "from its first message to its last, by log time"),
-    Column("start_stamp_ns", pa.int64(), "of its first step, on the alignment clock"),
-    Column("end_stamp_ns", pa.int64(), "of its last step, on the alignment clock"),
+    Column("duration_s", pa.float64(), "time from its first message to its last, by log time"),
+    Column("start_stamp_ns", pa.int64(), "time of its first step, on the alignment clock"),
+    Column("end_stamp_ns", pa.int64(), "time of its last step, on the alignment clock"),
     Column("clock", pa.string(), "the alignment clock: header.stamp or log_time"),
-    Column("clock_offset_ns", pa.int64(), "log time less alignment clock"),
-    Column("clock_jumps", pa.int32(), "times that the alignment clock was set"),
-    Column("profile", pa.string(), "name of the profile that read it"),
-    Column("profile_hash", pa.string(), "of the profile, 12 hex digits"),
-    Column("task_hash", pa.string(), "of the definition of observation, action and reward"),
-    Column("labels_version", pa.string(), "of the conditions that labelled it"),
-    Column("restock_version", pa.string(), "of the software that wrote it"),
+    Column("clock_offset_ns", pa.int64(), "log time minus alignment clock"),
+    Column("clock_jumps", pa.int32(), "how often the alignment clock was set"),
+    Column("profile", pa.string(), "name of the profile with which it was ingested"),
+    Column("profile_hash", pa.string(), "hash of the profile, 12 hex digits"),
+    Column("task_hash", pa.string(), "hash of the definition of observation, action and reward"),
+    Column("labels_version", pa.string(), "version of the conditions that labelled it"),
+    Column("restock_version", pa.string(), "version of Restock that wrote it"),
     Column(
         "tags",
         pa.map_(pa.string(), pa.string()),
-        "whose drive it is: robot, site, … and any other; null: from before there were tags",
+        "robot, site, … and any other tag; null: from a Restock without tags",
         nullable=True,
     ),
-    Column("ticks", pa.int64(), "of the control clock = transitions + episode_ends + drops"),
-    Column("steps", pa.int64(), "ticks that belong to an episode"),
-    Column("episodes", pa.int64(), "of one transition or more"),
-    Column("transitions", pa.int64(), "rows in `transitions`"),
-    Column("episode_ends", pa.int64(), "ticks that only end an episode"),
-    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks in no episode"),
+    Column("ticks", pa.int64(), "number of ticks of the control clock = transitions + "
+        "episode_ends + drops"),
+    Column("steps", pa.int64(), "number of ticks that belong to an episode"),
+    Column("episodes", pa.int64(), "number of episodes with at least one transition"),
+    Column("transitions", pa.int64(), "number of rows in `transitions`"),
+    Column("episode_ends", pa.int64(), "number of ticks that only end an episode"),
+    Column("drops", _rows_of(reason=pa.string(), count=pa.int64()), "ticks that are in no episode"),
     Column(
         "topics",
         _rows_of(
             topic=pa.string(), type=pa.string(), expected=pa.int64(), decoded=pa.int64(),
             skipped=pa.int64(), reason=pa.string(),
         ),
-        "messages by the container's count, rows decoded, and why the rest were not",
+        "number of messages by the container's count, number decoded, and why the rest were not",
     ),
     Column(
         "stand_ins",
         _rows_of(input=pa.string(), instead=pa.string()),
-        "inputs that the recording does not fill, and what was used instead",
+        "inputs that the recording lacks, and what was used instead",
     ),
     Column(
         "label_scores",
@@ -226,7 +241,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             condition=pa.string(), precision=pa.float64(), recall=pa.float64(),
             labelled=pa.int64(), support=pa.int64(),
         ),
-        "of the labels against the true condition; empty where that is not known",
+        "scores of the labels against the true condition; empty if that is not known",
     ),
     Column(
         "label_counts",
@@ -235,7 +250,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             agreed=pa.int64(), event_labelled=pa.int64(), event_right=pa.int64(),
             event_support=pa.int64(), event_found=pa.int64(),
         ),
-        "what those scores are made of, in steps and events; null: older than events",
+        "the counts behind those scores, in steps and events; null: from a Restock without events",
         nullable=True,
     ),
     Column(
@@ -246,7 +261,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             log_backsteps=pa.int64(), backsteps=pa.int64(), duplicates=pa.int64(),
             zero_stamps=pa.int64(), off_clock=pa.int64(), restamped=pa.int64(),
         ),
-        "per topic read: log time against header stamp, and what is odd about the stamps",
+        "per topic that was read: log time against header stamp, and irregular stamps",
         nullable=True,
     ),
     Column(
@@ -256,7 +271,8 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             path=pa.string(), meaning=pa.string(), messages=pa.int64(), found=pa.int64(),
             unread=pa.int64(), steps=pa.int64(),
         ),
-        "custom signals: unit and source, messages, those that have it, steps that know it",
+        "custom signals: unit and source, number of messages, messages with a value, steps with a "
+        "value",
         nullable=True,
     ),
     Column(
@@ -267,8 +283,9 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             problems=_rows_of(reason=pa.string(), count=pa.int64()), steps=pa.int64(),
             size_bytes=pa.int64(), file=pa.string(),
         ),
-        "of each camera the messages expected and decoded; frames kept, thinned out (max_hz),"
-        " unused (in force at no step); problems; steps that have one; null: older than that",
+        "per camera: messages expected and decoded; frames kept, thinned out (max_hz) and unused "
+        "(in"
+        " force at no step); problems; steps with a frame; null: from an older Restock",
         nullable=True,
     ),
     Column("task_json", pa.string(), "the task, as JSON"),
@@ -276,7 +293,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column(
         "exposures_json",
         pa.string(),
-        "the exposures, as conditions_json; null: older than exposures",
+        "the exposures, as in conditions_json; null: from a Restock without exposures",
         nullable=True,
     ),
     Column(
@@ -285,7 +302,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             condition=pa.string(), kind=pa.string(), signals=pa.list_(pa.string()),
             because=pa.string(),
         ),
-        "conditions and exposures that no row of it tells; null: older than that",
+        "conditions and exposures that are unknown in all its rows; null: from an older Restock",
         nullable=True,
     ),
     Column(
@@ -295,33 +312,45 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
             first_ns=pa.int64(), last_ns=pa.int64(), given_at=pa.timestamp("us", "UTC"),
             rows=pa.int64(),
         ),
-        "what people said of its labels, see the view; null: older than corrections",
+        "corrections of its labels by people, see the view; null: from a Restock without "
+        "corrections",
         nullable=True,
     ),
-    Column("profile_toml", pa.string(), "the profile, the SQL of its files in it", nullable=True),
+    Column("profile_toml", pa.string(), "the profile, including the SQL of its "
+        "files", nullable=True),
 )  # fmt: skip
 
 # One row a frame of a camera that is in force at a step: `frames/` of a store.
 FRAME_COLUMNS: tuple[Column, ...] = (
-    Column("recording_id", pa.string(), "of the recording"),
+    Column("recording_id", pa.string(), "id of the recording"),
     Column("camera", pa.string(), "its name in the profile"),
-    Column("frame_index", pa.int64(), "of the message in its topic, by log time, from 0"),
-    Column("topic", pa.string(), "that it was received on"),
-    Column("type", pa.string(), "of the message"),
+    Column("frame_index", pa.int64(), "number of the message in its topic, by log time, from 0"),
+    Column("topic", pa.string(), "topic of the frame"),
+    Column("type", pa.string(), "type of the message"),
     Column("log_time_ns", pa.int64(), "when the message was recorded"),
     Column("stamp_ns", pa.int64(), "when the frame was taken, on the alignment clock"),
-    Column("first_transition_id", pa.int64(), "of the first step at which it is the last one"),
-    Column("last_transition_id", pa.int64(), "of the last; steps that only end an episode count"),
-    Column("encoding", pa.string(), "jpeg or png: the file as recorded; else that of raw pixels"),
+    Column(
+        "first_transition_id", pa.int64(), "time of the first step at which it is the last frame"
+    ),
+    Column(
+        "last_transition_id",
+        pa.int64(),
+        "time of the last such step, including steps that only end an episode",
+    ),
+    Column(
+        "encoding",
+        pa.string(),
+        "jpeg or png: the file as recorded; else the encoding of the raw pixels",
+    ),
     Column("width", pa.int32(), "in pixels"),
     Column("height", pa.int32(), "in pixels"),
-    Column("channels", pa.int16(), "colours, and alpha where it has one"),
-    Column("bits", pa.int16(), "of a channel"),
-    Column("row_bytes", pa.int32(), "of a row of raw pixels; 0 for files"),
-    Column("big_endian", pa.bool_(), "of raw pixels"),
-    Column("size_bytes", pa.int64(), "of the bytes"),
-    Column("sha256", pa.string(), "of the bytes as the recording has them, 64 hex digits"),
-    Column("data", pa.binary(), "the bytes as the recording has them"),
+    Column("channels", pa.int16(), "number of channels: colours, and alpha if there is one"),
+    Column("bits", pa.int16(), "bits per channel"),
+    Column("row_bytes", pa.int32(), "bytes per row of raw pixels; 0 for files"),
+    Column("big_endian", pa.bool_(), "byte order of raw pixels"),
+    Column("size_bytes", pa.int64(), "number of bytes"),
+    Column("sha256", pa.string(), "hash of the bytes as in the recording, 64 hex digits"),
+    Column("data", pa.binary(), "the bytes as in the recording"),
 )
 
 

@@ -48,7 +48,7 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("accel_x_mps2", "forward acceleration from the accelerometer"),
     Signal(
         "sector_clearance_m",
-        "per sector of bearing, nearest lidar return minus the body's extent that way",
+        "per sector of bearing: nearest lidar return minus the body's extent in that direction",
         per_sector=True,
         stored=False,
         lidar=True,
@@ -60,23 +60,23 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("waypoint_far_x_m", "far look-ahead point of the plan, body frame, forward"),
     Signal("waypoint_far_y_m", "far look-ahead point of the plan, body frame, left"),
     Signal("route_remaining_m", "length of the plan from the nearest point on it to its end"),
-    Signal("goal_distance_m", "straight distance from the pose to the goal"),
+    Signal("goal_distance_m", "straight-line distance from the pose to the goal"),
     Signal("localised_speed_mps", "forward speed from the last two localised poses"),
     Signal("localised_lateral_mps", "sideways speed (left) from the last two localised poses"),
     _of_lidar(
         "came_nearer_m",
-        "how far something within 2 m came nearer since the step before, and than it was seen in"
-        " the last second, the robot's own motion taken off; 0: nothing",
+        "how much nearer something within 2 m is than at the step before and in the last second,"
+        " without the robot's own motion; 0: nothing",
     ),
     _of_lidar(
         "plan_return_m",
-        "way along the plan in view to the first lidar return within half the body's width of it;"
+        "distance along the plan to the first lidar return within half the body's width of it;"
         " range_max_m: none",
     ),
     _of_lidar(
         "plan_gap_m",
-        "from the plan just ahead (1.4 of near_m) to the lidar return nearest to it; range_max_m:"
-        " none",
+        "distance from the plan just ahead (1.4 of near_m) to the nearest lidar return;"
+        " range_max_m: none",
     ),
     Signal("bumped", "the bumper was pressed since the step before", "bool"),
     Signal("command_speed_mps", "commanded forward speed in force until the next step"),

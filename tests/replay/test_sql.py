@@ -113,7 +113,7 @@ def test_a_runs_columns_are_listed_with_their_meanings(
             "view": "audit",
             "column_name": "row_hash",
             "type": "VARCHAR",
-            "meaning": "of the packed row, 16 hex digits: `restock trace` checks it",
+            "meaning": "checksum of the packed row, 16 hex digits; checked by `restock trace`",
         }
     ]
     undocumented = "SELECT count(*) AS n FROM columns WHERE meaning IS NULL AND view <> 'columns'"
@@ -159,8 +159,8 @@ def test_wrong_sql_is_one_message_and_exit_2(
 def test_wrong_places_are_refused(
     tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "neither a store" in out_of(capsys, str(tmp_path), "SELECT 1", code=2)
-    assert "nothing is there" in out_of(capsys, str(tmp_path / "x"), "SELECT 1", code=2)
+    assert "it is not a store" in out_of(capsys, str(tmp_path), "SELECT 1", code=2)
+    assert "it does not exist" in out_of(capsys, str(tmp_path / "x"), "SELECT 1", code=2)
     err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path), code=2)
     assert "not a run" in err
     err = out_of(capsys, str(store_path), "SELECT 1", "--json", "--csv", code=2)

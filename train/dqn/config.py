@@ -35,11 +35,11 @@ NonNegativeInt = Annotated[int, Meta(ge=0)]
 
 
 class NetworkConfig(Checked, frozen=True):
-    hidden: tuple[Count, ...] = (256, 256)  # widths
+    hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
     dueling: bool = False
-    quantiles: NonNegativeInt = 0  # of each action's return (QR-DQN); 0 learns the mean alone
-    ensemble: Count = 1  # networks: their mean acts, their least is the target's value
+    quantiles: NonNegativeInt = 0  # per action, of the return (QR-DQN); 0: learn the mean
+    ensemble: Count = 1  # networks: acts by the mean, target is the least
 
     def check(self) -> None:
         if not self.hidden:
@@ -49,33 +49,33 @@ class NetworkConfig(Checked, frozen=True):
 
 
 class LossConfig(Checked, frozen=True):
-    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # a step; a panel brings its own, the same
-    n_step: Count = 3  # of fresh rows; the panel's rows bring their own
+    discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must be that of the panel
+    n_step: Count = 3  # steps of fresh rows' returns; the panel has its own
     double: bool = True
-    huber_delta: Positive = 10.0  # above most errors: at 1, rare heavy costs are half unseen
+    huber_delta: Positive = 10.0  # larger than most errors, so that rare high costs count
     conservative: NonNegative = 0.1  # weight of the CQL term on rows from logs, while offline
-    conservative_online: NonNegative = 0.0  # … and the weight it goes to, linearly, once online
-    conservative_steps: Count = 20_000  # environment steps that this takes
-    calibrated: bool = False  # Cal-QL: that term stops at the logs' return-to-go
+    conservative_online: NonNegative = 0.0  # weight that it changes to, linearly, when online
+    conservative_steps: Count = 20_000  # environment steps of that change
+    calibrated: bool = False  # Cal-QL: bounds the CQL term by the logs' return-to-go
     munchausen: Share = 0.0  # weight of the log-policy in the reward (0.9 in the paper); 0: off
     munchausen_temperature: Positive = 0.03
-    munchausen_floor: Annotated[float, Meta(le=0)] = -1.0  # of the log-policy times the temperature
+    munchausen_floor: Annotated[float, Meta(le=0)] = -1.0  # lower bound of log-policy * temperature
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
-    margin_size: NonNegative = 0.8  # by which their action must be better
-    margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies
-    margin_strata: tuple[str, ...] = ()  # only in these strata of the logs; empty: in all
+    margin_size: NonNegative = 0.8  # the margin: how much better their action must be
+    margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
+    margin_strata: tuple[str, ...] = ()  # only in these strata of the logs; empty: all
 
 
 class OptimizerConfig(Checked, frozen=True):
     learning_rate: Positive = 1e-3
-    max_grad_norm: Positive | None = None  # Huber bounds each row's gradient already
+    max_grad_norm: Positive | None = None  # None: no clipping (Huber bounds each row's gradient)
 
 
 class ReplayConfig(Checked, frozen=True):
     batch_size: Count = 128
-    logs_share: Share | None = None  # of each online batch; None: what the panel's mixture says
+    logs_share: Share | None = None  # share of each online batch; None: the mixture's
     ring_capacity: int | Literal["auto"] = 100_000  # fresh rows kept; "auto": by their diversity
-    ring_reserved: Share = 0.0  # share of them reserved for the conditions, in equal parts
+    ring_reserved: Share = 0.0  # share of it reserved for conditions, in equal parts
 
     def check(self) -> None:
         if self.ring_capacity != "auto" and self.ring_capacity < self.batch_size:
@@ -93,18 +93,18 @@ class ReplayConfig(Checked, frozen=True):
 
 
 class ScheduleConfig(Checked, frozen=True):
-    env_steps: NonNegativeInt = 200_000  # the budget, of all environments together
-    seconds: Positive | None = None  # stop earlier, after this much training time
-    offline_updates: NonNegativeInt = 2_000  # on the panel alone, before the first environment step
+    env_steps: NonNegativeInt = 200_000  # budget, over all environments
+    seconds: Positive | None = None  # stop after this training time, if earlier
+    offline_updates: NonNegativeInt = 2_000  # updates on the panel alone, before any driving
     warmup_env_steps: NonNegativeInt = 2_000  # rollouts before the first online update
     updates_per_env_step: Positive = 0.25
 
 
 class JumpStartConfig(Checked, frozen=True):
-    """How the logs' behaviour begins episodes: see `restock.train.jump_start`."""
+    """The logs' behaviour drives the first steps of episodes: see `restock.train.jump_start`."""
 
-    env_steps: NonNegativeInt = 0  # over which it drives ever less; 0: it never drives
-    horizon_steps: Count = 60  # of an episode that it drives at most, to begin with
+    env_steps: NonNegativeInt = 0  # steps over which it drives less and less; 0: never
+    horizon_steps: Count = 60  # most first steps of an episode that it drives
 
     def horizon(self, env_steps: int) -> int:
         """The most steps of an episode that begins after `env_steps`."""
@@ -113,19 +113,19 @@ class JumpStartConfig(Checked, frozen=True):
 
 
 class TeacherConfig(Checked, frozen=True):
-    """Who says what it would do where the agent is, and how far Q may go from that."""
+    """The teacher, which says what it would do, and how far the policy may deviate from that."""
 
     # operator: the twin's; logs: rows of `policies` alone; none; or your own, as module:name.
     # None: the operator where the task has a goal, else none.
     source: str | None = None
-    ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; a number, or a schedule
-    target: Literal["filtered", "all"] = "filtered"  # actions that the target's maximum looks at
+    ratio: Portion = 0.3  # plausible: G(a|s) >= ratio * max G; or a schedule
+    target: Literal["filtered", "all"] = "filtered"  # actions over which the target maximises
     policies: tuple[str, ...] = ("operator",)  # behaviour policies whose logged rows are cloned
     # And rows of other drivers' episodes that reached their goal without one of `policies`: before
     # the first environment step, and for good where nobody is asked. None: where goals are logged
     # and nobody is asked in the twin.
     successes: bool | None = None
-    logs_share: Share = 0.25  # of the behaviour network's online batch, where there are such rows
+    logs_share: Share = 0.25  # share of cloned rows in its online batch
     # Of it on those rows, before any of the critic's; None: as many as the critic's will be, and
     # of more than 5,000 rows in proportion, up to ten times as many.
     offline_updates: NonNegativeInt | None = None
@@ -157,15 +157,15 @@ class TeacherConfig(Checked, frozen=True):
 
 
 class OfflineStartConfig(Checked, frozen=True):
-    """What drives until online updates begin: see `restock.train.evaluation.offline_start`."""
+    """What drives before online updates: see `restock.train.evaluation.offline_start`."""
 
-    choose: bool = False  # the best of several on held-out logs; else what was learnt offline
+    choose: bool = False  # true: the best candidate on held-out logs
     # Filters beside the run's own, where it has a teacher with logged rows; 1: the clone alone.
     ratios: tuple[Annotated[float, Meta(gt=0, le=1)], ...] = (0.1, 0.3, 1.0)
 
 
 class EnvConfig(Checked, frozen=True):
-    twin: bool = True  # false: the logs alone; nothing drives, and what was learnt last is kept
+    twin: bool = True  # false: logs alone, no driving; keeps the last policy
     num_envs: Count = 32
     # Shares of true conditions among the episodes of the twin.
     conditions: dict[str, NonNegative] = msgspec.field(
@@ -174,7 +174,7 @@ class EnvConfig(Checked, frozen=True):
     # A missions file, or its [[missions]]: that part of the episodes is of those; docs/train.md.
     missions: str | tuple[MissionOrder, ...] | None = None
     missions_share: Share = 0.5
-    overlap: bool = True  # simulate on one thread while learning on another; same result
+    overlap: bool = True  # simulate and learn on two threads; same result
     layouts: str = "default"  # floors: generated:train, FILE.toml, map.yaml; docs/layouts.md
     # A ready-made one's name, a TOML file, or its table; of a schedule, one drawn an episode.
     perturbation: str | dict[str, Any] = "nominal"
@@ -192,32 +192,32 @@ class PracticeConfig(Checked, frozen=True):
     rule: Literal["natural", "even", "shares", "logs", "missions", "success", "regret"] = "natural"
     # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
     by: tuple[str, ...] = ("block",)
-    shares: dict[str, NonNegative] = msgspec.field(default_factory=dict)  # of kinds or arms
-    floor: Share | None = None  # least share of an arm; None: FLOOR where shares move, else 0
-    floors: dict[str, Share] = msgspec.field(default_factory=dict)  # of single kinds or arms
-    every_env_steps: Count = 1_000  # one interval of practice
-    warmup_episodes: NonNegativeInt = 5  # of an arm, before its rate is believed
-    half_life_episodes: Positive = 20.0  # of an arm: an older episode counts half
-    max_change: Annotated[float, Meta(gt=0, le=1)] = 0.1  # of a share, in an interval
-    reference: Literal["operator", "planner"] = "operator"  # against whom regret is
-    reference_missions: Count = 20  # of each arm, that it drives before training
+    shares: dict[str, NonNegative] = msgspec.field(default_factory=dict)  # share per kind or arm
+    floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0
+    floors: dict[str, Share] = msgspec.field(default_factory=dict)  # least share per kind or arm
+    every_env_steps: Count = 1_000  # length of an interval of practice
+    warmup_episodes: NonNegativeInt = 5  # episodes of an arm before its rate is used
+    half_life_episodes: Positive = 20.0  # an arm's episode that is this old counts half
+    max_change: Annotated[float, Meta(gt=0, le=1)] = 0.1  # largest change of a share per interval
+    reference: Literal["operator", "planner"] = "operator"  # driver with which regret is computed
+    reference_missions: Count = 20  # missions per arm that it drives before training
 
     def check(self) -> None:
         if self.rule == "shares" and sum(self.shares.values()) <= 0:
             raise ValueError(f"shares must have a share above 0, got {self.shares}")
         if self.rule != "shares" and self.shares:
-            raise ValueError(f'shares are of the rule "shares", and the rule is "{self.rule}"')
+            raise ValueError(f'shares need the rule "shares", but the rule is "{self.rule}"')
         if sum(self.floors.values()) > 1:
             raise ValueError(f"floors must sum to at most 1, got {self.floors}")
 
 
 class EvaluationConfig(Checked, frozen=True):
     every_env_steps: Count = 20_000
-    episodes: Count = 10  # per condition
-    seed: int = 90_000  # of the first fixed episode; kept away from training seeds
+    episodes: Count = 10  # episodes per condition
+    seed: int = 90_000  # seed of the first fixed episode; not used in training
     # Rate of the average of weights that is evaluated; 1: the last ones.
     averaging: Annotated[float, Meta(gt=0, le=1)] = 0.001
-    layouts: str | None = None  # None: env.layouts, with generated:train's validation floors
+    layouts: str | None = None  # None: env.layouts (generated:train: its validation floors)
     # Where the fixed episodes start and end: by their seeds, or as the logged episodes that the
     # panel holds out (all of them) did, each way at most once.
     missions: Literal["drawn", "logged", "logged:all"] = "drawn"
@@ -228,26 +228,26 @@ class GuardConfig(Checked, frozen=True):
     # Of success in a condition, below the kept policy's; None: off.
     margin: Annotated[float, Meta(gt=0, le=1)] | None = None
     action: Literal["stop", "rollback"] = "stop"
-    conditions: tuple[str, ...] = ()  # that are watched; empty: all that are evaluated
-    rollbacks: NonNegativeInt = 3  # after so many the run stops
+    conditions: tuple[str, ...] = ()  # conditions that are watched; empty: all evaluated
+    rollbacks: NonNegativeInt = 3  # after this number of rollbacks the run stops
 
 
 class RecordConfig(Checked, frozen=True):
-    every_updates: Count = 500  # one logging interval
-    audit_share: Share = 0.01  # of all batches, every row of which is recorded
-    probe_rows: NonNegativeInt = 64  # per condition, held fixed for the whole run
+    every_updates: Count = 500  # length of a logging interval
+    audit_share: Share = 0.01  # share of batches whose rows are all recorded
+    probe_rows: NonNegativeInt = 64  # rows per condition, fixed for the whole run
     checkpoint_every_env_steps: Count = 40_000
-    keep_checkpoints: Count = 3  # the latest and those before it; the best is kept besides
+    keep_checkpoints: Count = 3  # number of latest ones; the best is always kept
     tensorboard: bool = True
-    trackers: tuple[Literal["wandb", "mlflow"], ...] = ()  # the same curves go there, too
+    trackers: tuple[Literal["wandb", "mlflow"], ...] = ()  # trackers that also get the curves
 
 
 class TrainConfig(Checked, frozen=True):
-    """Everything that decides a run, besides the panel."""
+    """All settings of a run, except the panel."""
 
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = 1  # of torch, on the CPU
+    threads: int = 1  # threads of torch on the CPU
     profile: str = "warehouse_amr"  # the robot: its task, conditions and zones
     network: NetworkConfig = NetworkConfig()
     loss: LossConfig = LossConfig()
@@ -267,7 +267,7 @@ class TrainConfig(Checked, frozen=True):
 
     def check(self) -> None:
         if self.loss.munchausen and self.network.quantiles:
-            raise ValueError("loss.munchausen and network.quantiles do not go together: choose one")
+            raise ValueError("loss.munchausen and network.quantiles cannot be combined: choose one")
         if self.loss.munchausen and self.teacher.filters and self.teacher.target == "filtered":
             raise ValueError(
                 'loss.munchausen averages over all actions, teacher.target = "filtered" leaves'
@@ -288,7 +288,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     """
     document: dict[str, Any] = {}
     if path is not None:
-        document = read_toml(path, remedy="give --config the path of a TOML file")
+        document = read_toml(path, remedy="give the path of a TOML file with --config")
     document = apply_overrides(document, overrides)
     return parse_config(document, where=str(path) if path is not None else "--set")
 
@@ -327,7 +327,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
     key, separator, text = override.partition("=")
     if not separator or not key.strip():
         raise ConfigError(
-            f"{override!r} is not key=value",
+            f"{override!r} is not of the form key=value",
             where="--set",
             remedy="write for example --set optimizer.learning_rate=1e-4",
         )
@@ -339,7 +339,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
     for section in sections:
         document = document.setdefault(section, {})
         if not isinstance(document, dict):
-            raise ConfigError(f"{key!r} goes below a value", where="--set")
+            raise ConfigError(f"{key!r} is a key below a single value", where="--set")
     document[last] = value
 
 

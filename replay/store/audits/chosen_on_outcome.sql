@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Choose on the situation: give the exposure of the row a stratum in this condition's place (the shipped mixture `exposure` does so for all), so that what was handled well is replayed too.
--- doc: Conditions whose episodes succeed much less than all episodes that were in the same situation (the exposure that most of them met): a stratum of them is chosen on its outcome.
+-- advice: Choose on the situation: use a stratum for the exposure in the row in place of this condition's (the shipped mixture `exposure` does so for all), so that episodes that handled it well are replayed, too.
+-- doc: Conditions whose episodes succeed much less often than all episodes in the same situation (the exposure that most of them met): a stratum of them is chosen on its outcome.
 SELECT
     condition,
     exposure,

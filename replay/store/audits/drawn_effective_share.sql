@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: run.strata
--- advice: What the run drew of them was weighted away: change their correction in the mixture, and train again.
--- doc: Strata of the logs whose share of the run's gradient, after weights, was below their share of the panel's rows, though they were drawn no less often.
+-- advice: Importance weights undid what the run drew of them: change their correction in the mixture, and train again.
+-- doc: Strata of the logs whose share of the run's gradient, after weights, was smaller than their share of the panel's rows, although they were drawn at least as often.
 WITH drawn AS (
     SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
     FROM run.strata

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: `FROM drops` says why; a topic that comes too seldom, or a maximum age that is too strict, takes data away.
--- doc: Recordings that lost too many ticks of the control clock to staleness, gaps and the like.
+-- advice: `FROM drops` lists the reasons; a topic that comes too rarely, or a maximum age that is too strict, removes data.
+-- doc: Recordings that lost too many ticks of the control clock, for example to stale topics or gaps.
 SELECT recording_id, source_file, sum(count) AS dropped, any_value(ticks) AS ticks
 FROM drops
 JOIN (SELECT recording_id, ticks FROM recordings) USING (recording_id)

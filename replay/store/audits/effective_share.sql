@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: panel
--- advice: Its quota is undone by its correction: set unit = "episode" or [correction] post = "density_ratio" in the mixture, or "none".
--- doc: Strata of the panel whose share of the gradient, after weights, is below that of the plain logs, though they are drawn no less often; or that their own correction takes further below.
+-- advice: Its correction undoes its quota: set unit = "episode" or [correction] post = "density_ratio" in the mixture, or "none".
+-- doc: Strata of the panel whose share of the gradient, after weights, is smaller than in the plain logs, although they are drawn at least as often; or whose own correction reduces it further.
 WITH of_source AS (
     SELECT
         name AS stratum,

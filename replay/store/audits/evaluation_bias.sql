@@ -1,7 +1,7 @@
 -- severity: warning
 -- needs: run
--- advice: Report success per condition, or weigh each condition by its share of the logs; the mean over this evaluation is not what deployment will show.
--- doc: Conditions that an evaluation of the run shows more often than the logs do.
+-- advice: Report success per condition, or weight each condition by its share of the logs; the mean over this evaluation does not predict deployment.
+-- doc: Conditions that are more frequent in an evaluation of the run than in the logs.
 WITH deployed AS (
     SELECT kind AS condition, count(*) / sum(count(*)) OVER () AS share_in_logs
     FROM episode_kinds($min_steps)

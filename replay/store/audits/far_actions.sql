@@ -1,6 +1,6 @@
 -- severity: info
--- advice: What the robot did there is not what the row says: add an action, or leave such rows out with the mixture's `where`.
--- doc: Behaviour policies whose commands are often far from every discrete action.
+-- advice: Here the robot did not do what the row says: add an action, or leave out such rows with the mixture's `where`.
+-- doc: Behaviour policies whose commands are often far from all discrete actions.
 SELECT
     behaviour_policy,
     count(*) AS rows,

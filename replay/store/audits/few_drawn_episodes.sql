@@ -1,7 +1,7 @@
 -- severity: warning
 -- needs: run.sampled_episodes
--- advice: What the critic knows of this stratum is what these few episodes show: add episodes, or read its results as theirs.
--- doc: Strata of which a run drew so unevenly that its draws are worth few episodes.
+-- advice: What the critic knows about this stratum comes from these few episodes: add episodes, or treat its results as valid only for them.
+-- doc: Strata that a run drew so unevenly that the draws have the information of too few episodes.
 SELECT
     source,
     stratum,

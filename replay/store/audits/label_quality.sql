@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Change the condition's SQL and ingest again; a stratum is no better than its label.
--- doc: Conditions whose labels miss, or make up, too much, where the true condition is known.
+-- advice: Change the condition's SQL and ingest again; a stratum is only as good as its label.
+-- doc: Conditions whose labels have too many misses or false alarms, where the true condition is known.
 SELECT
     condition,
     sum(precision * labelled) / sum(labelled) AS precision,

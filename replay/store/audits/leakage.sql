@@ -1,7 +1,7 @@
 -- severity: error
 -- needs: panel
--- advice: Make the panel again, after `duplicate_transitions` and `repeated_steps` pass; what is held out must share nothing with what is trained on.
--- doc: What is in the panel and held out at once: an episode; a recording, robot or site, where whole ones are held out; an episode that ends after the first that is held out, where the latest are; steps up to the end of an episode, where that is; or the same step under another id.
+-- advice: Make the panel again after `duplicate_transitions` and `repeated_steps` pass; held-out data must share nothing with the training data.
+-- doc: Data that is both in the panel and held out: an episode; a recording, robot or site, if whole ones are held out; an episode that ends after the first held-out one, if the latest are held out; steps up to the end of an episode, if ends are held out; or the same step under another id.
 WITH copies AS (
     FROM same_steps()
 ), panel_steps AS (

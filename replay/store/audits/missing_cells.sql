@@ -1,4 +1,4 @@
 -- severity: warning
--- advice: The critic must guess the value of this action here: explore it in the twin, or take it out of the target's maximum.
--- doc: Condition x action cells with fewer rows than the minimum, empty ones included.
+-- advice: Here the critic must guess the value of this action: explore it in the twin, or exclude it from the target's maximum.
+-- doc: Condition x action cells with fewer rows than the minimum, including empty cells.
 FROM cells_below($min_rows)

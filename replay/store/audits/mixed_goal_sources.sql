@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Take one kind of goal into a panel: where = "goal_source = 'logged'" in its mixture. Returns of the two are not comparable, and only the logged ones have successes.
--- doc: Tasks whose rows have goals of both kinds: ordered, and by hindsight.
+-- advice: Use one kind of goal in a panel: where = "goal_source = 'logged'" in its mixture. Returns of the two kinds are not comparable, and only logged goals have successes.
+-- doc: Tasks whose rows have goals of both kinds: recorded, and in hindsight.
 SELECT
     task_hash,
     count(DISTINCT episode_id) FILTER (WHERE goal_source = 'logged') AS logged_episodes,

@@ -1,6 +1,6 @@
 -- severity: error
--- advice: Ingest this recording again with this version; if it stays, its profile reads a broken topic.
--- doc: Rows that lack a value no row may lack.
+-- advice: Ingest this recording again with this version; if the finding stays, its profile reads a broken topic.
+-- doc: Rows without a required value.
 SELECT transition_id, recording_id, episode_id, step_index
 FROM flawed_rows
 WHERE is_null

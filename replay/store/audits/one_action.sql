@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Nothing in these rows says what another action leads to, so a policy learns none: ingest drives that turn and stop, or check `actions` of the profile against its commands.
--- doc: Recordings (almost) all of whose rows have one and the same action.
+-- advice: These rows do not show what other actions lead to, so a policy cannot learn them: ingest drives that turn and stop, or check `actions` of the profile against the commands.
+-- doc: Recordings in which (almost) all rows have the same action.
 SELECT recording_id, source_file, action, rows, rows / of_recording AS share
 FROM (
     SELECT

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Compare policies per condition, or weigh each condition as the whole fleet meets it.
--- doc: Behaviour policies whose success looks better than it is, because they drove easier episodes than the fleet meets.
+-- advice: Compare policies per condition, or weight each condition by its frequency in the whole fleet.
+-- doc: Behaviour policies whose success looks better than it is, because they drove easier episodes than the fleet.
 WITH kinds AS (
     SELECT first_policy AS behaviour_policy, kind, success
     FROM episode_kinds($min_steps)

@@ -1,6 +1,6 @@
 -- severity: error
--- advice: A bag and a part of it, a copy cut otherwise or a drive that was recorded again were both ingested: take one of the two recordings out, or these steps weigh twice.
--- doc: Recordings that hold the same steps as another one: equal action, observation and pose, at one constant shift of their clocks (`repeated_rows`).
+-- advice: A bag and a part of it, a differently cut copy, or the same drive recorded twice were both ingested: remove one of the two recordings, or these steps count twice.
+-- doc: Recordings that contain the same steps as another one: equal action, observation and pose, at one constant shift of their clocks (`repeated_rows`).
 SELECT
     repeated.same_as AS recording_id,
     any_value(one.source_file) AS source_file,

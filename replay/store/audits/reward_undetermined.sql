@@ -1,4 +1,4 @@
 -- severity: warning
--- advice: More episodes of each driver would tell; `restock eval RUN --policies agent,planner,operator` drives all of them on the same missions, which needs fewest, and `restock audit RUN --reward` compares those.
--- doc: Pairs of drivers of whom too few episodes are there to tell whether more success earns more.
+-- advice: More episodes of each driver would decide; `restock eval RUN --policies agent,planner,operator` drives all of them on the same missions, which needs the fewest episodes, and `restock audit RUN --reward` compares them.
+-- doc: Pairs of drivers with too few episodes to decide whether more success earns more.
 FROM undetermined_order('driven_episodes', $min_episodes, $same_success)

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: One drive was likely recorded twice (replayed, or by another profile): take one of the two recordings out, or its steps weigh twice.
--- doc: Recordings whose commands and wheel speeds are those of another one at one constant shift of their clocks, whatever their profiles take for the pose, the goal and the actions.
+-- advice: One drive was probably recorded twice (replayed, or read with another profile): remove one of the two recordings, or its steps count twice.
+-- doc: Recordings with the same commands and wheel speeds as another one, at one constant shift of their clocks, whatever their profiles use as pose, goal and actions.
 SELECT
     one.recording_id,
     file.source_file,

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Look at the robot (its wheels, its lidar, its floor) before learning from it: a policy for the others may never meet this, or a fault looks like it. `FROM coverage_by_robot` has the rates.
--- doc: Conditions that one robot saw (almost) alone, though others drove too: the robot's own fault, or what only its site has.
+-- advice: Check the robot (its wheels, its lidar, its floor) before learning from it: the other robots may never meet this condition, or a fault may look like it. `FROM coverage_by_robot` has the rates.
+-- doc: Conditions that (almost) only one robot has seen, although others drove too: a fault of the robot, or something that only its site has.
 WITH seen AS (
     SELECT
         robot,

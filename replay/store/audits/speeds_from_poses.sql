@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: Record the odometry. Speeds from poses are late by half a window, and slip cannot be seen in them.
+-- advice: Record odometry. Speeds from poses are late by half a window, and slip cannot be detected in them.
 -- doc: Recordings whose speeds come from poses, as no odometry was recorded.
 SELECT recording_id, source_file, transitions, stand_in.instead
 FROM (SELECT recording_id, source_file, transitions, unnest(stand_ins) AS stand_in FROM recordings)

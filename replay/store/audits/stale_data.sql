@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: The floor may have changed since: record this condition again, or set max_age_days in the mixture.
+-- advice: The floor may have changed since then: record this condition again, or set max_age_days in the mixture.
 -- doc: Conditions whose newest row is older than the limit.
 SELECT condition, rows, newest, age_min_days
 FROM ages

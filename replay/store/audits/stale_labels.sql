@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Where only conditions changed, `restock label STORE --profile PROFILE`; else ingest these recordings again.
--- doc: Recordings that were labelled, or read, by another version of the conditions or the profile than the newest ingest of that profile's name.
+-- advice: If only conditions changed, run `restock label STORE --profile PROFILE`; otherwise ingest these recordings again.
+-- doc: Recordings that were labelled or read with another version of the conditions or the profile than the newest ingest with a profile of that name.
 WITH newest AS (
     FROM recordings
     QUALIFY row_number() OVER (PARTITION BY profile ORDER BY ingested_at DESC, ingest_id) = 1

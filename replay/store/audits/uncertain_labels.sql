@@ -1,6 +1,6 @@
 -- severity: info
--- advice: Leave such rows out of strata, have people review them (restock label --review), or log a better sensor.
--- doc: Conditions of whose rows, labelled or uncertain, many are too near to call by their probability.
+-- advice: Leave such rows out of strata, let people review them (restock label --review), or log a better sensor.
+-- doc: Conditions with a large share of uncertain rows, by their probability, among all rows that are labelled or uncertain.
 WITH doubted AS (
     SELECT
         condition,

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Nothing was measured that these conditions need: record a scan, or leave them out of the profile and ask for no share of them. Rows of an older Restock say that they never hold: ingest those again.
--- doc: Conditions and exposures that the rows of a recording do not tell, such as what needs a lidar on a robot without one.
+-- advice: A signal that these conditions need was not recorded: record a scan, or remove them from the profile and give them no share. Rows from an older Restock say that they never hold: ingest those recordings again.
+-- doc: Conditions and exposures that are unknown in the rows of a recording, for example those that need a lidar on a robot without one.
 SELECT condition, kind, because, signals, count(*) AS recordings, sum(transitions) AS rows
 FROM unknown_conditions
 GROUP BY condition, kind, because, signals

@@ -1,6 +1,6 @@
 -- severity: warning
--- advice: Leave these episodes out with the mixture's `where`, or keep them in a stratum of their own with a cap.
--- doc: Behaviour policies that bumped into things in too many of their steps.
+-- advice: Leave out these episodes with the mixture's `where`, or keep them in a stratum of their own with a cap.
+-- doc: Behaviour policies with a bump in too many of their steps.
 WITH bumps AS (
     -- Pressed at the start of a step, or what ended the episode.
     SELECT behaviour_policy, count(*) AS bumped, count(DISTINCT episode_id) AS episodes

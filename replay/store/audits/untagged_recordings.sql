@@ -1,6 +1,6 @@
 -- severity: info
--- advice: `restock ingest RECORDING --tag robot=…` says it without reading the recording again, or let the profile take it from the path: [tags] in docs/ingest.md.
--- doc: Recordings that do not say their robot, site, firmware, map or shift while others do: they are missing from what is counted by it.
+-- advice: Add the tag with `restock ingest RECORDING --tag robot=…` (the recording is not read again), or let the profile take it from the path: [tags] in docs/ingest.md.
+-- doc: Recordings without a robot, site, firmware, map or shift while others have one: they are missing from all counts by that tag.
 WITH told AS (
     SELECT
         count(robot) > 0 AS robot,
