@@ -85,7 +85,7 @@ def test_a_refused_comparison_says_why_on_its_page(tmp_path: Path) -> None:
     found = read(page)
     assert "gate refused: not comparable" in found.text
     assert "cannot be compared: they differ in config.replay.batch_size" in found.text
-    assert "How probably" not in found.text
+    assert "Probability that" not in found.text
 
 
 def test_a_check_without_an_end_of_its_interval_is_shown() -> None:
@@ -136,20 +136,20 @@ def test_a_store_has_a_page_of_what_it_holds(
     page, folder = tmp_path / "page.html", tmp_path / "figures"
     argv = ["coverage", str(store_path), "--out", str(page), "--figures", str(folder)]
     assert main(argv) == 0
-    assert "the shelves" in capsys.readouterr().out
+    assert "rows by condition" in capsys.readouterr().out
     found = read(page)
     for title in (
-        "The shelves",
+        "What the store holds",
         "What to log next",
         "When was it logged?",
-        "Which robot saw what?",
+        "Which robot has seen which condition?",
     ):
         assert title in found.text
     assert "Has a robot changed?" in found.text
     assert "Where was it logged?" in found.text
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
     assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
-    assert "name the page with --out FILE" in capsys.readouterr().err
+    assert "give --out FILE, too" in capsys.readouterr().err
 
 
 def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:

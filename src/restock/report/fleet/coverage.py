@@ -74,8 +74,8 @@ def coverage_page(
         "kicker": "coverage of a store",
         "title": f"Coverage of {gaps['store']}",
         "headline": headline(found["shelves"], gaps),
-        "lead": f"What the logs hold of each condition, and what mixture {gaps['mixture']} and the"
-        " audits ask for and do not find.",
+        "lead": f"How much of each condition the logs hold, and what mixture {gaps['mixture']} "
+        "and the audits ask for and do not find.",
         "cards": [
             {"value": count(totals["rows"]), "label": "transitions"},
             {"value": count(totals["episodes"]), "label": "episodes"},
@@ -104,20 +104,20 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     text = ""
     if worst is not None:
         text = (
-            f"Shortest against what is asked for: {words(worst['cell'])}, {worst['there']:,} of"
-            f" {worst['needed']:,} {worst['counted']}"
+            f"Largest gap: {words(worst['cell'])}, {worst['there']:,} of {worst['needed']:,} "
+            f"{worst['counted']}"
         )
     never = [words(row["condition"]) for row in shelves if row["rows"] == 0]
     if never:
         text += f"; never seen: {', '.join(never)}"
     unknown = [words(row["condition"]) for row in shelves if row["rows"] is None]
     if unknown:
-        text += f"; unknown of every recording: {', '.join(unknown)}"
+        text += f"; unknown in every recording: {', '.join(unknown)}"
     plan = gaps["plan"]
     if plan["orders"]:
         text += (
-            f"; {_amount(plan['total'])} {gaps['unit']} [{_amount(plan['total_low'])},"
-            f" {_amount(plan['total_high'])}] would fill what can be filled"
+            f"; {_amount(plan['total'])} {gaps['unit']} [{_amount(plan['total_low'])}, "
+            f"{_amount(plan['total_high'])}] would fill the gaps that can be filled"
         )
     return text.removeprefix("; ")
 
@@ -142,12 +142,13 @@ def _shelves(rows: Rows) -> Section:
     ]
     return Section(
         "shelves",
-        "The shelves",
-        intro="One shelf a condition. A row lies on the shelf of its rarest condition; it holds for"
-        " others too. Effective episodes: how many equally long ones it would be."
+        "What the store holds",
+        intro="Each row is counted under its rarest condition; other conditions may hold in it, "
+        "too. Effective episodes: the number of equally long episodes with the same "
+        "information."
         + (
-            f" No row tells {', '.join(unknown)}: nothing was measured that they need (see the view"
-            " unknown_conditions)."
+            f" Unknown in every row: {', '.join(unknown)}, as a signal that they need was not "
+            "measured (see the view unknown_conditions)."
             if unknown
             else ""
         ),
@@ -232,7 +233,7 @@ def _shopping(gaps: dict[str, Any]) -> Section:
         " at the rates of the store's own episodes; intervals are 95 %. `restock gaps"
         " --missions-out FILE` writes it as missions to drive.",
         tables=[
-            Table(_without_empty(orders), {"missions", "hours"}, title="The shopping list"),
+            Table(_without_empty(orders), {"missions", "hours"}, title="What to drive"),
             Table(
                 table,
                 {"there", "needed", unit},
@@ -316,9 +317,9 @@ def _robots(rows: Rows) -> Section | None:
     ]
     return Section(
         "robots",
-        "Which robot saw what?",
-        intro="Rows of each condition, and their share of the robot's own. A condition that one"
-        " robot alone has seen is learnt with that robot's wheels.",
+        "Which robot has seen which condition?",
+        intro="Rows of each condition, and their share of the robot's own. A condition that only "
+        "one robot has seen is learned only from that robot's hardware.",
         tables=[Table(table, {"hours", *names})],
     )
 

@@ -30,7 +30,7 @@ _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {
     "robot": "this robot",
     "site": "the whole site",
-    "alone": "no other robot to tell",
+    "alone": "no other robot to compare",
     "unclear": "unclear",
 }
 
@@ -52,8 +52,8 @@ def drift_page(drift: Drift) -> dict[str, Any]:
         "title": f"Drift of {drift.store}",
         "headline": headline(drift),
         "lead": f"{_count(len(robots), 'robot')} over {_count(len(periods), drift.every)}:"
-        f" each {drift.every} of a robot against its first"
-        f" {_count(drift.reference, drift.every)}, and against the other robots of its site.",
+        f" each {drift.every} of a robot compared with its first "
+        f"{_count(drift.reference, drift.every)}, and with the other robots of its site.",
         "cards": [
             {"value": f"{number:,}", "label": label}
             for number, label in (
@@ -91,8 +91,8 @@ def headline(drift: Drift) -> str:
     if all(row["p"] is None for row in drift.tests):
         return "Too little to compare: no robot has a reference and enough later episodes"
     if drift.findings:
-        return "No robot's hardware has changed by what matters; how or where it drives has"
-    return "Nothing has changed by what matters, as far as these logs can tell"
+        return "No robot's hardware has changed enough to matter; how or where it drives has"
+    return "No change that matters was found in these logs"
 
 
 def findings_section(drift: Drift) -> Section:
@@ -113,10 +113,11 @@ def findings_section(drift: Drift) -> Section:
     return Section(
         "findings",
         "What has changed",
-        intro="A change is reported where it is at least what matters for its signal and its p,"
-        " corrected over all signals, robots and periods, is below .05. The interval holds with"
-        " 95 % confidence for the one signal. Scope: whether the other robots of the site changed"
-        " alike in the same period, as a new floor makes them.",
+        intro="A change is reported if it is at least the least change that matters for its "
+        "signal, and if its p-value, corrected over all signals, robots and periods, is below "
+        ".05. The interval has 95 % confidence for the single signal. Scope: whether the "
+        "other robots of the site changed in the same way in the same period, for example "
+        "because of a new floor.",
         callout="" if rows else headline(drift) + ".",
         figures=[_trend(drift, row) for row in shown],
         two=True,
@@ -193,7 +194,9 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
             color=alt.Color(
                 "size:Q",
                 scale=alt.Scale(scheme="blueorange", domain=[-_BEYOND, _BEYOND]),
-                legend=alt.Legend(title="change, in least changes that matter", titleLimit=280),
+                legend=alt.Legend(
+                    title="change, in units of the least change that matters", titleLimit=280
+                ),
             )
         )
         marks = base.mark_text(color="#1f2937").encode(text="mark:N")
@@ -208,8 +211,8 @@ def _overview_section(drift: Drift, own: Rows) -> Section | None:
     return Section(
         "overview",
         "Every signal of the hardware",
-        intro="Against the robot's own reference. One unit is the least change that matters; a dot"
-        " marks what is reported as changed.",
+        intro="Compared with the robot's own reference. One unit is the least change that "
+        "matters; a dot marks a reported change.",
         figures=[
             Figure(
                 charts.draw(chart, charts.FULL),
@@ -243,7 +246,7 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
             .mark_line(point={"size": 40, "filled": True})
             .encode(
                 x=alt.X("period:O", title=None, axis=_PERIODS),
-                y=alt.Y("events_per_h:Q", title="events an hour", scale=alt.Scale(zero=True)),
+                y=alt.Y("events_per_h:Q", title="events per hour", scale=alt.Scale(zero=True)),
                 color=charts.coloured("robot", robots, {}, width),
             )
             .properties(width=width // columns - 70, height=150)
@@ -255,13 +258,13 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
     return Section(
         "conditions",
         "How often each condition begins",
-        intro=f"Events an hour driven. {compared:,} comparisons by robot, zone and {drift.every}"
-        " had five events or more and were tested (a quasi-Poisson score test, whose dispersion is"
-        " from how a robot's drives differ).",
+        intro=f"Events per hour driven. {compared:,} comparisons by robot, zone and {drift.every} "
+        "had at least five events and were tested (a quasi-Poisson score test, with the "
+        "dispersion between the drives of a robot).",
         figures=[
             Figure(
                 charts.draw(chart, charts.FULL),
-                caption=f"None began of: {_list(sorted(never))}." if never else "",
+                caption=f"Never seen: {_list(sorted(never))}." if never else "",
             )
         ],
     )
@@ -290,9 +293,9 @@ def _differences_section(drift: Drift) -> Section | None:
     return Section(
         "differences",
         "Robots that differ from the others",
-        intro="Against the mean of the other robots of the site, newest difference of each signal."
-        " Robots may differ from the day they were built: that alone is no drift. In a small fleet"
-        " one robot that changed also sets all others apart from their mean.",
+        intro="The newest difference of each signal from the mean of the other robots of the "
+        "site. Robots may differ since they were built: that alone is not drift. In a small "
+        "fleet, one robot that changed also moves the mean with which the others are compared.",
         tables=[Table(rows[:40], numbers={"the others", "this robot"})],
     )
 
@@ -324,10 +327,9 @@ def _comparisons_section(own: Rows) -> Section | None:
     return Section(
         "comparisons",
         "The newest comparison of each signal",
-        intro="What changed stands first. Undecided: neither shown to have changed nor to be within"
-        " what matters; more drives would decide. Samples are of now and of the reference."
-        " Cliff's delta and the Kolmogorov-Smirnov distance compare episodes: 0 is no difference,"
-        " 1 no overlap.",
+        intro="Changed signals come first. Undecided: neither a change nor its absence is shown; "
+        "more drives would decide. Samples: now / reference. Cliff's delta and the "
+        "Kolmogorov-Smirnov distance compare episodes: 0 is no difference, 1 no overlap.",
         tables=[
             Table(
                 rows[:120],

@@ -13,18 +13,18 @@ from restock.replay.store.column_docs import unit as unit_of
 from restock.report.look.blocks import Rows, words
 
 _MEANINGS = {  # what a signal tells of; docs/drift.md has how each is measured
-    "odometry_scale": "metres localised a metre that the wheels report, straight",
-    "wheel_yaw_scale": "yaw rate of the gyroscope over that of the wheels, turning",
-    "wheel_pull_radpm": "turn that the wheels did not report, a metre of straight driving",
-    "command_gain": "wheel speed over the command, once held",
+    "odometry_scale": "localised metres per metre that the wheels report, driving straight",
+    "wheel_yaw_scale": "yaw rate of the gyroscope divided by that of the wheels, when turning",
+    "wheel_pull_radpm": "turn that the wheels did not report, per metre of straight driving",
+    "command_gain": "wheel speed divided by the command, when the command is held",
     "command_response": "share of a changed command that is reached within one step",
-    "gyro_bias_radps": "gyroscope less the pose's turn, straight",
+    "gyro_bias_radps": "gyroscope minus the turn of the pose, driving straight",
     "accel_bias_mps2": "acceleration at a steady speed: bias, or a slope of the floor",
     "vibration_mps2": "spread of the acceleration at a steady speed",
-    "localiser_jitter_mps": "sideways speed of the poses, straight",
+    "localiser_jitter_mps": "sideways speed of the poses, driving straight",
     "localiser_age_s": "age of the pose at a step",
-    "lidar_noise_m": "unevenness of a sector's range over three steps, straight",
-    "silent_sectors": "lidar sectors that show nothing, or the same, for a whole episode",
+    "lidar_noise_m": "noise of a sector's range over three steps, driving straight",
+    "silent_sectors": "lidar sectors with no return, or a constant one, for a whole episode",
 }
 
 

@@ -23,12 +23,12 @@ def actions_section(facts: Facts) -> Section | None:
     cells = _cells(facts.actions)
     return Section(
         "actions",
-        "Which actions did it see, and which does it want?",
-        intro="Of each condition's sampled rows, those with an action: in batches from logs, in"
-        " fresh rows, and those of the fresh rows where the policy would take it (of audited"
-        " batches, in the last quarter of the updates). Of an action that is wanted and not in the"
-        " logs, the logs do not tell what it leads to; `restock diagnose` says when that is a"
-        " cause of failure.",
+        "Which actions were in the data, and which ones does the policy prefer?",
+        intro="For each condition, the share of each action in sampled rows from logs and in "
+        "fresh rows, and the share of fresh rows in which the policy would take it (from "
+        "audited batches, in the last quarter of the updates). The logs do not show the "
+        "outcome of an action that is preferred but not in the logs; `restock diagnose` tells "
+        "whether that causes failures.",
         figures=[Figure(_heatmap(cells), "Share of a condition's rows by action")],
         tables=_table(facts.actions),
     )
@@ -132,12 +132,12 @@ def _table(rows: Rows) -> list[Table]:
             "wanted": percent(row["wanted_share"]),
             "in the logs": percent(share),
             "in fresh rows": percent(row["drawn_share"]),
-            "rows looked at": count(row["audited_rows"]),
+            "rows checked": count(row["audited_rows"]),
         }
         for _, share, row in gaps[:_LINES]
     ]
-    numbers = {"wanted", "in the logs", "in fresh rows", "rows looked at"}
-    title = "Wanted more than twice as often as the logs have it"
+    numbers = {"wanted", "in the logs", "in fresh rows", "rows checked"}
+    title = "Preferred more than twice as often as in the logs"
     return [Table(lines, numbers, title=title)] if lines else []
 
 

@@ -22,7 +22,11 @@ def capacity_section(facts: Facts) -> Section | None:
     if capacity is None:
         return None
     asked = capacity["recommended"]
-    how = "chosen by task diversity" if chosen else f"by the panel's diversity {asked:,} would do"
+    how = (
+        "chosen by task diversity"
+        if chosen
+        else (f"by the panel's diversity, {asked:,} would be enough")
+    )
     intro = f"The ring holds {ring or 0:,} rows; {how}: {capacity['reason']}."
     rows = [
         {
@@ -38,10 +42,10 @@ def capacity_section(facts: Facts) -> Section | None:
     ]
     return Section(
         "capacity",
-        "How much must the buffer hold?",
-        intro=f"{intro} A cell is a condition x zone x action; a first-in-first-out buffer that"
-        " is smaller forgets whole cells, and no sampling brings them back.",
-        figures=[Figure(_curve(capacity, asked), "What the newest logged rows cover")],
+        "How large must the buffer be?",
+        intro=f"{intro} A cell is a condition x zone x action. A smaller first-in-first-out "
+        "buffer forgets whole cells, which no sampling can bring back.",
+        figures=[Figure(_curve(capacity, asked), "Cells covered by the newest logged rows")],
         two=True,
         tables=[Table(rows, set(rows[0]) if rows else set())],
     )

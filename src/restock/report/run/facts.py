@@ -24,7 +24,7 @@ from restock.train.twin.floors.layout import DEFAULT, Warehouse
 
 PACKAGE = "restock.report.run"
 CELL_M = 0.25
-NO_GOAL = "The task has no goal: success is not defined, and no evaluation shows it."
+NO_GOAL = "The task has no goal: success is not defined."
 MOST_DOTS = 1500
 _TABLES = (  # of a run, that run.sql asks
     *("strata", "conditions", "actions", "ages", "policies", "evaluations", "probe", "progress"),
@@ -172,7 +172,7 @@ def _add_panel(facts: Facts) -> None:
     panel = facts.config.get("panel")
     where = panel.get("path") if isinstance(panel, dict) else panel
     if not where:
-        facts.missing.append("The run had no panel: it learnt from fresh experience alone.")
+        facts.missing.append("The run had no panel: it learned from fresh experience alone.")
         return
     try:
         facts.panel = Panel.open(where)
@@ -252,8 +252,7 @@ def evaluation_bias(facts: Facts) -> str:
     if gain <= 0.0005:
         return text + " No condition's share biases the evaluation upward."
     return text + (
-        f" The share that biases it most is {words(worst)}: {evaluated:.0%} of the"
-        f" mean, {logged[worst]:.0%} of the logs' episodes, and"
-        f" {'easier' if more else 'harder'} than average ({success[worst]:.0%}); it is worth"
-        f" {gain * 100:+.1f} points."
+        f" The largest bias comes from {words(worst)}: {evaluated:.0%} of the mean, "
+        f"{logged[worst]:.0%} of the logs' episodes, and {'easier' if more else 'harder'} than "
+        f"average ({success[worst]:.0%}); it contributes {gain * 100:+.1f} points."
     )

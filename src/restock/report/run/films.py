@@ -37,11 +37,11 @@ def films_section(facts: Facts) -> Section | None:
     return Section(
         "films",
         "What does it look like?",
-        intro="Episodes of the evaluation, driven again: the same spec, policy and outcome. Of each"
-        " condition the failure of the lowest return, and an episode that it ended well where"
-        " another policy did not. From above: the robot orange, its way so far a line, its plan"
-        " dashed, the goal green; people blue, forklifts yellow, pallets brown, slippery floor"
-        " light blue.",
+        intro="Episodes of the evaluation, driven again with the same spec, policy and outcome. "
+        "For each condition: the failure with the lowest return, and an episode in which the "
+        "agent succeeded and another policy did not. Seen from above: the robot is orange, "
+        "its path a line, its plan dashed, the goal green; people are blue, forklifts yellow, "
+        "pallets brown, slippery floor light blue.",
         figures=figures,
         two=True,
     )

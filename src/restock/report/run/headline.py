@@ -21,7 +21,7 @@ BASELINES = {
     "random": "a random policy",
 }
 MOST_NAMED = 3  # conditions of a verdict in the headline
-_WITHOUT = "evaluate it beside one: `restock eval --policies agent,planner`"
+_WITHOUT = "evaluate it together with one: `restock eval --policies agent,planner`"
 
 
 def headline(facts: Facts) -> str:
@@ -40,7 +40,7 @@ def headline(facts: Facts) -> str:
     average, random = mean_success(cells), facts.clean_cells("random")
     if random and average <= mean_success(random):
         return (
-            "Nothing was learnt: no better than a random policy on the same episodes"
+            "Nothing was learned: no better than a random policy on the same episodes"
             f" ({average:.0%} against {mean_success(random):.0%}, mean over conditions)"
         )
     return _against_baseline(facts) + _distrust(facts)
@@ -177,10 +177,10 @@ def lead(facts: Facts) -> str:
         return text
     name = baseline(facts)
     if name is None:
-        return f"{text} Without a baseline a success says little: {_WITHOUT}."
+        return f"{text} Without a baseline, the success is hard to interpret: {_WITHOUT}."
     text += f" {_safety(facts, name)}" + (
-        " Differences are in success, paired by episode, with 95 % intervals over episodes:"
-        " what another training seed would have changed is not in them."
+        " Differences are in success, paired by episode, with 95 % intervals over episodes; they "
+        "do not include the variation between training seeds."
     )
     return text.replace("  ", " ")
 
@@ -192,8 +192,8 @@ def _safety(facts: Facts, name: str) -> str:
         return ""
     who = BASELINES[name].removesuffix(",")
     text = (
-        f"On the way it bumped {_told(own, 'bumps_per_km', '.0f')} times a km, {who}"
-        f" {_told(other, 'bumps_per_km', '.0f')}"
+        f"It bumped {_told(own, 'bumps_per_km', '.0f')} times per km, {who} "
+        f"{_told(other, 'bumps_per_km', '.0f')}"
     )
     if name == "planner" and own.get("time_lost_s") is not None:
         text += f"; where both arrived it took {_told(own, 'time_lost_s', '+.1f')} s"

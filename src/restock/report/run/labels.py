@@ -17,14 +17,15 @@ def labels_section(facts: Facts) -> Section | None:
     reliability = _reliability(facts.reliability)
     tables = [Table(rows, set(rows[0]) - {"condition"})]
     if reliability:
-        title = "Of steps whose probability is about p, a share p should be true"
+        title = "Steps with probability p: the share that is true should be p"
         tables.append(Table(reliability, set(reliability[0]) - {"condition"}, title=title))
     return Section(
         "labels",
         "How good are the labels?",
-        intro="Against what the simulator knew, over all recordings of the store. An event is a run"
-        " of steps of an episode; it is found within .4 s. Ranges are 95 % (Wilson). Uncertain is"
-        " the share of all steps that are too near to call by the condition's probability.",
+        intro="Compared with the true conditions of the simulator, over all recordings of the "
+        "store. An event is a run of steps of an episode; it counts as found within .4 s. "
+        "Ranges are 95 % (Wilson). Uncertain: the share of all steps that are uncertain by "
+        "the condition's probability.",
         tables=tables,
     )
 

@@ -7,15 +7,15 @@ from restock.report.look.blocks import Rows, Section, Table, estimate
 from restock.report.run.facts import Facts
 
 _NAMES = {
-    "logged": "what was logged",
+    "logged": "the logs' drivers",
     "fqe": "fitted Q evaluation (FQE)",
     "pdwis": "per-decision weighted importance sampling (PDWIS)",
     "wdr": "weighted doubly robust (WDR)",
 }
 BEST_FIRST = ("wdr", "pdwis")  # estimators with an interval
 NOTHING_DROVE = (
-    "This run learnt from the logs alone: nothing drove, in a twin or on a robot, so there is no"
-    " success to show."
+    "This run learned from the logs alone: it was not driven, in a twin or on a robot, so there "
+    "is no success to show."
 )
 
 
@@ -23,17 +23,17 @@ def headline(facts: Facts) -> str:
     """The most that can honestly be said."""
     rows = {(row["measure"], row["estimator"]): row for row in facts.off_policy}
     if not rows and not holds_out(facts):
-        return "Trained on the logs alone, which are too short to judge it by"
+        return "Trained on the logs alone, which are too short to evaluate it"
     if not rows:
-        return "Trained on the logs alone, not yet judged"
+        return "Trained on the logs alone, not yet evaluated"
     measure = "success" if any(name == "success" for name, _ in rows) else "return"
     logged = rows.get((measure, "logged"))
     judged = next((rows[measure, e] for e in BEST_FIRST if known(rows.get((measure, e)))), None)
     if logged is None or judged is None:
-        return "Trained on the logs alone: they are too few to say what it is worth"
+        return "Trained on the logs alone: there are too few to evaluate it"
     return (
-        f"By held-out logs alone: {measure} {estimate(judged)}, as they were driven"
-        f" {estimate(logged)}"
+        f"By held-out logs alone: {measure} {estimate(judged)}, the logs' drivers "
+        f"{estimate(logged)}"
     )
 
 
@@ -53,22 +53,23 @@ def judged_section(facts: Facts) -> Section:
     if not facts.off_policy and not holds_out(facts):
         return Section(
             "judged",
-            "What is it worth?",
-            intro=f"{NOTHING_DROVE} And the logs are too short to hold any of them out: it learnt"
-            " from all, so they cannot judge it. More recordings can.",
+            "How good is it?",
+            intro=f"{NOTHING_DROVE} The logs are too short to hold any of them out: it learned "
+            "from all of them, so they cannot evaluate it. More recordings can.",
         )
     if not facts.off_policy:
         return Section(
             "judged",
-            "What is it worth?",
-            intro=f"{NOTHING_DROVE} `restock eval --on-logs own {facts.run}` says what it is worth"
-            " on episodes that it did not learn from.",
+            "How good is it?",
+            intro=f"{NOTHING_DROVE} `restock eval --on-logs own {facts.run}` evaluates it on "
+            "episodes that it did not learn from.",
         )
     return Section(
         "judged",
-        "What is it worth?",
-        intro=f"{NOTHING_DROVE} These are estimates for episodes of the logs that it did not learn"
-        " from, beside what their own drivers achieved there. Choose nothing by them alone.",
+        "How good is it?",
+        intro=f"{NOTHING_DROVE} These are estimates for episodes of the logs that it did not "
+        "learn from, beside what the logs' drivers achieved there. Do not choose a policy by "
+        "them alone.",
         tables=[table(facts.off_policy)],
     )
 
@@ -88,9 +89,9 @@ def table(rows: Rows) -> Table:
         shown,
         {"episodes"},
         title="Off-policy evaluation on held-out logs, before it drove",
-        caption="Over all conditions; an estimate is refused where the weights leave too few"
-        " episodes to say. What was logged is what the logs' drivers achieved. Fitted Q"
-        " evaluation rests on a model of the values alone, and has no interval.",
+        caption="Over all conditions. An estimate is refused if the weights leave too few "
+        "episodes. Fitted Q evaluation rests only on a model of the values, and has no "
+        "interval.",
     )
 
 

@@ -30,8 +30,8 @@ def practice_section(facts: Facts) -> Section | None:
     return Section(
         "practice",
         "What did it practise?",
-        intro=f"Missions that the twin gave, by the rule “{rule}”. Shares are of missions that"
-        " ended, while the agent explored; its success there is below that of evaluations.",
+        intro=f"Missions in the twin, by the rule “{rule}”. Shares are of missions that ended "
+        "while the agent explored; its success is lower there than in evaluations.",
         figures=[] if rule in FIXED else [Figure(_shares(facts.practice), "Wanted shares")],
         tables=[Table(shown, set(shown[0]) - {"missions"})],
     )

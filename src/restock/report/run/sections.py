@@ -53,7 +53,7 @@ def success(facts: Facts) -> Section | None:
             "bumps a km": _told(row, "bumps_per_km", ".1f"),
             "least distance to people": _told(row, "closest_person_least_m", ".2f", " m"),
             "time to goal": _told(row, "time_s", ".1f", " s"),
-            "lost to the planner": ""
+            "time lost to the planner": ""
             if row["policy"] == "planner"
             else _told(row, "time_lost_s", "+.1f", " s"),
         }
@@ -69,9 +69,9 @@ def success(facts: Facts) -> Section | None:
         "Does it reach the goal?",
         intro=NO_GOAL
         if facts.no_goal
-        else "Success per kind of episode, on the same seeded episodes for every policy, clean and"
-        f" under each perturbation. Lines are 95 % Wilson intervals. {facts.evaluation}"
-        + "".join(f" {one.text}." for one in facts.clones),
+        else "Success per kind of episode, on the same seeded episodes for every policy, without "
+        "a perturbation (clean) and under each one. Lines are 95 % Wilson intervals. "
+        f"{facts.evaluation}" + "".join(f" {one.text}." for one in facts.clones),
         callout="" if facts.no_goal else "; ".join(losses(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=tables,
@@ -94,8 +94,9 @@ def _success_table(perturbation: str, rows: Rows) -> Table:
             {"policy", "kind of episode"},
             title="Success, return and safety side by side"
             + ("" if clean else f": {perturbation}"),
-            caption="Intervals are 95 % over episodes. People are people and forklifts, by the true"
-            " distance from the body's edge; time is lost on the missions in which both arrived."
+            caption="Intervals are 95 % over episodes. People include forklifts; the distance is "
+            "the true one from the edge of the body. Time lost is over the missions in which "
+            "both arrived."
             if clean
             else "",
         ),
@@ -138,20 +139,21 @@ def sampled(facts: Facts) -> Section:
             Figure(
                 charts.ages(_age_rows(facts)),
                 "How old the sampled rows were",
-                f"Logs age by the calendar (before training began{_newest(facts)}); fresh"
-                " rows by environment steps since they were collected. The two are never pooled.",
+                f"The age of logs is in days (before training began{_newest(facts)}), that of "
+                "fresh rows in environment steps since they were collected. The two are never "
+                "pooled.",
             )
         )
     if facts.policies:
         policies = [{**row, "who": row["behaviour_policy"]} for row in facts.policies]
         stacked = charts.stacked(policies, group="source", part="who", value="share")
-        figures.append(Figure(stacked, "Whose experience it was"))
+        figures.append(Figure(stacked, "Behaviour policies of the sampled rows"))
     return Section(
         "fed",
         "What was the critic fed?",
-        intro="The replay mix is the training distribution. Natural is what the logs"
-        " hold, wanted what the mixture asks for, drawn what the batches held, and after weights"
-        " what the gradient saw.",
+        intro="The replay mix is the training distribution. Natural: the share in the logs. "
+        "Wanted: the share that the mixture asks for. Drawn: the share in the batches. After "
+        "weights: the share in the gradient.",
         callout=evaluation_bias(facts),
         figures=figures,
         two=True,
@@ -213,8 +215,7 @@ def learning(facts: Facts) -> Section:
                     marker=float(facts.kept["env_steps"]) if facts.kept else None,
                 ),
                 "Greedy success on fixed episodes",
-                "The checkpoint that is kept is the best of these evaluations, never simply the"
-                " last.",
+                "The kept checkpoint is the best of these evaluations, not the last.",
             )
         )
     figures.append(
@@ -228,7 +229,7 @@ def learning(facts: Facts) -> Section:
                 colours={"offline": "#334155", "warmup": "#94a3b8", "online": "#14b8a6"},
             ),
             "Loss",
-            "A low loss alone says little: a frozen target has the lowest loss of all.",
+            "A low loss alone says little: with a frozen target it is lowest.",
         )
     )
     tables = [off_policy_table(facts.off_policy)] if facts.off_policy and facts.twin else []
@@ -248,8 +249,8 @@ def critic(facts: Facts) -> Section | None:
                     y_title="mean |TD error| on a fixed probe",
                 ),
                 "TD error by condition",
-                "On the same rows at every point. A condition that stays high while the others"
-                " fall is one that the buffer does not teach.",
+                "On the same rows at every point. If a condition stays high while the others "
+                "fall, the buffer does not teach it.",
             )
         )
     lag = [
@@ -268,9 +269,9 @@ def critic(facts: Facts) -> Section | None:
                     y_title="mean |Q − Q target| / mean |Q|",
                     colours={"relative value lag": "#0f766e"},
                 ),
-                "How far the target is behind",
-                f"Target rule: {facts.target_rule}. Near zero the target keeps up; above about a"
-                " quarter it holds learning back.",
+                "Lag of the target network",
+                f"Target rule: {facts.target_rule}. Near zero, the target keeps up; above about a "
+                "quarter, it slows down learning.",
             )
         )
     return (
@@ -303,11 +304,11 @@ def floor_section(facts: Facts) -> Section | None:
                 floor_map.visited(plan, facts.visited, CELL_M),
                 "Where the logs have been",
                 f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
-                f" (logarithmic); the bar is {floor_map.BAR_M} m. Drawn on the floor that the run"
-                f" drives on, {layout.name}."
+                f" (logarithmic); the bar is {floor_map.BAR_M} m. Drawn on the run's floor, "
+                f"{layout.name}."
                 + (
-                    f" Its missions start at {len(layout.starts_m)} places that the robot was at"
-                    f" in the logs, and go to {len(layout.goals)}."
+                    f" Its missions start at {len(layout.starts_m)} places where the robot was in "
+                    f"the logs, and go to {len(layout.goals)}."
                     if layout.starts_m
                     else ""
                 ),
@@ -363,9 +364,9 @@ def provenance(facts: Facts) -> Section:
     tables.append(Table(software, title="Software"))
     return Section(
         "provenance",
-        "Where does all of this come from?",
+        "Where does the data come from?",
         intro=" ".join(facts.missing),
         tables=tables,
         details=pretty(facts.config),
-        details_title="The whole configuration of the run",
+        details_title="The full configuration of the run",
     )

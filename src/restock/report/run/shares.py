@@ -81,7 +81,9 @@ def remarks(facts: Facts) -> list[str]:
     ]
     texts = []
     if lost:
-        texts.append(f"Weights leave less than the plain logs would: {'; '.join(lost)}.")
+        texts.append(
+            f"The share after weights is smaller than in the plain logs for {'; '.join(lost)}."
+        )
     if short:
         texts.append(f"Too few rows for the wanted shares; missing: {', '.join(short)}.")
     return texts
@@ -117,8 +119,8 @@ def table(facts: Facts) -> Table:
     return Table(
         rows,
         numbers,
-        caption="Shares are of the source. Replays per row: rows drawn over rows available"
-        " at the end, so for a ring that turned over it is an upper bound.",
+        caption="Shares are of the source. Replays per row: rows drawn divided by rows available "
+        "at the end; for a ring that was overwritten, this is an upper bound.",
     )
 
 

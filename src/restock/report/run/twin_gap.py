@@ -48,7 +48,7 @@ _MEANING = {
     TRUSTED: "shown to be within the limits",
     UNTRUSTED: "shown to be beyond a limit",
     UNDECIDED: "the interval holds a limit: more logs would decide",
-    UNKNOWN: "too few segments or episodes to say",
+    UNKNOWN: "too few segments or episodes",
 }
 
 
@@ -80,8 +80,8 @@ def run_section(facts: Facts) -> Section | None:
     if facts.panel is None or version == facts.panel.header.store_version:
         return section
     note = (
-        f" It was measured at version {version} of the store; the run's panel is of version"
-        f" {facts.panel.header.store_version}."
+        f" It was measured at version {version} of the store; the run's panel is from version "
+        f"{facts.panel.header.store_version}."
     )
     return replace(section, intro=section.intro + note)
 
@@ -122,7 +122,7 @@ def headline(gap: TwinGap) -> str:
     if names:
         return f"Do not trust the twin in: {names}"
     if all(item.verdict == UNKNOWN for item in gap.verdicts):
-        return "Too little could be driven again to assess the twin in any condition"
+        return "Too few logs could be driven again to assess the twin in any condition"
     if all(item.verdict == TRUSTED for item in gap.verdicts):
         return "The twin is within its limits in every logged condition"
     return "No condition is shown to be beyond the limits; not all are shown to be within"
@@ -161,20 +161,20 @@ def gap_section(gap: TwinGap) -> Section:
     return Section(
         "twin-gap",
         "Can the twin be trusted?",
-        intro="Logged commands, driven again in the twin open loop, without feedback from the log."
-        " Odometry is the logged wheels, dead-reckoned: a twin should beat it. The floor is the"
-        " least that could be measured: what a perfect twin would show through localisation noise."
-        " A condition is trusted where nine in"
-        f" ten segments of {limits['horizon_s']:g} s end within {limits['position_m']:g} m of"
-        f" the log, and the one-step reward is off by less than {limits['reward_ratio']:g} times"
-        " its standard deviation in the log (its spread), both with 95 % confidence over episodes.",
+        intro="Logged commands, driven again in the twin in open loop, without feedback from the "
+        "log. Odometry: dead reckoning from the logged wheels; a twin should be better. The "
+        "floor is the least error that can be measured: that of a perfect twin with the same "
+        "localisation noise. A condition is trusted if nine in ten segments of "
+        f"{limits['horizon_s']:g} s end within {limits['position_m']:g} m of the log, and the "
+        f"error of the one-step reward is less than {limits['reward_ratio']:g} times its "
+        "standard deviation in the log (its spread), both with 95 % confidence over episodes.",
         callout=headline(gap) + "." if gap.untrusted else "",
         figures=[
             Figure(
                 _positions(shown),
-                "How far from the log it ends",
-                "Dots are medians with 95 % intervals over episodes, ticks the 90th percentile. A"
-                " segment counts for every condition it meets.",
+                "Distance from the log at the end",
+                "Dots are medians with 95 % intervals over episodes; ticks are 90th percentiles. "
+                "A segment counts for all conditions in it.",
             )
         ]
         if shown
@@ -237,9 +237,9 @@ def _steps_section(gap: TwinGap) -> Section:
     return Section(
         "one-step",
         "One step from each logged state",
-        intro="The twin is put into the logged state, drives the logged action for one control"
-        " period, and the task's own functions make observation and reward of it. Mean absolute"
-        " differences; persistence is the error of predicting that nothing changes.",
+        intro="The twin starts from the logged state and drives the logged action for one control "
+        "period; the task's own functions compute observation and reward. Mean absolute "
+        "differences; persistence is the error of predicting that nothing changes.",
         tables=[
             Table(
                 rewards,
@@ -251,8 +251,8 @@ def _steps_section(gap: TwinGap) -> Section:
                 _observations(gap),
                 numbers={*map(source_name, twins), "persistence"},
                 title="Observation, by component, in nominal driving",
-                caption="As the policy sees them, scaled to about -1 to 1. A lidar's sectors are"
-                " taken together; observations.parquet has each component and condition.",
+                caption="As the policy sees them, scaled to about -1 to 1. The sectors of a lidar "
+                "are shown together; observations.parquet has each component and condition.",
             ),
         ],
     )
@@ -281,9 +281,9 @@ def _signals_section(gap: TwinGap) -> Section | None:
     return Section(
         "signals",
         "Pose and signals, by horizon",
-        intro="Medians over segments: of a pose its distance from the log at the horizon's end, of"
-        " a signal the root mean square of its difference on the way. Empty where a source has no"
-        " such signal.",
+        intro="Medians over segments: for a pose, its distance from the log at the end of the "
+        "horizon; for a signal, the root mean square of its difference over the segment. "
+        "Empty if a source has no such signal.",
         tables=[
             Table(
                 rows,

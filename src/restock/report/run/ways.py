@@ -33,7 +33,7 @@ def ways_section(facts: Facts) -> Section | None:
             "ways": row["episodes"],
             "bumps an episode": f"{row['bumps_per_episode']:.2f}",
             "time to goal": "" if row["time_s"] is None else f"{row['time_s']:.1f} s",
-            "lost to the planner": ""
+            "time lost to the planner": ""
             if row["time_lost_s"] is None or row["policy"] == "planner"
             else f"{row['time_lost_s']:+.1f} s",
         }
@@ -41,15 +41,16 @@ def ways_section(facts: Facts) -> Section | None:
     ]
     return Section(
         "ways",
-        "And on the ways that robots really drove?",
-        intro="Start and goal of logged episodes, each way once, on the floor of the logs"
+        "And on routes that robots really drove?",
+        intro="Start and goal of logged episodes, each route once, on the floor of the logs"
         f" (`restock eval --missions logged`). {facts.evaluation_on_ways}",
         tables=[
             Table(
                 shown,
                 set(shown[0]) - {"kind of episode", "policy"},
-                title="Success on logged ways",
-                caption="Intervals are 95 % Wilson intervals over ways; few ways tell little.",
+                title="Success on logged routes",
+                caption="Intervals are 95 % Wilson intervals over routes; with few routes they "
+                "are wide.",
             )
         ],
     )

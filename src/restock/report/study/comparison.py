@@ -13,8 +13,8 @@ from restock.stats import interval_text
 MOST_NAMED = 3
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
 _INTERVALS = (
-    "Intervals are 95 %, over seeds and episodes; where there are fewer than three seeds or ten"
-    " episodes there are values alone."
+    "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
+    "only values are shown."
 )
 
 
@@ -69,7 +69,7 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
         return f"{second} is {', '.join(parts)} than {first}{more}"
     if not known:
         why = next((row["no_interval"] for row in rows if row["no_interval"]), "too little data")
-        return f"{second} against {first}: nothing can be told apart ({why})"
+        return f"{second} against {first}: no difference can be measured ({why})"
     widest = max(known, key=lambda row: row["difference_high"] - row["difference_low"])
     return (
         f"No difference between {second} and {first} is shown in any condition; the widest"
@@ -110,7 +110,7 @@ def outcome_sections(
         return [Section(f"{prefix}outcomes", title, callout=text)]
     rows = found["outcomes"]
     if not rows:
-        return [Section(f"{prefix}outcomes", title, callout="No condition was driven in both.")]
+        return [Section(f"{prefix}outcomes", title, callout="No condition was driven by both.")]
     reasons = list(dict.fromkeys(row["no_interval"] for row in rows if row["no_interval"]))
     table = [
         {
@@ -135,9 +135,9 @@ def outcome_sections(
     figures = [
         Figure(
             charts.improvements(rows),
-            f"How probably {second} is better",
-            "The probability that its return on an episode is higher, ties counting half, over all"
-            " pairs of runs; one half says nothing.",
+            f"Probability that {second} is better",
+            "The probability that its return on an episode is higher, ties counting half, over "
+            "all pairs of runs; 0.5 means no difference.",
             name="probability of improvement",
         )
     ]
@@ -176,7 +176,7 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
     bands = (
         f"Bands are 95 % over up to {most} seeds (Student's t)."
         if any(row["low"] is not None for row in rows)
-        else "One seed each: there is no band, and another seed would have given another curve."
+        else "One seed each, so there is no band; another seed would give another curve."
     )
     return Section(
         "curves",
@@ -213,9 +213,9 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
     ]
     return Section(
         "gate",
-        "What the gate looked at",
-        intro=f"Compared: the {found['treatment']}. Everything else must be the same: settings, and"
-        " what the critics were fed, by equivalence tests. What failed stands first.",
+        "The checks of the gate",
+        intro=f"Compared: the {found['treatment']}. Everything else must be the same: settings, "
+        "and what the critics were fed, by equivalence tests. Failed checks come first.",
         tables=[
             Table(differences, title="What differs"),
             Table(checks, {"value", "95 %", "limit"}, title="What was fed", folded=True),

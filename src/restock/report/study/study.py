@@ -80,7 +80,9 @@ def _measure(name: str) -> str:
     """`auc_rare` for people."""
     kind, _, what = name.partition("_")
     where = "the rare conditions" if what == "rare" else words(what)
-    return f"{where}, " + ("mean success on the way" if kind == "auc" else "success at the end")
+    return f"{where}, " + (
+        "mean success during training" if kind == "auc" else "success at the end"
+    )
 
 
 def _gate(comparisons: Rows) -> Section:
@@ -96,9 +98,9 @@ def _gate(comparisons: Rows) -> Section:
     ]
     return Section(
         "gate",
-        "May they be compared?",
-        intro="A comparison is refused where the critics were fed differently in what is not the"
-        " treatment, or where too little was seen to say.",
+        "Can they be compared?",
+        intro="A comparison is refused if the critics were fed differently in something other "
+        "than the treatment, or if there is too little data to decide.",
         tables=[Table(rows)],
     )
 
@@ -163,8 +165,9 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
     return Section(
         "arms",
         "Success and safety at the end",
-        intro="Of the kept policies on the unperturbed episodes, means with 95 % over seeds; safety"
-        " in the rare missions. Time is lost against the planner, where both arrived.",
+        intro="The kept policies on the unperturbed episodes, means with 95 % intervals over "
+        "seeds; safety in the rare missions. Time lost is against the planner, where both "
+        "arrived.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         two=True,
         tables=[Table(rows, set(rows[0]) - {"arm"})],
