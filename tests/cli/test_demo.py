@@ -108,7 +108,7 @@ def test_an_earlier_demo_is_replaced_and_nothing_else(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("precious")
-    with pytest.raises(RestockError, match="not from a demo"):
+    with pytest.raises(RestockError, match="not made by a demo"):
         prepare(mine)
     assert (mine / "thesis.tex").read_text() == "precious"
 
@@ -129,7 +129,7 @@ def test_what_the_user_gave_is_neither_removed_nor_mistyped_at_the_earlier_demos
         ["--profile", str(profile)],
     ):
         assert cli.main(["demo", "--out", str(out), *given]) == 2
-        assert "lies inside --out" in capsys.readouterr().err
+        assert "is inside --out" in capsys.readouterr().err
     for given in (["--logs", str(tmp_path / "lgos")], ["--profile", "turtelbot3"]):
         assert cli.main(["demo", "--out", str(out), *given]) == 2
     assert (out / "mine.mcap").read_text() == "precious"

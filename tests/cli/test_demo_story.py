@@ -32,7 +32,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def test_a_shelf_is_told_by_its_share_before_and_after(told: Settings) -> None:
+def test_a_stratum_is_shown_by_its_share_before_and_after(told: Settings) -> None:
     head, *lines, legend = story.shelves(told.panel)
     strata = {stratum.name: stratum for stratum in Panel.open(told.panel).strata}
     assert [line.split()[0] for line in lines] == list(strata)
@@ -49,7 +49,7 @@ def test_a_shelf_is_told_by_its_share_before_and_after(told: Settings) -> None:
 def test_a_rare_event_is_followed_from_its_message_to_an_update(told: Settings) -> None:
     lines = story.rare_event(told)
     links = [line.split()[0] for line in lines if not line.startswith(" ")]
-    assert links == ["recording", *["message"] * 2, "row", "shelf", "update", "All"]
+    assert links == ["recording", *["message"] * 2, "row", "stratum", "update", "All"]
     assert str(LOGS) in lines[0]
     assert any("/scan" in line and "m away" in line for line in lines)
     assert "nominal" not in "".join(lines)

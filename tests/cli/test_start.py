@@ -119,7 +119,7 @@ def test_interrupted_training_goes_on_from_its_checkpoint(tmp_path: Path, bag: P
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(RestockError, match="not from `restock start`"):
+    with pytest.raises(RestockError, match="not made by `restock start`"):
         way(tmp_path, Verbs(), bag)
 
 
@@ -208,7 +208,7 @@ def test_commands_in_one_recording_and_poses_in_another_are_told_so(
     assert code == 3
     why = "bags/commands has a command (/cmd_vel) and no pose: one recording must hold both"
     assert why in document["stopped"]["why"]
-    assert "name recordings that hold it" in document["stopped"]["remedies"][0]
+    assert "give recordings that contain it" in document["stopped"]["remedies"][0]
 
 
 def test_an_edited_profile_is_taken_and_never_replaced(
@@ -260,8 +260,10 @@ def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
         for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None), ("wdr", None))
     ]
     told, refused = outcomes.on_logs({"results": rows, "notes": []})
-    assert told.startswith("return of 1 held-out episode: as it was driven -1.05 (no interval), ")
-    assert refused.startswith(f"refused: {few}. So nothing says whether the policy is better")
+    assert told.startswith(
+        "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
+    )
+    assert refused.startswith(f"refused: {few}. So it is not known whether the policy is better")
 
 
 def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> None:
@@ -271,7 +273,7 @@ def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> Non
     profile.write_text(f"{WAREHOUSE}\n{robot}")
     told = robot_line(profile)
     assert "track 0.4 m (from urdf)" in told
-    assert "wheel radius, mass guessed by its outline" in told
+    assert "wheel radius, mass guessed from its outline" in told
 
 
 def test_several_topics_of_commands_are_for_a_person_to_choose_from(

@@ -127,7 +127,7 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(
     # Once the profile is a person's, a proposal's flags are said to change nothing.
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
     assert cli.main(["start", *argv, *up_to_the_panel(tmp_path)]) == 3
-    assert "--urdf and --footprint are for a proposal" in capsys.readouterr().out
+    assert "--urdf and --footprint apply only to a proposed profile" in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
@@ -237,8 +237,8 @@ def test_a_damaged_ros1_bag_is_not_asked_for_as_if_nothing_was_named(
     assert "add --salvage to this command" in said
     assert cli.main([*argv, "--salvage"]) == 3
     said = " ".join(capsys.readouterr().out.split())
-    assert "nothing of it can be salvaged" in said
-    assert "what can be done for each is said above" in said
+    assert "nothing in it can be salvaged" in said
+    assert "see the message for each above" in said
 
 
 def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> None:
@@ -258,7 +258,7 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
         ("--typestore", "humbel", "no type store named 'humbel'"),
         ("--footprint", "wide", "--footprint"),
         ("--minutes", "nan", "--minutes"),
-        ("--out", "a_file", "name a folder with --out"),
+        ("--out", "a_file", "give a folder with --out"),
     ],
 )
 def test_what_is_wrong_with_an_option_is_said_before_the_first_stage(

@@ -24,15 +24,15 @@ VERBS = {
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "label": "label a store again after its conditions changed, without the recordings",
-    "compact": "few large files in place of a store's many small ones",
-    "sql": "any question to a store (or a run), in SQL",
-    "coverage": "what does a store hold of each condition, and what is missing? on one page",
-    "audit": "is the coverage good enough? exit 1 if not",
+    "compact": "join a store's many small files into a few large ones",
+    "sql": "query a store (or a run) in SQL",
+    "coverage": "how much of each condition a store holds, and what is missing, on one page",
+    "audit": "check that the coverage is good enough: exit 1 if not",
     "drift": "which robot's wheels, lidar or floor have changed?",
     "diff": "what is different between two stores, versions, panels or runs?",
     "gaps": "what is missing, and which missions would fill it?",
     "mix": "a pinned replay panel with quotas per stratum",
-    "export": "transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
+    "export": "write transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "twin": "describe floors (layout), fit the twin to logs (fit), measure its gap to them (gap)",
     "train": "offline warm-up on the panel, then online in the twin",
     "eval": "success per condition, clean and perturbed",
@@ -40,13 +40,13 @@ VERBS = {
     "compare": "compare methods; refused if their critics were fed differently",
     "trace": "trace a sampled row to its source, down to the messages",
     "diagnose": "buffer failure or target failure?",
-    "report": "one HTML page with all of it",
-    "check": "a gate for pipelines: audits, what changed, is the last run worse? exit 1 if so",
-    "node": "an exported policy on a robot: a ROS 2 node, in shadow or driving",
+    "report": "one HTML page with the results of a run",
+    "check": "a gate for pipelines: audits, changes, regressions; exit 1 if one fails",
+    "node": "run an exported policy on a robot, as a ROS 2 node, in shadow mode or driving",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
     "demo": "all of the above, on sample_logs/",
-    "schema": "what a TOML file may say, as a JSON Schema for editors",
-    "doctor": "what is installed here, what works, and is a store well?",
+    "schema": "what a TOML file may contain, as a JSON Schema for editors",
+    "doctor": "what is installed here, what works, and whether a store can be read",
     "completion": "a script that completes verbs and options in bash or zsh",
 }
 # folder -> the verbs whose modules it holds
@@ -75,7 +75,7 @@ with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 
 {verbs}
 
-`restock VERB --help` explains one. Exit codes: 0 done, 1 an audit failed or a comparison was
+`restock VERB --help` explains a verb. Exit codes: 0 done, 1 an audit failed or a comparison was
 refused, 2 any other failure: wrong usage, bad input, a file that cannot be read or written,
 3 written but data was lost or skipped, 130 interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
 

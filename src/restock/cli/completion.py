@@ -29,11 +29,11 @@ class CompletionCommand:
         source <(restock completion bash)                  # this shell; or in ~/.bashrc
         restock completion zsh > ~/.zfunc/_restock         # a folder of your fpath
 
-    What is no verb, option or choice is completed as a file. Make it again after an update.
+    Everything else is completed as a file name. Generate the script again after an update.
     """
 
     shell: Annotated[Literal["bash", "zsh"], tyro.conf.Positional]
-    """The shell that reads it."""
+    """The shell that will run the script."""
 
     def run(self) -> None:
         """Print the script."""

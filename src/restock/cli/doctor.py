@@ -49,14 +49,14 @@ class Finding(NamedTuple):
 
 @dataclass
 class DoctorCommand:
-    """What is installed here, what works, and whether a store is well: for a bug report.
+    """Check what is installed here, what works, and whether a store can be read: for a bug report.
 
-    Exit code 2 where something that every command needs is missing or a store cannot be read; an
-    extra that is not installed is no fault.
+    The exit code is 2 if something that every command needs is missing, or if the store cannot be
+    read. A missing extra is not an error.
     """
 
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
-    """A store to look at, too: a folder or an s3:// address."""
+    """Also check this store: a folder or an s3:// address."""
     json: bool = False
     """Print {"findings": [{"part", "name", "state", "what", "remedy"}]}."""
 
@@ -117,9 +117,7 @@ def _torch() -> Finding:
     try:
         import torch
     except (ImportError, OSError) as error:
-        return Finding(
-            "works", "torch", "wrong", f"cannot be imported: {error}", "install it again"
-        )
+        return Finding("works", "torch", "wrong", f"cannot be imported: {error}", "reinstall it")
     threads = f"{torch.get_num_threads()} threads"
     if torch.cuda.is_available():
         return Finding("works", "torch", "ok", f"{torch.cuda.get_device_name()}, {threads}")
@@ -131,7 +129,9 @@ def _native() -> Finding:
     state = native.state()
     if native.IS_THERE:
         return Finding("works", "native code", "ok", state)
-    remedy = "install a C compiler, then restock again from its source; only training is slower"
+    remedy = (
+        "install a C compiler and reinstall restock from source; only training is slower without it"
+    )
     return Finding("works", "native code", "missing", state, remedy)
 
 
@@ -141,13 +141,14 @@ def _drawing() -> Finding:
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)
     except subprocess.TimeoutExpired:
-        return Finding("works", "pictures", "missing", f"not drawn within {DRAWS_S} s")
+        return Finding("works", "pictures", "missing", f"no image was rendered within {DRAWS_S} s")
     if ended.returncode == 0:
         backend = os.environ.get("MUJOCO_GL", "egl")
-        return Finding("works", "pictures", "ok", f"MuJoCo draws off screen ({backend})")
+        return Finding("works", "pictures", "ok", f"MuJoCo renders off screen ({backend})")
     why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
     remedy = (
-        "install libegl1 (or MUJOCO_GL=osmesa with libosmesa6); only the twin's cameras need it"
+        "install libegl1 (or set MUJOCO_GL=osmesa and install libosmesa6); only the twin's "
+        "cameras need it"
     )
     return Finding("works", "pictures", "missing", why, remedy)
 

@@ -15,7 +15,7 @@ from restock.errors import RestockError, StoreError
 from restock.files import first_line
 
 TRACEBACK = "RESTOCK_TRACEBACK"
-_CHECK = "a file that it reads is damaged, or is not what the command line says it is"
+_CHECK = "a file is damaged, or is of another kind than the command expects"
 # package of an exception -> what to do
 _REMEDIES = {
     "duckdb": _CHECK,
@@ -40,14 +40,16 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     kind = type(error)
     if isinstance(error, MemoryError):
         return RestockError(
-            "there is not enough memory", where=where, remedy="free some, or ask for less at once"
+            "there is not enough memory",
+            where=where,
+            remedy="free some memory, or use fewer workers or less data at once",
         )
     if isinstance(error, OSError) and error.strerror:
         files = [str(name) for name in (error.filename, error.filename2) if name is not None]
         return RestockError(
             f"cannot be read or written: {error.strerror}",
             where=" -> ".join(files) or where,
-            remedy="is the path right, does this user have the permission, and is there room?",
+            remedy="check the path, the permissions and the free space",
         )
     package = kind.__module__.split(".")[0]
     remedy = _REMEDIES.get(package)

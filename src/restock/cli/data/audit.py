@@ -21,39 +21,42 @@ class AuditCommand:
     """Is the coverage of a store good enough to learn from? Exits 1 when an audit fails.
 
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning
-    warns, an info informs. Those that look at a panel or a run are skipped unless one is given.
+    warns, an info informs. Audits of a panel or a run are skipped unless one is given.
     The thresholds are in replay/store/audits.toml; docs/audit.md lists all audits.
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
-    """The store to audit; with --reward, a run will do as well."""
+    """The store to audit. With --reward, it may also be a run."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel made from it, audited too."""
+    """Also audit this panel, which was made from the store."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run whose evaluation is audited too."""
+    """Also audit the evaluation of this run."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of your own audits (*.sql); one with a shipped one's name replaces it."""
+    """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A TOML file with thresholds in place of the shipped ones."""
+    """A TOML file with thresholds that replace the shipped ones."""
     capacity: bool = False
-    """Instead of auditing, show how coverage grows with the rows kept, and how many are enough."""
+    """Instead of auditing, show how coverage grows with the number of rows kept, and how many are
+    enough."""
     apply: Annotated[Path | None, tyro.conf.arg(metavar="CONFIG")] = None
-    """With --capacity: write the number into this training config, as replay.ring_capacity."""
+    """With --capacity: write that number into this training config, as replay.ring_capacity."""
     reward: bool = False
-    """Only ask whether the reward wants what is measured: returns by driver, condition and outcome,
-    and whether more success earns more (docs/reward.md)."""
+    """Only check whether the reward agrees with the outcomes: print returns by driver, condition
+    and outcome, and check that more success earns a higher return (docs/reward.md)."""
     discount: float | None = None
-    """With --reward: of one step, in a store; 0.99. A run's evaluations have their own."""
+    """With --reward on a store: the discount per step. Default: 0.99. For a run, the discount of
+    its evaluations is used."""
     strict: bool = False
-    """Let warnings fail, too."""
+    """Warnings fail, too."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Audit the store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """Audit an earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default:
+    the newest."""
     rows: int = 5
-    """Offending rows shown per audit, 10 at most; `restock sql` shows them all."""
+    """How many offending rows to show per audit, at most 10; `restock sql` shows all."""
     json: bool = False
     """Print one JSON document."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write JUnit XML as well, for continuous integration."""
+    """Also write JUnit XML, for continuous integration."""
 
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
@@ -79,9 +82,9 @@ class AuditCommand:
             raise ConfigError(
                 f"must be within [0, 1], got {self.discount:g}"
                 if self.reward
-                else "is of the returns that --reward looks at",
+                else "applies only to --reward",
                 where="--discount",
-                remedy="give --reward, and the discount of one step: 0.99 say",
+                remedy="give --reward, and the discount per step, for example 0.99",
             )
         if self.reward:
             _refuse_with(self, "--reward", "panel", "run_dir", "rows")
@@ -150,13 +153,13 @@ class AuditCommand:
             return int(ExitCode.OK)
         output.print_table(capacity.curve, title="what the newest rows cover")
         output.stdout().print(
-            f"{capacity.recommended:,} rows: {capacity.reason}. With less, a buffer forgets what no"
-            " sampling brings back"
+            f"{capacity.recommended:,} rows: {capacity.reason}. A smaller buffer forgets cells "
+            "that no sampling can bring back"
         )
         if not capacity.saturated:
             output.stdout().print(
-                f"the newest half keeps {capacity.half_share:.0%}: the logs still show new cells,"
-                " and more recordings will show more"
+                f"the newest half keeps {capacity.half_share:.0%}: the logs still add new cells, "
+                "and more recordings will add more"
             )
         if applied is not None:
             output.say(
@@ -169,7 +172,7 @@ class AuditCommand:
 def _refuse_with(command: AuditCommand, other: str, *names: str) -> None:
     from restock.cli.command_line import refuse
 
-    refuse(command, names, f"does not go with {other}", remedy="leave one of them out")
+    refuse(command, names, f"cannot be combined with {other}", remedy="leave out one of them")
 
 
 def _apply(path: Path, rows: int) -> dict[str, Any]:
@@ -257,7 +260,7 @@ def _print_reward(reward: RewardAudit) -> None:
         for row in reward.returns
         if row["outcome"] == "all"
     ]
-    output.print_table(shown, title="what drivers earned")
+    output.print_table(shown, title="return by driver")
     output.stdout().print()
     pairs = [
         {
@@ -302,5 +305,5 @@ def _summary(findings: list[Finding]) -> str:
     skipped = [finding.audit.place for finding in findings if finding.status == "skipped"]
     if skipped:
         flags = " and ".join(f"--{place}" for place in sorted({place or "" for place in skipped}))
-        counts.append(f"{len(skipped)} skipped ({flags} would let them run)")
+        counts.append(f"{len(skipped)} skipped ({flags} would run them)")
     return ", ".join(counts)

@@ -10,22 +10,23 @@ import tyro
 
 @dataclass
 class CompactCommand:
-    """Make few large files of a store's many small ones, so that queries open fewer of them.
+    """Join a store's many small files into a few large ones, so that queries open fewer files.
 
         restock compact store/
         restock compact s3://warehouse/store --dry-run
 
-    Ingest writes a file a recording. Here they are joined, some half a million transitions a file,
-    in the order of robots and time, and so are the manifests; recordings of an older Restock get
-    their summaries, by which coverage is answered without a scan. No row changes: recordings can be
-    ingested again, relabelled and corrected as before, also while this runs, and older versions
-    stay readable for 7 days. For so long the disk holds both; then `restock ingest` cleans up.
+    Ingest writes one file per recording. This joins the files, to about half a million transitions
+    per file, ordered by robot and time, and joins the manifests. Recordings from an older Restock
+    get the summaries that answer coverage queries without a scan. No row changes: recordings can be
+    ingested again, relabelled and corrected as before, also while this runs. Older versions stay
+    readable for 7 days. Until then the disk holds both the old and the new files; afterwards
+    `restock ingest` removes the old ones.
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store: a folder, or s3://bucket/prefix."""
     dry_run: bool = False
-    """Say what would be joined; write nothing."""
+    """Print what would be joined; write nothing."""
     json: bool = False
     """Print one JSON document: {"rows", "files_before", "files_after", …}."""
 
@@ -47,7 +48,7 @@ class CompactCommand:
         if not self.dry_run:
             output.say(f"manifests: {done.manifests_before:,} -> {done.manifests_after:,} files")
         if done.summaries:
-            output.say(f"{done.summaries:,} recordings were given the summaries that they lacked")
+            output.say(f"{done.summaries:,} recordings got the summaries that they lacked")
         if done.changed_meanwhile:
             output.say(
                 f"{done.changed_meanwhile:,} files stayed as they were: other writers changed some"

@@ -16,28 +16,28 @@ if TYPE_CHECKING:
 
 @dataclass
 class DiffCommand:
-    """What is different between two stores, two versions of a store, two panels or two runs?
+    """Show the differences between two stores, two versions of a store, two panels or two runs.
 
         restock diff monday/ tuesday/
         restock diff store@11 store                 # versions; store@2026-11-01 is as of that day
         restock diff panels/a panels/b
         restock diff runs/a runs/b
 
-    Of stores: recordings and episodes that came and went, rows whose labels changed, the shares of
-    conditions, zones and policies, and signals that shifted, with 95 % intervals over episodes. Of
-    panels: mixture, rows, shares and weights. Of runs: settings, what their critics were fed, and
-    their evaluations side by side. Two places of different tasks are refused: their rows do not
-    mean the same. It only reads.
+    Stores: recordings and episodes that were added or removed, rows whose labels changed, the
+    shares of conditions, zones and policies, and signals that shifted, with 95 % intervals over
+    episodes. Panels: mixture, rows, shares and weights. Runs: settings, what their critics were
+    fed, and their evaluations side by side. Sources of different tasks are refused, as their rows
+    have different meanings. The command only reads.
     """
 
     first: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
-    """A store (or store@VERSION), a panel or a run: what was."""
+    """The first (earlier) store, store@VERSION, panel or run."""
     second: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
-    """Another of the same kind: what is now."""
+    """The second (later) one, of the same kind."""
     exit_code: bool = False
-    """Exit 1 where they differ."""
+    """Exit 1 if they differ."""
     json: bool = False
-    """Print one JSON document, whole."""
+    """Print one JSON document with everything."""
 
     def run(self) -> int:
         """Compare, print, and say with the exit code whether they differ, where that was asked."""
@@ -57,8 +57,8 @@ def _difference(first: str, second: str) -> dict[str, Any]:
     if len(set(kinds.values())) > 1:
         raise RestockError(
             f"{first} is a {kinds[first]}, {second} a {kinds[second]}",
-            remedy="name two stores, two panels or two runs; a run's or a panel's own store is in"
-            " its config.json or panel.json",
+            remedy="give two stores, two panels or two runs; the store of a run or panel is in "
+            "its config.json or panel.json",
         )
     kind = kinds[first]
     if kind == "panel":

@@ -35,8 +35,8 @@ def _print_stores(document: dict[str, Any]) -> None:
     _section("recordings", [_recording(row) for row in document["recordings"]])
     episodes = document["episodes"]
     output.stdout().print(
-        f"episodes: {episodes['in']:,} in, {episodes['out']:,} out, {episodes['changed']:,} with"
-        f" other rows, {episodes['same']:,} the same"
+        f"episodes: {episodes['in']:,} added, {episodes['out']:,} removed, "
+        f"{episodes['changed']:,} with changed rows, {episodes['same']:,} the same"
     )
     _print_labels(document["labels"])
     _section(
@@ -195,10 +195,10 @@ def _print_labels(labels: dict[str, Any]) -> None:
     if not labels["rows_compared"]:
         return
     _section("labels that changed", labels["changes"])
-    line = f"of {labels['rows_compared']:,} rows written again {labels['rows_changed']:,} changed"
+    line = f"{labels['rows_changed']:,} of {labels['rows_compared']:,} rows written again changed"
     line += " their condition"
     if labels["rows_with_other_changes"]:
-        line += f", {labels['rows_with_other_changes']:,} more one that was not their main one"
+        line += f", and {labels['rows_with_other_changes']:,} more changed another condition"
     output.stdout().print(line)
 
 

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class DriftCommand:
-    """Which robot's wheels, lidar or floor have changed?
+    """Find out which robot's wheels, lidar or floor have changed.
 
-    Compares each robot's weeks with its own first ones and with the other robots of its site, for
-    each signal (odometry scale, lidar noise, gyroscope bias, …) and for how often each condition
-    begins: a two-sample test over recordings or episodes, its size of effect, and p corrected over
-    all of them. What all robots of a site share is called the site's. Robots and sites are the
-    tags of recordings (`restock ingest --tag robot=amr-1`). See docs/drift.md.
+    Compares each robot's weeks with its own first weeks and with the other robots of its site. Each
+    signal (odometry scale, lidar noise, gyroscope bias, …) and the rate at which each condition
+    begins gets a two-sample test over recordings or episodes, with an effect size and a p-value
+    corrected over all tests. A change that all robots of a site share is reported for the site.
+    Robots and sites are tags of recordings (`restock ingest --tag robot=amr-1`). See docs/drift.md.
 
         restock drift store/
         restock drift store/ --out drift.html
@@ -35,15 +35,17 @@ class DriftCommand:
     every: str = "week"
     """The length of a period: day, week, month, year or decade."""
     reference: int = 2
-    """How many of a robot's first periods its later ones are compared with."""
+    """How many first periods of a robot are the reference for its later ones."""
     least_episodes: int = 5
-    """With fewer episodes on a side there is no verdict."""
+    """The least number of episodes on each side; with fewer there is no verdict."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a page (HTML) that opens without a network. Replaces what is there."""
+    """Write an HTML page that opens without a network. Replaces an existing file."""
     exit_code: bool = False
-    """Exit 1 where a robot, a site or a condition has changed; how it was driven does not count."""
+    """Exit 1 if a robot, a site or a condition has changed. Changes in how a robot was driven do
+    not count."""
     json: bool = False
     """Print one JSON document: {"findings", "notes", "tests", …}."""
 
@@ -95,4 +97,4 @@ def _show(drift: Drift) -> None:
     for row in drift.findings:
         out.print(visible(row["finding"]), markup=False, soft_wrap=True)
     if not drift.findings:
-        out.print("nothing has changed by what matters, as far as these logs can tell")
+        out.print("no change that matters was found in these logs")

@@ -11,34 +11,36 @@ import tyro
 
 @dataclass
 class ExportCommand:
-    """Transitions as another library's data set, or a run's policy as an ONNX file.
+    """Write transitions as another library's data set, or a run's policy as an ONNX file.
 
-    Reassembles a panel, or the rows of a query to a store, into episodes: in order, with how each
-    ended and the observation after its last step. Where a query leaves rows out, an episode becomes
-    several, cut where rows are missing. The data set has its provenance: store version, query or
-    panel, task, counts. See docs/libraries.md. The policy is the one that a run kept as its best,
-    with the task in the file's metadata. See docs/deploy.md.
+    The rows of a panel, or of a query to a store, are put together into episodes: in order, with
+    how each ended and the observation after its last step. If a query leaves out rows, an episode
+    is cut where rows are missing and becomes several. The data set records its provenance: store
+    version, query or panel, task, counts. See docs/libraries.md. The policy of a run is the best
+    one that it kept; the task is in the file's metadata. See docs/deploy.md.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A store or a panel; for onnx a run."""
+    """A store or a panel; for onnx, a run."""
     to: Literal["minari", "d3rlpy", "lerobot", "parquet", "npz", "onnx"]
-    """The format: minari and lerobot are directories, d3rlpy (.h5), the others files."""
+    """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
     query: Annotated[str | None, tyro.conf.arg(metavar="SQL")] = None
-    """A query for whole transitions of a store (default: all)."""
+    """An SQL query that selects transitions of a store, with all columns. Default: all
+    transitions."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
     """A panel whose tables the query may use, as panel.rows and panel.strata."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Of a store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     action: Literal["discrete", "continuous"] = "discrete"
     """The index of the task's action, or the logged command (m/s, rad/s)."""
     license: Annotated[str | None, tyro.conf.arg(metavar="ID")] = None
-    """The licence that the card of a minari or lerobot data set names: cc-by-4.0, apache-2.0, …"""
+    """The licence for the card of a minari or lerobot data set: cc-by-4.0, apache-2.0, …"""
     cameras: Annotated[str, tyro.conf.arg(metavar="NAMES")] = "all"
-    """Of a store to lerobot: the cameras whose frames go with the steps, with commas between, all
-    or none. A step without a frame of each is left out and counted."""
+    """From a store to lerobot: the cameras whose frames are exported, comma-separated, or all, or
+    none. A step that lacks a frame of one of them is left out and counted."""
     json: bool = False
     """Print what was written as one JSON document."""
 
@@ -50,7 +52,12 @@ class ExportCommand:
 
         if self.to == "onnx":
             of_rows = ("query", "panel", "version", "action", "license", "cameras")
-            refuse(self, of_rows, "is of a data set", remedy="leave it out: a policy has no rows")
+            refuse(
+                self,
+                of_rows,
+                "applies only to a data set",
+                remedy="leave it out: a policy has no rows",
+            )
             from restock.train.evaluation.onnx_policy import export_onnx
 
             made = export_onnx(self.source, self.out)

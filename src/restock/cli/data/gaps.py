@@ -14,39 +14,42 @@ SHOWN = 15  # lines of a table on a terminal; --json has all
 
 @dataclass
 class GapsCommand:
-    """What is missing from a store, and how many missions of which kind would fill it?
+    """Find what is missing from a store, and how many missions of which kind would fill the gaps.
 
         restock gaps store/
         restock gaps store/ --mixture my.toml --missions-out next.toml
         restock gaps store/ --min-rows 20 --by condition,zone
 
-    A gap is what a mixture, or an audit of coverage, asks for and the store has not: rows of a
-    stratum, rows or episodes of a condition, cells of condition x action; with --min-rows every
-    cell of condition x zone x action (x robot). Each comes with the rate seen so far, the missions
-    (or hours of logging) that it takes at that rate, and their 95 % interval. The plan is the least
-    number of missions that fills all of them. It can be written as a file that `restock record
-    --missions` drives, and that training's episodes follow (env.missions).
+    A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
+    rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
+    also cells of condition x zone x action (x robot). Each gap is printed with the rate seen so
+    far, and the number of missions (or hours of logging) needed at that rate, with its 95 %
+    interval. The plan is the least number of missions that fills all gaps. It can be written as a
+    file for `restock record --missions`, and for training (env.missions).
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """What should be there: a mixture's shares of its planned draws. See docs/mixture.md."""
+    """The mixture whose planned draws say how much is needed of each stratum. See
+    docs/mixture.md."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Thresholds of audits in place of the shipped ones, as `restock audit` takes them."""
+    """A TOML file with thresholds of audits that replace the shipped ones, as for `restock
+    audit`."""
     no_audits: bool = False
-    """Ask for what the mixture needs alone."""
+    """Use only the needs of the mixture, not those of the audits."""
     min_rows: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Ask for so many rows of every cell, too (default: none)."""
+    """Also ask for at least this many rows of every cell."""
     by: str = "condition,zone,action,robot"
-    """What makes a cell of --min-rows."""
+    """The columns that define a cell for --min-rows."""
     unit: Literal["missions", "hours"] | None = None
-    """Count in missions of a kind, or in hours of logging (default: missions where a simulator made
-    the recordings, hours where a fleet did)."""
+    """Count in missions or in hours of logging. Default: missions if a simulator made the
+    recordings, hours if robots did."""
     confidence: float = 0.8
-    """With which the planned missions are to close each gap."""
+    """The probability with which the planned missions close each gap."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     missions_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write the plan as a missions file, which must not exist yet."""
     force: bool = False
@@ -108,9 +111,9 @@ def _columns(text: str) -> list[str]:
     unknown = sorted(set(names) - set(CELL))
     if unknown or len(set(names)) != len(names) or not names:
         raise ConfigError(
-            f"{', '.join(unknown) or text!r} cannot make a cell",
+            f"{', '.join(unknown) or text!r} cannot define a cell",
             where="--by",
-            remedy=f"name some of {', '.join(CELL)}, each once",
+            remedy=f"name one or more of {', '.join(CELL)}, each once",
         )
     return names
 

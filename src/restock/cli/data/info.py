@@ -17,10 +17,10 @@ LONGEST = 60  # characters of an entry's value that are shown
 
 @dataclass
 class InfoCommand:
-    """What is in these recordings: format, times, compression, topics, types, counts, rates, QoS.
+    """Show what is in recordings: format, times, compression, topics, types, counts, rates, QoS.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
-    recordings, or a quoted glob. Nothing is decoded (but for --clocks) and nothing is written. A
+    recordings, or a quoted glob. Nothing is written, and messages are decoded only with --clocks. A
     recording that cannot be read is reported on stderr and makes the exit code 2; the others are
     still shown.
     """
@@ -28,15 +28,16 @@ class InfoCommand:
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Recordings, folders of recordings, or globs."""
     typestore: str | None = None
-    """Distribution whose message definitions serve recordings without their own (humble)."""
+    """ROS 2 distribution whose message definitions are used for recordings without their own.
+    Default: humble."""
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
-    for recordings that carry none."""
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
+    recordings that do not contain the definitions."""
     salvage: bool = False
-    """Read truncated files, too (exit code 3)."""
+    """Also read what is intact in damaged or truncated files (exit code 3)."""
     clocks: bool = False
-    """Read the header stamps, too, and compare the clocks: how far log time is ahead of them, how
-    often they jump, go back, repeat or are zero."""
+    """Also read the header stamps and compare the clocks: how far log time is ahead of the stamps,
+    and how often stamps jump, go back, repeat or are zero."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
 

@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class IngestCommand:
-    """Turn recordings into labelled transitions in a store, each whole or not at all.
+    """Turn recordings into labelled transitions in a store.
 
     PATH is an MCAP file, a rosbag2 folder or one of its files, a ROS 1 bag, a folder of many
-    recordings, or a quoted glob. A recording that is in the store with the same content and
-    definitions is skipped; one with changed definitions replaces its old rows. A recording
-    that cannot be used is named on stderr, leaves the store as it was, and the others go on.
+    recordings, or a quoted glob. Each recording is added as a whole or not at all. One that is
+    already in the store with the same content and definitions is skipped; if its definitions
+    changed, the new rows replace the old ones. A recording that cannot be used is reported on
+    stderr and adds nothing; the others are still ingested.
 
     Exit codes: 0 all ingested (or unchanged), 2 nothing was written, 3 written, but a recording
     failed or messages of the topics used were lost.
@@ -35,32 +36,33 @@ class IngestCommand:
     """The store's folder, or s3://bucket/prefix; created if missing. Required unless
     --dry-run."""
     profile: str = "warehouse_amr"
-    """How topics become signals: a profile that comes with Restock, or a TOML file."""
+    """How topics become signals: the name of a shipped profile, or a TOML file."""
     dry_run: bool = False
-    """Do everything but write, and print the result."""
+    """Do everything except writing, and print the result."""
     force: bool = False
-    """Ingest unchanged recordings again, too."""
+    """Also ingest unchanged recordings again."""
     salvage: bool = False
-    """Read what is intact of truncated or damaged files (exit code 3)."""
+    """Also read what is intact in damaged or truncated files (exit code 3)."""
     repeated: Literal["keep", "refuse"] = "keep"
-    """What to do with a recording whose rows are largely those of another one in the store (a
-    part of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps`
-    fails), or refuse it."""
+    """What to do with a recording whose rows are mostly those of another one in the store (a part
+    of it, a copy, a drive recorded again): keep it and say so (the audit
+    `repeated_steps` then fails), or refuse it."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
-    """Whose drive the recordings are: robot, site, firmware, map, shift, or any other name. Decides
-    over what a recording or its path says; KEY= takes a tag off. May be given several times."""
+    """A tag for the recordings: robot, site, firmware, map, shift, or any other name. It overrides
+    tags from the recording or its path; KEY= removes a tag. May be given several times."""
     typestore: str | None = None
-    """Distribution whose message definitions serve recordings without their own (humble)."""
+    """ROS 2 distribution whose message definitions are used for recordings without their own.
+    Default: humble."""
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
-    for recordings that carry none."""
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
+    recordings that do not contain the definitions."""
     workers: int = 1
-    """Processes that read recordings at the same time."""
+    """How many processes read recordings at the same time."""
     engine: Literal["processes", "ray"] = "processes"
-    """Where they run: on this machine, or recording by recording on the cluster of RAY_ADDRESS
-    (without one, of a Ray that is started here). Ray is an extra: pip install 'restock[ray]'."""
+    """Where the processes run: on this machine, or on the Ray cluster at RAY_ADDRESS (if it is not
+    set, a local Ray is started). Ray is an extra: pip install 'restock[ray]'."""
     json: bool = False
     """Print one JSON document: {"recordings": [{"path", "status", "transitions", …}]}."""
 
@@ -81,7 +83,7 @@ class IngestCommand:
         if not self.paths:
             raise RecordingError("no path given", remedy="restock ingest PATH --store STORE")
         if self.store is None and not self.dry_run:
-            raise ConfigError("no store given", remedy="say --store STORE, or --dry-run")
+            raise ConfigError("no store given", remedy="give --store STORE, or --dry-run")
         if self.workers < 1:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         tags = parse_tags(self.tag, empty=True)

@@ -21,41 +21,43 @@ if TYPE_CHECKING:
 class LabelCommand:
     """Label a store's transitions again where their conditions have changed.
 
-    Conditions run over the signals that are stored: no recording is read, and observations,
-    actions and rewards stay as they are. Recordings whose labels are up to date are left
-    unchanged; the others change in one commit. Each row keeps the version of its labels.
+    Conditions are computed from the stored signals: no recording is read, and observations, actions
+    and rewards do not change. Recordings whose labels are up to date are left unchanged; the others
+    change in one commit. Each row stores the version of its labels.
 
-    The conditions of a recording are those of the profile that read it, by name or as the store
-    keeps it; `--profile` gives others, for the recordings of that profile's name (or, with --all,
-    for every recording).
+    By default, a recording gets the conditions of the profile with which it was ingested: the
+    shipped profile of that name, or the copy in the store. `--profile` gives other conditions, for
+    the recordings ingested with a profile of the same name (or, with --all, for every recording).
 
-    With --review it labels nothing: it lists the events whose label is most doubtful, each with its
-    moment, the command that opens it, and a column for a verdict. --corrections takes verdicts
-    into the store: they stay when recordings are labelled or ingested again. See docs/review.md.
+    With --review, nothing is labelled: it lists the events whose label is most uncertain, each with
+    its time, the command that opens it, and a column for a verdict. --corrections writes verdicts
+    to the store: they stay when recordings are labelled or ingested again. See docs/review.md.
     """
 
     store: Annotated[Path, tyro.conf.Positional]
     """The store's folder."""
     profile: str | None = None
-    """A profile that comes with Restock, or a TOML file, whose conditions to use."""
+    """Use the conditions of this profile: the name of a shipped profile, or a TOML file."""
     all: bool = False
-    """Use that profile's conditions for recordings that another profile read, too."""
+    """Also use that profile's conditions for recordings that were ingested with another profile."""
     score: bool = False
-    """Label nothing: print how good the labels are where a simulator knew what was true, by step
-    and by event, and how reliable their probabilities are."""
+    """Label nothing: compare the labels with the true conditions of simulated recordings, by step
+    and by event, and print how reliable their probabilities are."""
     by: Annotated[str | None, tyro.conf.arg(metavar="COLUMN")] = None
     """With --score: one score for each value of a column of `recordings` (source_file, map, …)."""
     review: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """List the N most doubtful events."""
+    """List the N most uncertain events."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """With --review: write them to this CSV file, to fill in the column `verdict`."""
+    """With --review: write the events to this CSV file, in which you fill in the column
+    `verdict`."""
     corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
-    """Take the verdicts of a CSV file (see docs/review.md) into the store; `none` takes all
-    corrections out."""
+    """Write the verdicts of a CSV file (see docs/review.md) to the store; `none` removes all
+    corrections."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """With --dry-run: of the store as it was, a version's number or a time; the newest."""
+    """With --dry-run: an earlier version of the store, its number or a time. Default: the
+    newest."""
     dry_run: bool = False
-    """Do everything but write, and print what would change."""
+    """Do everything except writing, and print what would change."""
     json: bool = False
     """Print one JSON document: {"version", "recordings": [{"recording_id", "changed", …}]}."""
 
@@ -129,13 +131,13 @@ class LabelCommand:
         ):
             clash = [name for name, there in (others | of_rules).items() if there]
             if given and clash:
-                raise ConfigError(f"{verb} does not go with {clash[0]}")
+                raise ConfigError(f"{verb} cannot be combined with {clash[0]}")
         if self.all and self.profile is None:
-            raise ConfigError("--all goes with --profile FILE")
+            raise ConfigError("--all needs --profile FILE")
         if self.by is not None and not self.score:
-            raise ConfigError("--by goes with --score")
+            raise ConfigError("--by needs --score")
         if self.out is not None and self.review is None:
-            raise ConfigError("--out goes with --review N")
+            raise ConfigError("--out needs --review N")
 
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
         from restock.ingest.profile.profile import load_profile
@@ -155,9 +157,9 @@ class LabelCommand:
                 if text := carried[name]:
                     return read_profile_toml(text, where=f"profile {name!r}").definitions
                 raise ConfigError(
-                    f"recordings of the profile {name!r} are in the store, and it is not at hand",
+                    f"the store holds recordings of profile {name!r}, which cannot be found",
                     where=str(self.store),
-                    remedy="name its file: --profile FILE (with --all for every recording)",
+                    remedy="give its file: --profile FILE (with --all for every recording)",
                 ) from error
 
         return conditions_of

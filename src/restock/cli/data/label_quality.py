@@ -27,12 +27,16 @@ def print_scores(path: Path, by: str | None, *, json: bool) -> int:
         output.print_json({"scores": rows, "reliability": bins})
         return ExitCode.OK
     if not found:
-        output.stdout().print("no recording of the store says what was true: nothing to score")
+        output.stdout().print(
+            "no recording in the store contains the true conditions: nothing to score"
+        )
         return ExitCode.OK
     output.print_table(score_rows(found, by))
     told = [row for row in bins if row["known"]]
     if told:
-        output.stdout().print("\nOf steps whose probability is about p, a share p should be true:")
+        output.stdout().print(
+            "\nA probability is reliable if, among steps with probability p, a share p is true:"
+        )
         output.print_table(reliability_rows(told))
     return ExitCode.OK
 

@@ -32,7 +32,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
             write_text(out, review_csv(rows), exclusive=True)
         except FileExistsError:
             raise LabelError(
-                "already exists, and may hold verdicts",
+                "already exists, and may contain verdicts",
                 where=str(out),
                 remedy="choose another --out",
             ) from None
@@ -42,13 +42,13 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
         output.print_json(rows)
         return ExitCode.OK
     if not rows:
-        output.stdout().print("no event of a label is in doubt, or none is left to review")
+        output.stdout().print("no uncertain event is left to review")
         return ExitCode.OK
-    output.print_table([_line(row) for row in rows], title="the most doubtful events first")
-    output.say(f"to look at the first: {rows[0]['open']}")
+    output.print_table([_line(row) for row in rows], title="events, the most uncertain first")
+    output.say(f"to see the first: {rows[0]['open']}")
     output.say(
-        f"write yes, no or FIRST..LAST (its true steps) into the last column of {out}, then:"
-        f" restock label {path} --corrections {out}"
+        f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "
+        f"is true), then run: restock label {path} --corrections {out}"
         if out is not None
         else "--out FILE writes them to a CSV file with a column for verdicts"
     )
@@ -99,9 +99,7 @@ def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: b
         return ExitCode.OK
     if not outcomes:
         output.stdout().print(
-            "there are no corrections to take out"
-            if file == NONE
-            else f"no line of {file} has a verdict",
+            "there are no corrections to remove" if file == NONE else f"{file} contains no verdict",
             markup=False,
         )
         return ExitCode.OK

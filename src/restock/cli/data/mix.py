@@ -26,14 +26,14 @@ _WIDE = 110  # columns of a terminal from which on the table says more
 
 @dataclass
 class MixCommand:
-    """Make a pinned replay panel: which transitions a run samples, in which shares.
+    """Make a pinned replay panel: the transitions that a run samples, and their shares.
 
-    Applies a mixture to a store and packs the chosen transitions into one memory-mapped
-    file. The plan shows for each stratum its share of the rows (natural), the wanted and the
-    drawn share, what is left of it after importance weights, how often each of its rows will be
-    replayed, and how many rows and hours of logging it misses. A correction that leaves less
-    of a stratum than the logs hold is refused. A
-    panel never changes; its id is a hash of store version, mixture, task and rows.
+    Applies a mixture to a store and packs the chosen transitions into one memory-mapped file. The
+    plan shows for each stratum its share of the rows (natural), the wanted share and the drawn
+    share, the share after importance weights, how often each of its rows will be replayed, and how
+    many rows and hours of logging are missing. Importance weights that give a stratum a smaller
+    share than it has in the logs are refused. A panel never changes; its id is a hash of store
+    version, mixture, task and rows.
     """
 
     store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
@@ -41,18 +41,18 @@ class MixCommand:
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
     """A TOML file, or one of coverage, exposure, steps and uniform. See docs/mixture.md."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """The panel's directory, which must not exist yet."""
+    """The new panel's directory. It must not exist yet."""
     dry_run: bool = False
     """Only show the plan; write nothing."""
     force: bool = False
     """Replace an existing panel."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """Limit of DuckDB's memory, e.g. 1GB; packing needs little more, whatever the panel's
-    size."""
+    """Memory limit of DuckDB, e.g. 1GB. Packing needs little more, whatever the panel's size."""
     verify: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """Check every byte of an existing panel, and do nothing else."""
+    """Check every byte of an existing panel; do nothing else."""
     schema: bool = False
     """Print the JSON Schema of mixture files, for editors, and nothing else."""
     json: bool = False
@@ -74,9 +74,11 @@ class MixCommand:
             self._verify(self.verify)
             return
         if self.store is None:
-            raise MixtureError("no STORE given", remedy="name the store to take transitions from")
+            raise MixtureError(
+                "no STORE given", remedy="give the store from which to take transitions"
+            )
         if self.out is None and not self.dry_run:
-            raise MixtureError("no --out given", remedy="say where the panel goes, or --dry-run")
+            raise MixtureError("no --out given", remedy="give --out PANEL, or --dry-run")
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
@@ -225,8 +227,8 @@ def _summary(document: dict[str, Any]) -> list[str]:
     ]
     if fewer:
         lines.append(
-            f"logs get {document['logs_share']:.1%} of a batch, not"
-            f" {document['logs_share_wanted']:.1%}: their rows allow no more"
+            f"the logs get {document['logs_share']:.1%} of a batch, not "
+            f"{document['logs_share_wanted']:.1%}: they do not have enough rows"
         )
     for fit in document["density_ratios"]:
         lines.append(
@@ -256,16 +258,16 @@ def _summary(document: dict[str, Any]) -> list[str]:
         lines.append(f"held out: {held['note']}{rows}")
     for name, rates in document["represents"].items():
         of = "the main store's" if rates == "archive" else "given"
-        lines.append(f"the rows of {name} were chosen: their natural shares are {of}")
+        lines.append(f"the rows of {name} are a selection: their natural shares are {of}")
     if len(read_by := [f"{p['name']} {p['hash']}" for p in document["profiles"]]) > 1:
         lines.append(
-            f"profiles of this task: {', '.join(read_by)}; the panel carries {read_by[0]}, of the"
-            " newest ingest"
+            f"profiles of this task: {', '.join(read_by)}; the panel carries {read_by[0]}, that "
+            "of the newest ingest"
         )
     if document["uncertain_rows"]:
         lines.append(
-            f"{document['uncertain_rows']:,} rows have a condition too near to call:"
-            f" {_UNCERTAIN[document['uncertain']]}"
+            f"{document['uncertain_rows']:,} rows have a condition too near to call: "
+            f"{_UNCERTAIN[document['uncertain']]}"
         )
     rules = dict.fromkeys(line["within"] for line in document["strata"])
     of_rule = {

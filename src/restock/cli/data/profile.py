@@ -28,43 +28,44 @@ OFTEN = 0.5  # of the transitions: a label that holds on more is worth a look
 class ProfileCommand:
     """Propose a profile for an unknown robot, or check one against a recording.
 
-    `restock profile new RECORDING` proposes one from what is in the file: topics by type and name,
-    rates, clocks, frames, the speeds that were commanded, with a comment at each guess; and,
-    commented out with a #, every field that might become a custom column. It is printed, or
-    written to --out. Of several recordings, or a folder of them, it proposes one profile for all
-    that are of one kind of robot, and names the others.
+    `restock profile new RECORDING` proposes a profile from the types and names of topics, rates,
+    clocks, frames and commanded speeds, with a comment at each guess. Fields that might become
+    custom columns are listed, commented out. The profile is printed, or written to --out. For
+    several recordings, or a folder of them, it proposes one profile for all recordings of one kind
+    of robot, and lists the others.
 
-    `restock profile check PROFILE RECORDING` shows what would be used, what is missing (and what
-    the recording has instead), how many transitions there would be and what each condition would
-    label, and what removes most rows, with what to try. Nothing is written.
+    `restock profile check PROFILE RECORDING` shows which inputs would be used, which are missing
+    (and what the recording has instead), how many transitions would result, how many of them each
+    condition would label, and what removes most rows, with advice. Nothing is written.
 
-    Exit codes of `new`: 3 where the proposal cannot be used as it is (it is written, and says why);
-    of `check`: 2 where the profile does not fit.
+    Exit codes: `new` exits with 3 if the proposal cannot be used as it is (it is still written, and
+    says why); `check` exits with 2 if the profile does not fit.
     """
 
     action: Annotated[Literal["new", "check"], tyro.conf.Positional]
     """new RECORDING…, or check PROFILE RECORDING."""
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """The recording, or several drives of one kind of robot; for `check`, the profile (a file or a
-    shipped name) first."""
+    """For `new`: one or more recordings of one kind of robot. For `check`: the profile (a file or a
+    shipped name), then the recording."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
-    """The robot's length and width in metres for `new`, as 0.6x0.5; without it from the recording's
-    /robot_description or its costmap's footprint, else a guess."""
+    """For `new`: the robot's length and width in metres, for example 0.6x0.5. Default: from the
+    recording's /robot_description or its costmap's footprint, else a guess."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The robot's URDF for `new`: outline, wheels, mass and lidar, in place of the recording's
-    /robot_description. Write xacro out first; meshes are not read. See docs/robot.md."""
+    """For `new`: the robot's URDF, for outline, wheels, mass and lidar. It replaces the recording's
+    /robot_description. Convert xacro to URDF first; meshes are not read. See docs/robot.md."""
     odometry_as_command: bool = False
-    """Let `new` take odometry for commands where none was recorded: what the robot did then stands
-    for what it was told."""
+    """For `new`: use odometry as the command if no command was recorded: the measured motion then
+    stands for the commanded motion."""
     out: Path | None = None
-    """Where `new` writes the profile. Nothing is overwritten."""
+    """Where `new` writes the profile. An existing file is not overwritten."""
     typestore: str | None = None
-    """Distribution whose message definitions serve recordings without their own (humble)."""
+    """ROS 2 distribution whose message definitions are used for recordings without their own.
+    Default: humble."""
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
-    for recordings that carry none."""
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
+    recordings that do not contain the definitions."""
     salvage: bool = False
-    """Read what is intact of truncated or damaged files."""
+    """Also read what is intact in damaged or truncated files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
     "problems", "advice", "commands", "kinds", "wheeled"}; `check`: {"inputs", "problems", "advice",
@@ -94,7 +95,7 @@ class ProfileCommand:
         from restock.ingest.propose.evidence.footprint import parse_footprint
 
         if self.out is not None and self.out.exists():
-            raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
+            raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
         chosen, left_out = drives_to_read([r for path in self.paths for r in recordings_in(path)])
@@ -112,7 +113,7 @@ class ProfileCommand:
                 )
         if left_out:
             output.say(
-                f"of {len(chosen) + left_out:,} recordings the {len(chosen)} largest are read"
+                f"reading the {len(chosen)} largest of {len(chosen) + left_out:,} recordings"
             )
         if self.out is not None:
             write_text(self.out, proposal.toml)
@@ -224,7 +225,7 @@ class ProfileCommand:
 
         with (
             self._open(self.paths[1]) as recording,
-            output.progress("looking for what would give more rows", None) as advance,
+            output.progress("looking for changes that would give more rows", None) as advance,
         ):
             recording.watch = advance.part
             as_read = as_recorded(profile, recording.topics)
@@ -232,8 +233,8 @@ class ProfileCommand:
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0
         lines += [
-            f"`{name}` holds on {count:,} of {rows:,} transitions: is its SQL right for this robot,"
-            " and is [task.body] its outline?"
+            f"`{name}` holds on {count:,} of {rows:,} transitions: check its SQL for this robot, "
+            "and the outline in [task.body]"
             for name, count in (outcome.conditions if outcome else {}).items()
             if name != NOMINAL and count > OFTEN * rows
         ]

@@ -23,35 +23,36 @@ CUT_TO = 4  # values of a list that are shown, where it has more than twice as m
 
 @dataclass
 class SqlCommand:
-    """Any question to a store, a run directory or a panel, in DuckDB's SQL.
+    """Query a store, a run directory or a panel, in DuckDB's SQL.
 
     A store has the views transitions, recordings, episodes, coverage, coverage_by_condition,
     missing_cells, reward_mix, ages, label_overlap, versions, conditions, actions, drops, topics,
     label_scores, drift and signal_weeks; `restock sql STORE "FROM columns"` lists every column
     with its meaning. A run has its tables (progress, strata, ages, audit, …) and the view
     replay_audit; a panel has `rows`, `strata` and `evaluation_split`.
-    A terminal shows the first 40 rows and cuts long lists; a file or a pipe gets all.
-    Queries are read-only, and Ctrl-C stops one. Without a query there is a prompt.
+    A terminal shows the first 40 rows and shortens long lists; a file or a pipe gets everything.
+    Queries are read-only, and Ctrl-C stops a query. Without a query, a prompt opens.
     """
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A store, a run directory or a panel."""
     query: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[QUERY]")] = None
-    """The query, or - to read it from stdin; a prompt without one."""
+    """The query, or - to read it from stdin. Default: open a prompt."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run whose tables are joined as run.audit, run.strata, …"""
+    """A run whose tables the query can also use, as run.audit, run.strata, …"""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """A panel whose tables are joined as panel.rows, panel.strata."""
+    """A panel whose tables the query can also use, as panel.rows, panel.strata."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Ask the store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """Query an earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default:
+    the newest."""
     json: bool = False
     """Print a list of row objects."""
     csv: bool = False
     """Print CSV with a header."""
     memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
-    """Limit of DuckDB's memory, e.g. 4GB; beyond that it spills to a temporary folder."""
+    """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
     export: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a store's views for any DuckDB: an init file (.sql) or a database (.duckdb)."""
+    """Write a store's views for use in any DuckDB: an init file (.sql) or a database (.duckdb)."""
 
     def run(self) -> None:
         """Run the query and print its rows."""
@@ -59,7 +60,7 @@ class SqlCommand:
         from restock.replay.places import open_place
 
         if self.json and self.csv:
-            raise QueryError("--json and --csv are both given", remedy="choose one")
+            raise QueryError("--json and --csv cannot be combined", remedy="choose one")
         if self.export is not None:
             self._export(self.export)
             return
@@ -95,7 +96,7 @@ class SqlCommand:
         else:
             self._show([_cut(row) for row in rows] if terminal else rows, columns)
         if count > len(rows):
-            output.say(f"{count:,} rows, {len(rows)} shown; all of them go to a file or a pipe")
+            output.say(f"{count:,} rows, {len(rows)} shown; a file or a pipe gets all of them")
 
     def _show(self, rows: list[dict[str, Any]], columns: list[str]) -> None:
         """A table, or the rows one below the other where that would not fit."""
@@ -117,7 +118,7 @@ class SqlCommand:
 
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  (gives the prompt a history)
-        output.say('A query ends with ";". FROM columns; lists what there is. Ctrl-D to leave.')
+        output.say('End a query with ";". FROM columns; lists all columns. Ctrl-D to quit.')
         text = ""
         while True:
             try:

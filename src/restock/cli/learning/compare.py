@@ -15,17 +15,16 @@ if TYPE_CHECKING:
 
 @dataclass
 class CompareCommand:
-    """Compare two methods, unless their critics were fed differently: then it is refused, exit 1.
+    """Compare two methods. Refused, with exit code 1, if their critics were fed differently.
 
-    Name the treatment: the one thing that may differ. Under `algorithm` (network, loss, optimizer)
-    and `target` (the target rule) the arms must have been fed the same rows in the same mix, which
-    an equivalence test over episodes decides, and been evaluated in the same way. Under `mixture`
-    the feed is what is compared, and the store, the algorithm, the target rule, the evaluation and
-    the numbers of steps and updates must be the same. Under `practice` the missions that the twin
-    gave may differ (`practice.*`, `env.conditions`, `env.missions`), and the logs must have been
-    drawn alike. Under `method` everything about how an arm
-    learns may differ (replay, target rule, updates), but not the twin, the environment steps and
-    the evaluation.
+    Name the treatment: the one thing that may differ. With `algorithm` (network, loss, optimizer)
+    and `target` (the target rule), both arms must have been fed the same rows in the same mix
+    (decided by an equivalence test over episodes) and evaluated in the same way. With `mixture`,
+    the feed is compared; the store, the algorithm, the target rule, the evaluation and the numbers
+    of steps and updates must be the same. With `practice`, the missions in the twin may differ
+    (`practice.*`, `env.conditions`, `env.missions`), and the logs must have been sampled in the
+    same way. With `method`, everything about how an arm learns may differ (replay, target rule,
+    updates), but not the twin, the environment steps and the evaluation.
 
     With several seeds per arm: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
 
@@ -37,11 +36,11 @@ class CompareCommand:
     against: tuple[Path, ...] = ()
     """The runs of the second method."""
     treatment: Literal["algorithm", "target", "mixture", "practice", "data", "method"] = "algorithm"
-    """What is compared, and so may differ."""
+    """The treatment: what is compared, and therefore may differ."""
     all_checks: bool = False
-    """Show every check, not only the deciding ones."""
+    """Show all checks, not only the decisive ones."""
     page: Path | None = None
-    """Write a page (HTML) that opens without a network. Replaces what is there."""
+    """Write an HTML page that opens without a network. Replaces an existing file."""
     json: bool = False
     """Print the verdict, the differences, the checks and the outcomes as JSON."""
 
@@ -178,7 +177,7 @@ def _success(value: float | None) -> str:
 
 def _sentence(comparison: Comparison) -> str:
     if comparison.identical:
-        return "COMPARABLE: both sides are the same runs, which differ in nothing"
+        return "COMPARABLE: both sides are the same runs"
     if comparison.verdict == "comparable":
         what = {
             "mixture": "settings, steps",

@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 @dataclass
 class DiagnoseCommand:
-    """Tell a failure of the buffer from a failure of the target.
+    """Find out why a critic fails: because of the buffer, or because of the target?
 
-    Compares replay with the periodic evaluations' own steps, which no replay has, condition by
-    condition: the critic's TD error, its frequency, its rows; and the online network with the
-    target network; and what the policy wants with what the logs have of each action. The verdict is
-    HEALTHY, BUFFER, ACTION_COVERAGE, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with the evidence
-    and the experiment that would confirm it. Figures are of the last three
-    evaluations; most of the runs must agree. Rows of the panel at fault make HEALTHY a BUFFER.
+    For each condition, it compares replay with the steps of the periodic evaluations, which are
+    never replayed: TD error, frequency and rows. It also compares the online network with the
+    target network, and the actions that the policy prefers with the actions in the logs. The
+    verdict is HEALTHY, BUFFER, ACTION_COVERAGE, TARGET, BOTH, DIVERGENCE or UNDETERMINED, with the
+    evidence and an experiment that would confirm it. The figures are from the last three
+    evaluations; most of the runs must agree. Faulty rows in the panel change HEALTHY to BUFFER.
 
-    With --before-training no run is needed: the rows of a panel or a store are held against fresh
-    rows of the twin and against the task's definitions: do actions explain the motion, are rewards
-    and ends what the task says, do rows follow from one another. Consistent mistakes, which no
-    figure of a run shows, are named there with the row of evidence.
+    With --before-training, no run is needed: the rows of a panel or a store are compared with fresh
+    rows from the twin and with the task's definitions. Do the actions explain the motion? Do
+    rewards and episode ends follow the task? Do the rows follow from one another? This finds
+    systematic errors that no figure of a run shows, and prints the rows that are the evidence.
 
     Example: `restock diagnose runs/a runs/a-seed1 runs/a-seed2`
     """
@@ -35,23 +35,24 @@ class DiagnoseCommand:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")] = ()
     """Runs of one method (seeds)."""
     before_training: Annotated[Path | None, tyro.conf.arg(metavar="PANEL_OR_STORE")] = None
-    """Diagnose the rows of this panel or store, without a run: some seconds."""
+    """Diagnose the rows of this panel or store, without a run. Takes some seconds."""
     profile: str | None = None
-    """With --before-training: the profile that the rows were ingested with (default: the one that
-    they carry)."""
+    """With --before-training: the profile with which the rows were ingested. Default: the one
+    stored with them."""
     perturbation: Path | None = None
-    """With --before-training: the calibrated twin, e.g. what `restock twin fit` wrote."""
+    """With --before-training: a perturbation that calibrates the twin, e.g. written by `restock
+    twin fit`."""
     twin: bool = True
-    """With --before-training: do not compare rows with the twin; check only what holds by
-    definition."""
+    """With --before-training: do not compare rows with the twin; check them only against the task's
+    definitions."""
     seed: int = 0
-    """With --before-training: of the twin's episodes and the bootstrap."""
+    """With --before-training: the seed of the twin's episodes and of the bootstrap."""
     rows: bool = True
     """Do not compare the rows of the runs' panel with the twin, which takes some seconds."""
     check: bool = False
     """Exit 1 unless the verdict is HEALTHY."""
     confirm: Path | None = None
-    """Run the experiment that would confirm it, into this new run directory."""
+    """Run the experiment that would confirm the verdict, in this new run directory."""
     json: bool = False
     """Print the verdict, the evidence and every window as JSON."""
 
@@ -77,7 +78,7 @@ class DiagnoseCommand:
         if not self.json:
             _show(diagnosis, self.runs)
             if found is None and self.rows:
-                say(f"the rows of its panel were not held against the twin: {reason}")
+                say(f"the rows of its panel were not compared with the twin: {reason}")
         confirmation = (
             confirm(runs[0], diagnosis, self.confirm) if self.confirm is not None else None
         )
@@ -99,7 +100,8 @@ class DiagnoseCommand:
 
         if self.runs or self.confirm is not None:
             raise ConfigError(
-                "--before-training takes no run and no --confirm", where="restock diagnose"
+                "--before-training cannot be combined with a run or --confirm",
+                where="restock diagnose",
             )
         diagnosis = diagnose_before_training(
             path,
@@ -175,7 +177,7 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
                 }
                 for row in chosen
             ],
-            title="what is past its limit, with 95 % intervals over episodes",
+            title="findings beyond their limit, with 95 % intervals over episodes",
         )
     out, about = stdout(), diagnosis.about
     compared = f"{about['rows']:,} rows of {about['episodes']:,} episodes"

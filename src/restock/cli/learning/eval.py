@@ -17,16 +17,16 @@ _DRIVES = (
 
 @dataclass
 class EvalCommand:
-    """Drive a run's kept policy through fixed episodes, beside the scripted and a random policy.
+    """Evaluate a run's kept policy on fixed episodes, beside scripted policies and a random one.
 
-    Every policy drives the same seeded episodes of every condition that its floors have room for,
-    clean and under each perturbation. Prints success, return, bumps a kilometre, the closest
-    approach to people and the time lost against the planner, with 95 % intervals, with partly and
-    wholly blocked aisles apart, and adds to RUN/eval/episodes.parquet.
+    Every policy drives the same seeded episodes of every condition for which the floors have room,
+    without a perturbation and under each one. Prints success, return, bumps per kilometre, the
+    closest approach to people and the time lost against the planner, with 95 % intervals; partly
+    and wholly blocked aisles are listed separately. Adds the episodes to RUN/eval/episodes.parquet.
 
-    With --baseline it is compared with another run or a saved baseline on the same episodes.
-    With --on-logs nothing drives: off-policy evaluation on logged episodes that it did not
-    learn from (docs/off-policy.md), into RUN/eval/off_policy.parquet.
+    With --baseline, the policy is compared with another run or a saved baseline on the same
+    episodes. With --on-logs nothing is driven: off-policy evaluation on logged episodes that the
+    policy did not learn from (docs/off-policy.md), written to RUN/eval/off_policy.parquet.
 
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """
@@ -34,46 +34,50 @@ class EvalCommand:
     run_path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """The run directory."""
     episodes: Annotated[str, tyro.conf.arg(metavar="N|KIND=N,...")] = "20"
-    """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision); or by kind, as
-    nominal=1000,wheel_slip=300: kinds that are not named are not driven."""
+    """Episodes per kind (nominal, wheel_slip, blocked_aisle, near_collision). Or a number for each
+    kind, as nominal=1000,wheel_slip=300: other kinds are not driven."""
     perturbations: str = "none,friction,latency"
-    """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (as
-    `restock twin fit` writes it)."""
+    """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (for example
+    from `restock twin fit`)."""
     policies: str = "agent,planner,random"
-    """Comma-separated: agent (the run's best), planner, operator, random, cloned (the way the logs
-    were driven, by behaviour cloning), cloned:DRIVER, onnx:FILE, run:DIRECTORY."""
+    """Comma-separated: agent (the run's best), planner, operator, random, cloned (behaviour cloning
+    of the logs' drivers), cloned:DRIVER, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
-    """Seed of the first episode; the same seeds for every policy."""
+    """Seed of the first episode. All policies drive the same seeds."""
     baseline: str | None = None
-    """Compare with this run, a saved baseline, or another of the --policies (cloned, planner), on
-    the same episodes, per condition."""
+    """Compare with this run, a saved baseline, or another one of the --policies (cloned, planner),
+    per condition, on the same episodes."""
     margin: float = 0.05
-    """With --baseline: a success lower by more than this, with the interval below 0, is worse."""
+    """With --baseline: the policy is worse where its success is lower by more than this, with the
+    interval below 0."""
     check: bool = False
-    """With --baseline: exit 1 where a condition is worse, or cannot be compared."""
+    """With --baseline: exit 1 if a condition is worse or cannot be compared."""
     save_as_baseline: str | None = None
-    """Keep the evaluation as baselines/NAME.parquet (or in the .parquet file that is named)."""
+    """Save the evaluation as baselines/NAME.parquet (or as the .parquet file given)."""
     drive: bool = True
     """Drive nothing: use the episodes in RUN/eval/episodes.parquet."""
     video: bool = False
-    """Film the agent's worst failure and a rescue of each condition, from above, into
-    RUN/eval/films: episodes of the evaluation, driven again. `restock report` shows them."""
+    """For each condition, film the agent's worst failure and an episode in which it succeeded and
+    another policy failed, from above, into RUN/eval/films. The episodes are driven again. `restock
+    report` shows the films."""
     on_logs: str | None = None
-    """Off-policy evaluation on a store's episodes, or on those that a panel holds out. "own": its
-    own panel."""
+    """Off-policy evaluation on the episodes of this store, or on the held-out episodes of this
+    panel. "own": the run's own panel."""
     epsilon: float = 0.1
-    """With --on-logs: probability of a random action of the evaluated policy, else greedy."""
+    """With --on-logs: the probability that the evaluated policy takes a random action; otherwise it
+    is greedy."""
     horizon: int | None = None
-    """With --on-logs: how many steps importance weights reach; default all."""
+    """With --on-logs: the number of steps over which importance weights are multiplied. Default:
+    all."""
     layouts: str | None = None
-    """Floors to drive on, e.g. generated:test (default: the run's own; where it trained on
-    generated:train, the test floors)."""
+    """Floors to drive on, e.g. generated:test. Default: the run's own floors; for a run trained on
+    generated:train, the test floors."""
     limiter: Annotated[str | None, tyro.conf.arg(metavar="profile|FILE.toml")] = None
-    """Drive each policy once more with the limiter in front of it, as limited:NAME: by the
-    profile's [limiter], or a file's (docs/deploy.md)."""
+    """Also drive each policy with a limiter after it, as limited:NAME. The limiter is the profile's
+    [limiter], or that of a file (docs/deploy.md)."""
     missions: str = "drawn"
-    """drawn: by their seeds, on the floor. logged: start and goal of the logged episodes that the
-    run's panel holds out, on the floor of the logs; logged:all: of those trained on too."""
+    """drawn: missions drawn from the seeds. logged: start and goal of the logged episodes that the
+    run's panel holds out, on the floor of the logs. logged:all: of all logged episodes."""
     dry_run: bool = False
     """Check everything and print what would be driven; write nothing."""
     json: bool = False
@@ -83,10 +87,12 @@ class EvalCommand:
         from restock.cli.command_line import refuse
 
         if self.on_logs is not None:
-            why = "does not go with --on-logs: nothing drives"
-            refuse(self, _DRIVES, why, remedy="leave one of them out")
+            why = "cannot be combined with --on-logs, which drives nothing"
+            refuse(self, _DRIVES, why, remedy="leave out one of them")
             return self._evaluate_off_policy(self.on_logs)
-        refuse(self, ("epsilon", "horizon"), "is of --on-logs", remedy="give that too")
+        refuse(
+            self, ("epsilon", "horizon"), "applies only to --on-logs", remedy="give --on-logs, too"
+        )
         return self._drive()
 
     def _drive(self) -> int:
@@ -100,7 +106,7 @@ class EvalCommand:
 
         if self.check and self.baseline is None:
             raise ConfigError(
-                "says nothing without --baseline",
+                "has no effect without --baseline",
                 where="--check",
                 remedy="name the run or the saved baseline to compare with",
             )
@@ -126,7 +132,7 @@ class EvalCommand:
             for line in plan.warnings:
                 say(line)
             for kind, floors in plan.left_out.items():
-                say(f"left out: {kind}, no room for it on {', '.join(floors)}")
+                say(f"left out: {kind}, as there is no room for it on {', '.join(floors)}")
             with progress("driving", plan.total) as advance:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]

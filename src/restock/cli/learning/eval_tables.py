@@ -35,11 +35,11 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
             title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
         )
     if not wide:
-        say(f"not shown in {stdout().width} columns, but with --json: {', '.join(_WIDER)}")
+        say(f"not shown in {stdout().width} columns, only with --json: {', '.join(_WIDER)}")
     if not any(row["policy"] == "planner" for row in rows) and not any(
         row["time_lost_episodes"] for row in rows
     ):
-        say("time lost is not known: name the planner in --policies once")
+        say("time lost is not known: add the planner to --policies once")
 
 
 def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
@@ -91,8 +91,8 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
         shown["weights worth"] = f"{row['ess']:.1f} episodes"
     print_table(
         list(cells.values()),
-        title=f"{result.version}, greedy but for {config.epsilon:.0%} random actions, off-policy on"
-        " logs it did not learn from [95 % over episodes]",
+        title=f"{result.version}, greedy with {config.epsilon:.0%} random actions, off-policy on "
+        "logs it did not learn from [95 % over episodes]",
     )
     for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
@@ -100,14 +100,14 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
             say(f"{row['measure']}: pdwis and wdr are refused: {row['refused']}{longest}")
     if any(row["estimator"] == "fqe" for row in result.rows):
         say(
-            "fqe is the fitted model's value of the starts: it has no interval, since how wrong the"
-            " model is cannot be told from these logs"
+            "fqe is the value of the starts by the fitted model: it has no interval, as the error "
+            "of the model cannot be measured on these logs"
         )
     estimated = result.rows[0]["estimated_share"] if result.rows else 0.0
     if estimated:
         say(
-            f"the behaviour's probabilities are estimated (cloned) for {estimated:.0%} of the rows:"
-            " the logs do not contain them"
+            f"the behaviour policy's probabilities are estimated (cloned) for {estimated:.0%} of "
+            "the rows: the logs do not contain them"
         )
     for note in result.notes:
         say(note)

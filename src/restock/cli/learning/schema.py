@@ -15,31 +15,31 @@ import tyro
 CONFIGS: Mapping[str, str] = {
     "train": "`restock train --config`",
     "mixture": "`restock mix --mixture`",
-    "profile": "`restock ingest --profile`, a robot's topics and task",
-    "study": "`restock study`, of arms",
-    "search": "`restock study`, of a [space]",
-    "layout": "a floor, for `--layouts`",
-    "perturbation": "`restock record --perturbation`, effective parameters",
-    "schedule": "the same, drawn an episode from `ranges`",
+    "profile": "`restock ingest --profile`: a robot's topics and task",
+    "study": "`restock study`: arms to compare",
+    "search": "`restock study`: a search over a [space]",
+    "layout": "`--layouts`: a floor",
+    "perturbation": "`restock record --perturbation`: effective parameters",
+    "schedule": "the same: effective parameters, drawn per episode from `ranges`",
     "missions": "`restock record --missions`",
 }
 
 
 @dataclass
 class SchemaCommand:
-    """The JSON Schema of a config: an editor completes and checks the TOML file by it.
+    """Print the JSON Schema of a config, with which an editor completes and checks the TOML file.
 
-    Without NAME it lists the configs. `restock schema train > train.schema.json`, and as the
-    first line of the TOML file: #:schema ./train.schema.json (Taplo, and with it VS Code's Even
-    Better TOML, read that line). --out writes every schema into a folder.
+    Without NAME, it lists the configs. Run `restock schema train > train.schema.json`, and make
+    this the first line of the TOML file: #:schema ./train.schema.json (read by Taplo, and so by the
+    VS Code extension Even Better TOML). --out writes all schemas into a folder.
     """
 
     name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
-    """Of which config."""
+    """The name of the config."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Write NAME.schema.json there; without NAME all of them."""
+    """Write NAME.schema.json into this folder; without NAME, all schemas."""
     json: bool = False
-    """Print the list as JSON (a schema is JSON anyway)."""
+    """Print the list as JSON (a schema is always JSON)."""
 
     def run(self) -> None:
         """Print or write."""
@@ -49,7 +49,8 @@ class SchemaCommand:
 
         if self.name is not None and self.name not in CONFIGS:
             raise ConfigError(
-                f"no config named {self.name!r}", remedy=f"there are {', '.join(CONFIGS)}"
+                f"there is no config named {self.name!r}",
+                remedy=f"choose one of {', '.join(CONFIGS)}",
             )
         if self.out is not None:
             for name in [self.name] if self.name else CONFIGS:

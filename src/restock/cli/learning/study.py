@@ -14,13 +14,14 @@ import tyro
 class StudyCommand:
     """Train and evaluate every arm of a study with every seed, then compare them.
 
-    The study is a TOML file: a store, arms (a mixture or a panel, and settings), seeds, what is
-    compared. Each run is a directory under OUT/runs. What already exists is not done again, so
-    the same command continues an interrupted study. Ends with OUT/study.md, study.json and a page,
-    study.html. --power says beforehand what so many seeds can see. See docs/study.md.
+    The study is a TOML file with a store, arms (a mixture or a panel, and settings), seeds and the
+    treatment. Each run is a directory under OUT/runs. Finished runs are kept, so the same command
+    continues an interrupted study. Ends with OUT/study.md, study.json and a page, study.html.
+    --power prints beforehand which effects this number of seeds can detect. See docs/study.md.
 
-    A file with [space] in place of arms is a search of settings with Optuna (`restock[tune]`):
-    the best is the one whose worst condition is best. It ends with OUT/best.toml, too.
+    A file with [space] instead of arms is a search for settings with Optuna (`restock[tune]`). The
+    best trial is the one with the highest success in its worst condition. It also writes
+    OUT/best.toml.
 
     Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
     """
@@ -28,14 +29,15 @@ class StudyCommand:
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
     """The study."""
     out: Path | None = None
-    """Where its panels, runs and logs go (needed but for --power)."""
+    """The folder for panels, runs and logs. Required, except with --power."""
     workers: int = 1
-    """Runs at a time, each a process."""
+    """How many runs to train at the same time, each in its own process."""
     engine: Literal["processes", "ray"] = "processes"
-    """`ray`: runs on a Ray cluster, RAY_ADDRESS's or one started here; needs `restock[ray]`."""
+    """Where the runs are trained. `ray`: on the Ray cluster at RAY_ADDRESS, or on a local one;
+    needs `restock[ray]`."""
     power: bool = False
-    """Print the power for the primary contrast and the least effect that is seen, and run
-    nothing: from finished runs under --out, else from the study's `power`."""
+    """Print the power for the primary contrast and the least detectable effect, and run nothing.
+    The spread is taken from finished runs in --out, else from the study's `power`."""
     dry_run: bool = False
     """Check the study and print what would be run; write nothing."""
     json: bool = False
@@ -59,9 +61,9 @@ class StudyCommand:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
         if self.out is None and not self.power:
             raise ConfigError(
-                "is needed: the study's panels, runs and page go there",
+                "is required: the study's panels, runs and page are written there",
                 where="--out",
-                remedy="name a directory, or only ask for --power",
+                remedy="give a directory, or --power",
             )
         if "space" in read_toml(self.study):
             return self._search()
@@ -73,7 +75,7 @@ class StudyCommand:
                 raise ConfigError(
                     "names no primary contrast"
                     if plan.study.primary is None
-                    else "says nothing of the spread between seeds, and no seeds are finished",
+                    else "does not give the spread between seeds, and no seeds are finished",
                     where=str(self.study),
                     remedy="give `primary` and `power = { sd = …, effect = … }`: docs/study.md",
                 )
@@ -129,8 +131,8 @@ class StudyCommand:
         search = load_search(self.study)
         if self.out is None or self.power or self.workers != 1 or self.engine != "processes":
             raise ConfigError(
-                "a search takes --out, and neither --power, --workers nor --engine: its trials"
-                " follow each other",
+                "a search needs --out and cannot be combined with --power, --workers or --engine: "
+                "its trials run one after another",
                 where=str(self.study),
                 remedy="`restock study SEARCH.toml --out DIR`",
             )
@@ -140,7 +142,10 @@ class StudyCommand:
             if self.json:
                 print_json({"trials": search.trials, "settings": fixed, "space": rows})
             else:
-                print_table(rows, title=f"{search.trials} trials of this space; of all: {fixed}")
+                print_table(
+                    rows,
+                    title=f"{search.trials} trials of this space; settings of all trials: {fixed}",
+                )
             return 0
         require_optuna()
         found = run_search(SearchPlan(search, self.study.parent, self.out), say=say)

@@ -23,43 +23,48 @@ _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and 
 class TraceCommand:
     """Trace a sampled row to its source, down to the recording's messages.
 
-    Of a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without
-    ROW it lists those with the largest TD errors. Of a PANEL, ROW is a row number; of a STORE, a
-    transition id. Shows the audited row, the row of the panel and of the store it was drawn from,
-    the recording and its time in it, and, with --recording, the messages that were held at
-    that tick. A fresh row leads to its episode in the twin, and to the spec that draws it again.
+    For a RUN, ROW is an audited row, STEP/ROW: the gradient step and the row of its batch. Without
+    ROW, the audited rows with the largest TD errors are listed. For a PANEL, ROW is a row number;
+    for a STORE, a transition id. It shows the audited row, the row of the panel and of the store
+    from which it was drawn, the recording and the time in it, and, with --recording, the messages
+    that were held at that tick. For a fresh row, it shows the episode in the twin, and the spec
+    that generates it again.
 
-    --view FILE.mcap (or FILE.rrd) writes the seconds around a row for Foxglove (or Rerun): what
-    the store has of each step, labels, the critic's value and TD error, and, with --recording,
+    --view FILE.mcap (or FILE.rrd) writes the seconds around a row for Foxglove (or Rerun): the
+    store's columns of each step, labels, the critic's value and TD error, and, with --recording,
     scans, plans and every topic of the recording.
     """
 
     place: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|PANEL|STORE")]
-    """Where the row is."""
+    """The run, panel or store that holds the row."""
     row: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[ROW]")] = None
-    """STEP/ROW of a run (1200/17), a row number of a panel, a transition id of a store."""
+    """STEP/ROW of a run (for example 1200/17), a row number of a panel, or a transition id of a
+    store."""
     recording: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
-    """The recording it is from: shows the messages it was made of."""
+    """The recording of the row: also show the messages from which the row was made."""
     profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """The profile that read the recording, if it is not a shipped one."""
+    """The profile with which the recording was ingested, if it is not a shipped one."""
     store: Annotated[str | None, tyro.conf.arg(metavar="STORE")] = None
-    """Where the store is now, if it was moved."""
+    """The new path of the store, if it was moved."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """Of a STORE as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the STORE: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     panel: Annotated[Path | None, tyro.conf.arg(metavar="PANEL")] = None
-    """Where the panel is now, if it was moved."""
+    """The new path of the panel, if it was moved."""
     view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write the moment: FILE.mcap for Foxglove, its layout beside it; FILE.rrd for Rerun."""
+    """Also write the seconds around the row: FILE.mcap for Foxglove, with a layout file beside it,
+    or FILE.rrd for Rerun."""
     before: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
     """Seconds before the row that --view shows."""
     after: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
-    """Seconds after it."""
+    """Seconds after the row that --view shows."""
     critic: Annotated[str | None, tyro.conf.arg(metavar="RUN|none")] = None
-    """Whose critic --view shows: a run, or none; of a RUN's row its own."""
+    """The run whose critic --view shows, or none. Default for a row of a RUN: that run."""
     beside: Annotated[str | None, tyro.conf.arg(metavar="CONDITION/SEED")] = None
-    """In --view also this episode of that run's evaluation (`restock eval`), driven again."""
+    """With --view: also drive this episode of that run's evaluation (`restock eval`) again, and
+    show it."""
     rows: int = 20
-    """How many audited rows to list, where no ROW is given."""
+    """How many audited rows to list if no ROW is given."""
     json: bool = False
     """Print one JSON document (without ROW: a list)."""
 
@@ -79,9 +84,9 @@ class TraceCommand:
             columns = _NARROW if narrow else None
             output.print_table(listed, columns, title="audited rows, largest TD error first")
             if narrow:
-                output.say("their other columns go to a wider terminal, a file or a pipe")
+                output.say("more columns are shown in a wider terminal, a file or a pipe")
             if listed:
-                output.say(f"`restock trace {self.place} {listed[0]['row']}` follows one")
+                output.say(f"`restock trace {self.place} {listed[0]['row']}` traces one of them")
             return
         version = given_version(self.version)
         where = TracePlaces(self.store, self.panel, self.recording, self.profile, version)
@@ -101,7 +106,7 @@ class TraceCommand:
         if self.view is None:
             if self.beside is not None:
                 raise ConfigError(
-                    "is shown in a file", where="--beside", remedy="name it with --view FILE"
+                    "needs a file to write to", where="--beside", remedy="give --view FILE"
                 )
             return
         from restock.train.view.view import check_view
@@ -109,14 +114,14 @@ class TraceCommand:
         check_view(self.view)
         if self.row is None:
             raise ConfigError(
-                "a moment is around one row: which?",
+                "needs one row",
                 where="--view",
-                remedy=f"name the ROW; `restock trace {self.place}` lists some of a run",
+                remedy=f"give ROW; for a run, `restock trace {self.place}` lists some rows",
             )
         for name in ("before", "after"):
             if not 0 <= getattr(self, name) <= 3600:
                 raise ConfigError(
-                    f"is {getattr(self, name):g} s: give 0 to 3600 s", where=f"--{name}"
+                    f"must be from 0 to 3600 s, got {getattr(self, name):g} s", where=f"--{name}"
                 )
 
     def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
@@ -174,10 +179,10 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
     from restock.cli import output
 
     _section("its row of the store", {**origin.store, **origin.transition})
-    _section("what its reward is made of", origin.reward_parts)
+    _section("terms of its reward", origin.reward_parts)
     manifest = origin.recording or {}
     _section("its recording", {k: v for k, v in manifest.items() if k not in _TABLES})
-    _section("when it was", origin.moment)
+    _section("when it happened", origin.moment)
     if origin.frames:
         files = list(dict.fromkeys(frame["file"] for frame in origin.frames))
         output.print_table(
@@ -210,7 +215,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
                 }
                 for message in origin.messages
             ],
-            title="the messages it was made of",
+            title="the messages from which it was made",
         )
     elif origin.topics:
         columns = [
@@ -219,7 +224,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
         output.print_table(origin.topics, columns, title="topics that were read")
         if not with_messages:
             file = origin.transition["source_file"]
-            output.say(f"--recording {file} shows the messages that it was made of")
+            output.say(f"--recording {file} shows the messages from which it was made")
 
 
 def _print_view(written: dict[str, Any]) -> None:

@@ -29,29 +29,29 @@ class TrainCommand:
     """
 
     out: Path | None = None
-    """Directory of the new run; it must not exist yet."""
+    """Directory of the new run. It must not exist yet."""
     panel: Path | None = None
-    """Panel from `restock mix`. Without one, training is online only."""
+    """A panel from `restock mix`. Without one, training is online only."""
     config: Path | None = None
-    """TOML with any of the config's keys (docs/train.md)."""
+    """A TOML file with any of the config's keys (docs/train.md)."""
     set: Annotated[list[str], tyro.conf.UseAppendAction] = field(default_factory=list)
-    """One key of the config, e.g. --set optimizer.learning_rate=1e-4; may be repeated."""
+    """Set one key of the config, e.g. --set optimizer.learning_rate=1e-4. May be repeated."""
     resume: Path | None = None
     """Continue this run from its latest checkpoint."""
     from_env_steps: int | None = None
-    """With --resume: from the earlier checkpoint that was taken after so many environment steps
-    (record.keep_checkpoints says how many are kept); what came after it is discarded."""
+    """With --resume: continue from the checkpoint taken after N environment steps
+    (record.keep_checkpoints sets how many are kept). Everything after it is discarded."""
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
-    """Stop after this much training time, if the budget is not spent before (schedule.seconds)."""
+    """Stop after this training time, even if the step budget is not used up (schedule.seconds)."""
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
     """Device of the network."""
     flush_fresh: Path | None = None
-    """Put the twin's labelled episodes in this store at the end, as a recording of format `twin`.
-    They are kept in the run's directory as soon as this is given."""
+    """At the end, write the twin's labelled episodes to this store, as a recording of format
+    `twin`. Until then they are kept in the run's directory."""
     dry_run: bool = False
     """Check everything and print the resolved config; write nothing."""
     json: bool = False
@@ -74,17 +74,15 @@ class TrainCommand:
         if self.resume is not None:
             if self.out or self.panel or self.config or self.set or self.seed is not None:
                 raise RestockError(
-                    "--resume goes on with the run's own panel, config and seed",
-                    remedy="give only --env-steps, --seconds or --device beside it",
+                    "--resume continues with the run's own panel, config and seed",
+                    remedy="with --resume, give only --env-steps, --seconds or --device",
                 )
             prepared = prepare_resumed(self.resume, overrides, self.from_env_steps)
         else:
             if self.from_env_steps is not None:
-                raise RestockError("--from-env-steps goes with --resume RUN")
+                raise RestockError("--from-env-steps needs --resume RUN")
             if self.out is None:
-                raise RestockError(
-                    "where should the run be written?", remedy="give --out RUN (or --resume RUN)"
-                )
+                raise RestockError("no --out given", remedy="give --out RUN (or --resume RUN)")
             prepared = prepare_new(self.out, self.panel, self.config, overrides)
         if self.dry_run:
             print_json(prepared.document)

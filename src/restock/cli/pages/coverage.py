@@ -12,11 +12,12 @@ import tyro
 
 @dataclass
 class CoverageCommand:
-    """What does a store hold of each condition, where, when and by whom, and what is missing?
+    """Show how much of each condition a store holds, where, when and by which driver, and what is
+    missing.
 
-    Prints the shelves: rows, episodes and success of each condition. With --out it writes one page:
-    shelves, what to log next (as `restock gaps`), weeks, robots, the map, and what has changed
-    about which robot (as `restock drift`).
+    Prints the rows, episodes and success of each condition. With --out, it writes one page: the
+    conditions, what to log next (as `restock gaps`), weeks, robots, the map, and which robots have
+    changed (as `restock drift`).
 
         restock coverage store/
         restock coverage store/ --out coverage.html
@@ -25,17 +26,19 @@ class CoverageCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write a page (HTML) that opens without a network. Replaces what is there."""
+    """Write an HTML page that opens without a network. Replaces an existing file."""
     figures: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """With --out: a folder for each figure of the page, as SVG and PNG."""
+    """With --out: also write each figure of the page as SVG and PNG into this folder."""
     mixture: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = "coverage"
-    """What should be there: a mixture's shares of its planned draws. See docs/mixture.md."""
+    """The mixture whose planned draws say how much is needed of each stratum. See
+    docs/mixture.md."""
     every: str = "week"
-    """Of drift: the length of a period: day, week, month, year or decade."""
+    """The length of a period for drift: day, week, month, year or decade."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     json: bool = False
-    """Print the shelves as JSON, one object a condition."""
+    """Print the table as JSON, one object per condition."""
 
     def run(self) -> None:
         """Ask, print, and write the page."""
@@ -46,7 +49,7 @@ class CoverageCommand:
 
         if self.figures is not None and self.out is None:
             raise ConfigError(
-                "are of the page", where="--figures", remedy="name the page with --out FILE"
+                "applies only to the page", where="--figures", remedy="give --out FILE, too"
             )
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
@@ -57,7 +60,7 @@ class CoverageCommand:
         if self.json:
             output.print_json(rows)
         else:
-            output.print_table([_line(row) for row in rows], title="the shelves")
+            output.print_table([_line(row) for row in rows], title="rows by condition")
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import ConfigError, RestockError

@@ -16,29 +16,30 @@ from restock.cli.output import print_json, progress
 class ReportCommand:
     """Write one self-contained HTML page about a run; it opens without a network.
 
-    What the critic was fed (intended, drawn and available share per stratum, ages, behaviour
-    policies), learning curves, TD error by condition, target lag, success per condition with
-    intervals against planner and random (run `restock eval RUN` first), a map of the logs'
-    positions and of the agent's failures, and the provenance of all of it.
+    The page shows what the critic was fed (intended, drawn and available share per stratum, ages,
+    behaviour policies), learning curves, TD error by condition, target lag, success per condition
+    with intervals beside the planner and a random policy (run `restock eval RUN` first), a map of
+    the logs' positions and the agent's failures, and the provenance of the data.
 
-    A gap between twin and logs that `restock twin gap` measured into RUN/gap, or into the gap
-    folder of the panel's store, is a section of it. Of a STORE the page is about its gap alone,
-    and is STORE/gap/index.html.
+    A gap between twin and logs that `restock twin gap` wrote to RUN/gap, or to the folder `gap` of
+    the panel's store, is shown in a section. For a STORE, the page shows only its gap, and is
+    STORE/gap/index.html.
 
-    With --card instead the replay card: what the critic was fed on one page of Markdown, on
-    stdout, and as RUN/replay_card.md and RUN/replay_card.json.
+    With --card, it writes the replay card instead: what the critic was fed, on one page of
+    Markdown, to stdout, RUN/replay_card.md and RUN/replay_card.json.
 
     Example: `restock report runs/a`
     """
 
     run_directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The directory that `restock train --out` wrote; or a store, for its gap alone."""
+    """The directory that `restock train --out` wrote; or a store, for a page about its gap only."""
     out: Path | None = None
-    """Where to write the page; default RUN/report.html. Replaces what is there."""
+    """Where to write the page. Default: RUN/report.html. Replaces an existing file."""
     figures: Path | None = None
-    """A folder for each figure of the page, as SVG and PNG. Replaces those of the same names."""
+    """Also write each figure of the page as SVG and PNG into this folder. Replaces files of the
+    same names."""
     card: bool = False
-    """The replay card instead of the page."""
+    """Write the replay card instead of the page."""
     json: bool = False
     """Print {"report": PATH, "bytes": N} instead of the path; with --card, the card as JSON."""
 
@@ -53,7 +54,8 @@ class ReportCommand:
             for flag, path in (("--out", self.out), ("--figures", self.figures)):
                 if path is not None:
                     raise ConfigError(
-                        "is of the page: a card is written beside the run's metrics", where=flag
+                        "applies only to the page: the card is written to the run's directory",
+                        where=flag,
                     )
             card, markdown = write_card(self.run_directory)
             if self.json:

@@ -16,14 +16,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class CheckCommand:
-    """Audit a store, hold it against the last one, and the last run against a baseline: exit 1
-    where one of them fails.
+    """Audit a store, and compare it and a run with earlier ones: exit 1 if a check fails.
 
     It is `restock audit`, `restock diff` and `restock eval --baseline` in one, for a team's
-    continuous integration: as JUnit XML for its test view, as Markdown for its page. An audit of
-    severity error fails, and so do recordings or episodes that were lost, a condition in which
-    the run is worse than the baseline, and what cannot be compared. It only reads. docs/ci.md has a
-    workflow to copy.
+    continuous integration: as JUnit XML for its test view, as Markdown for its page. What fails: an
+    audit of severity error, recordings or episodes that were lost, a condition in which the run is
+    worse than the baseline, and a comparison that is not possible. The command only reads.
+    docs/ci.md has a workflow to copy.
 
     Example: `restock check store/ --against store@41 --run runs/a --baseline nightly`
     """
@@ -31,23 +30,25 @@ class CheckCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     against: Annotated[str | None, tyro.conf.arg(metavar="OLD")] = None
-    """The last store, or its last version (store@41): what was there must be there still."""
+    """The earlier store, or an earlier version (store@41): everything it held must still be
+    there."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """A run that was evaluated (`restock eval`): audited too, and held against --baseline."""
+    """A run that was evaluated (`restock eval`): it is audited, too, and compared with
+    --baseline."""
     baseline: Annotated[str | None, tyro.conf.arg(metavar="RUN|NAME")] = None
-    """What the run must not be worse than: another run, or a saved baseline's name or file."""
+    """The run must not be worse than this: another run, or a saved baseline's name or file."""
     margin: float = 0.05
-    """A success lower by more than this, with the interval below 0, is worse."""
+    """The run is worse where its success is lower by more than this, with the interval below 0."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of your own audits (*.sql), as `restock audit` takes it."""
+    """A folder of your own audits (*.sql), as for `restock audit`."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A TOML file with thresholds of audits in place of the shipped ones."""
+    """A TOML file with thresholds of audits that replace the shipped ones."""
     strict: bool = False
-    """Let warnings fail, too."""
+    """Warnings fail, too."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Write JUnit XML: a suite each of audits, difference and regression."""
+    """Write JUnit XML: one suite each for audits, difference and regression."""
     summary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Add the Markdown summary to this file, as $GITHUB_STEP_SUMMARY wants it."""
+    """Append a Markdown summary to this file, for example $GITHUB_STEP_SUMMARY."""
     json: bool = False
     """Print {"store", "failed", "checks": [{"part", "check", "status", "rows", …}]}."""
 
@@ -59,7 +60,9 @@ class CheckCommand:
         from restock.replay.store.audit import junit_suites
 
         if self.baseline is not None and self.run_dir is None:
-            raise ConfigError("is of a run", where="--baseline", remedy="give --run RUN too")
+            raise ConfigError(
+                "applies only to a run", where="--baseline", remedy="also give --run RUN"
+            )
         parts = self._parts()
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = sum(one.status in failing for part in parts for one in part.findings)

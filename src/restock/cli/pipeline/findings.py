@@ -50,43 +50,44 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
         _finding(
             "recordings_lost",
             "error",
-            f"Recordings that {old} has and this store has not",
+            f"Recordings that are in {old} but not in this store",
             "ingest them again, or compare with a store without them",
             gone,
         ),
         _finding(
             "episodes_lost",
             "error",
-            f"Episodes that {old} has, of recordings that both have",
-            "find out what changed on the way: profile, conditions, or a damaged recording",
+            f"Episodes that are in {old} but not in this store, of recordings that are in both",
+            "find out what changed: the profile, the conditions, or a damaged recording",
             lost,
         ),
         _finding(
             "definitions_changed",
             "warning",
-            "Conditions, labels or profiles that are defined otherwise than before",
-            "where it was not meant, go back to the old ones and ingest again",
+            "Conditions, labels or profiles with changed definitions",
+            "if this was not intended, restore the old ones and ingest again",
             [row for row in document["definitions"] if row["what"] != "restock_version"],
         ),
         _finding(
             "labels_changed",
             "warning",
-            "Rows whose condition is another one than before",
-            "`restock diff` shows them whole; `restock label STORE --review` asks a person",
+            "Rows whose condition changed",
+            "`restock diff` shows all of them; `restock label STORE --review` lets a person check "
+            "labels",
             labels,
         ),
         _finding(
             "signals_shifted",
             "warning",
             "Signals whose mean over episodes shifted (false discovery rate 5 %)",
-            "`restock drift` says which robot, week and part",
+            "`restock drift` shows which robot, week and part",
             shifted(document["signals"]["shifts"]),
         ),
         _finding(
             "recordings_new",
             "info",
-            "Recordings that came, or were written again",
-            "nothing: this is what the difference is made of",
+            "Recordings that were added, or written again",
+            "nothing to do: these recordings explain the differences",
             [row for row in recordings if row["change"] != "out"],
         ),
     ]
@@ -105,7 +106,7 @@ def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Find
                 f"{row['perturbation']}.{row['condition']}",
                 severity,
                 told,
-                row["reason"] or "`restock compare` and `restock diagnose` say why",
+                row["reason"] or "`restock compare` and `restock diagnose` help to find out why",
                 [shown] if bad else [],
             )
         )
@@ -115,7 +116,9 @@ def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Find
 def refused(name: str, error: RestockError) -> list[Finding]:
     """What could not be looked at, as a failure: a pipeline must not pass over it."""
     row = {"what": error.what, "where": error.where or ""}
-    return [_finding(name, "error", error.what, error.remedy or "mend it, or leave it out", [row])]
+    return [
+        _finding(name, "error", error.what, error.remedy or "correct it, or leave it out", [row])
+    ]
 
 
 def _finding(

@@ -16,27 +16,28 @@ if TYPE_CHECKING:
 class NodeCommand:
     """Run an exported policy on a robot, as a ROS 2 lifecycle node.
 
-    It starts unconfigured, and in shadow mode: it says what it would drive and commands nothing.
-    `ros2 lifecycle set /restock_policy configure`, then `activate`; or --activate. Parameters of
-    ROS follow --ros-args. With --on it needs no ROS: a recording is played to it, and what it would
-    have done is counted. See docs/deploy.md.
+    It starts unconfigured and in shadow mode: it reports the commands it would send, and sends
+    none. `ros2 lifecycle set /restock_policy configure`, then `activate`; or --activate. ROS
+    parameters follow --ros-args. With --on, ROS is not needed: a recording is played to the policy,
+    and its decisions are counted. See docs/deploy.md.
 
     Example: `restock node policy.onnx --activate --ros-args -p use_sim_time:=true`
     """
 
     policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY.onnx")]
-    """What `restock export RUN --to onnx` wrote."""
+    """The policy file that `restock export RUN --to onnx` wrote."""
     drive: bool = False
-    """Publish commands: the parameter shadow is then false."""
+    """Publish commands: sets the parameter shadow to false."""
     activate: bool = False
     """Configure and activate at once, without a lifecycle manager."""
     on: Annotated[Path | None, tyro.conf.arg(metavar="RECORDING")] = None
-    """Play this recording to the policy instead, behind its limiter, and print what came of it."""
+    """Instead of starting a node, play this recording to the policy with its limiter, and print the
+    results."""
     profile: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """With --on: a profile in place of the one that the policy carries."""
+    """With --on: use this profile instead of the one in the policy file."""
     write_profile: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
-    """Write the policy's profile, with what the node publishes as columns: for ingesting
-    recordings in which it ran."""
+    """Write the policy's profile with extra columns for the topics that the node publishes, to
+    ingest recordings of drives with this policy."""
 
     def run(self) -> int:
         from restock.errors import ConfigError
@@ -46,9 +47,9 @@ class NodeCommand:
             return self._play(self.on)
         if self.profile is not None and self.write_profile is None:
             raise ConfigError(
-                "only goes with --on and --write-profile",
+                "applies only to --on and --write-profile",
                 where="--profile",
-                remedy="to the node give it as a parameter: --ros-args -p profile:=FILE",
+                remedy="for the node, give it as a parameter: --ros-args -p profile:=FILE",
             )
         if self.write_profile is not None:
             return self._write(PolicyFile(self.policy, self.profile).profile, self.write_profile)

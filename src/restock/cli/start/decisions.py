@@ -53,9 +53,9 @@ def several_kinds(kinds: list[Any], out: Path) -> Stop:
         for kind, folder in zip(kinds, folders, strict=True)
     ]
     return Stop(
-        f"these are recordings of {len(kinds)} kinds of robots, and a profile is of one:"
-        f" {' | '.join(told)}",
-        (*calls, f"or add --accept: what is not of the first kind is left out of {out}"),
+        f"these are recordings of {len(kinds)} kinds of robots, but a profile describes one kind: "
+        f"{' | '.join(told)}",
+        (*calls, f"or add --accept: recordings of the other kinds are left out of {out}"),
     )
 
 
@@ -171,7 +171,7 @@ def robot_line(profile: Path | str | None) -> str:
 
     robot = None if profile is None else load_profile(str(profile)).robot
     if robot is None:
-        return "the twin's own, as nothing describes this one: --urdf FILE would"
+        return "the twin's default robot, as nothing describes yours: give --urdf FILE"
     told = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
     untold = []
     for key, name, unit in (
@@ -184,7 +184,7 @@ def robot_line(profile: Path | str | None) -> str:
         else:
             told.append(f"{name} {value:g} {unit} (from {robot.origin.get(key, 'the profile')})")
     if untold:
-        told.append(f"{', '.join(untold)} guessed by its outline: --urdf FILE would tell")
+        told.append(f"{', '.join(untold)} guessed from its outline: give --urdf FILE")
     return ", ".join(told)
 
 

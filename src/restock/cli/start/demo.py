@@ -33,32 +33,35 @@ LAST_LINES = 20  # of what a command beside another says, where it fails
 
 @dataclass
 class DemoCommand:
-    """Run every stage on sample_logs/, explain each, and end with what came of it and a report.
+    """Run every stage on sample_logs/, explain each one, and end with the results and a report.
 
-    Takes recordings through info, ingest, sql, audit, mix, train, eval and report: about five
-    minutes on two cores. Every stage shows its command, so that you can run it on
-    your own recordings. At the end stand the policy before and after fine-tuning, one that was fed
-    uniformly, the shelves before and after mixing, and one rare event from its message to an
-    update.
+    Runs info, ingest, sql, audit, mix, train, eval and report on the recordings: about five minutes
+    on two cores. Every stage shows its command, so that you can run it on your own recordings. The
+    results compare the policy before and after fine-tuning with one that was fed uniformly, show
+    the shares of conditions before and after mixing, and follow one rare event from its message to
+    an update.
 
     Example: `restock demo --out build/demo`
     """
 
     out: Path = Path("restock-demo")
-    """Where store, panel, run and report go. What an earlier demo left there is replaced."""
+    """The folder for store, panel, run and report. The output of an earlier demo there is
+    replaced."""
     logs: Path | None = None
-    """Recordings to use; default sample_logs/ of the source tree, else newly recorded ones."""
+    """Recordings to use. Default: sample_logs/ of the source tree; if it is missing, the demo
+    records some."""
     profile: str | None = None
-    """How their topics become signals: a profile that comes with Restock, or a TOML file. Default:
-    that of the simulated robot (`restock start` proposes one for another robot)."""
+    """How topics become signals: the name of a shipped profile, or a TOML file. Default: the
+    profile of the simulated robot (`restock start` proposes one for another robot)."""
     seconds: float = 200.0
-    """How long to train: two policies at the same time, by quotas and uniformly fed."""
+    """Training time in seconds. Two policies train at the same time: one fed by quotas, one fed
+    uniformly."""
     episodes: int = 20
-    """Evaluation episodes per kind, policy and perturbation."""
+    """Evaluation episodes per kind of episode, policy and perturbation."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network trains."""
     dry_run: bool = False
-    """Print the commands that would run, and run none."""
+    """Print the commands that would run; run nothing."""
     json: bool = False
     """At the end, print {"report", "store", "panel", "run"} as JSON."""
 
@@ -71,7 +74,7 @@ class DemoCommand:
         if logs is None:
             logs = self.out / "logs"
             record = ["record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
-            why = "This installation has no sample recordings: a simulated robot drives some."
+            why = "This installation has no sample recordings: a simulated robot records some."
             plan.append(Stage("record", "Record", why, record))
         to = Settings(
             logs=(str(logs),),
@@ -139,7 +142,7 @@ def tell(to: Settings, console: Console) -> None:
         )
         print_table(rows)
         console.print(story.trained(to))
-    show("The shelves, before and after mixing", story.shelves(to.panel))
+    show("Shares of conditions, before and after mixing", story.shelves(to.panel))
     show("One rare event, from its message to an update", story.rare_event(to))
     show("What to try next", story.next_steps(to))
 
@@ -173,7 +176,7 @@ def run_demo(
         if stage.decided is not None:
             command = stage.decided()
             if command is None:
-                say("[dim]They have: nothing is to be done.[/dim]")
+                say("[dim]They already have: nothing to do.[/dim]")
                 continue
             stage = replace(stage, command=command)
         say(f"[cyan]$ {escape(stage.line())}[/cyan]\n")
@@ -246,15 +249,15 @@ def prepare(out: Path, given: Sequence[Path] = ()) -> None:
             out.resolve()
         ):
             raise RestockError(
-                f"lies inside --out {out}, which the demo replaces",
+                f"is inside --out {out}, which the demo replaces",
                 where=str(path),
-                remedy="give another --out",
+                remedy="choose another --out",
             )
     if out.exists() and not (out / MARKER).exists() and (not out.is_dir() or any(out.iterdir())):
         raise RestockError(
-            "already exists, and not from a demo",
+            "already exists, and was not made by a demo",
             where=str(out),
-            remedy="give another --out",
+            remedy="choose another --out",
         )
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)

@@ -9,8 +9,8 @@ from restock.cli.start.stage import Document
 from restock.stats import interval_text
 
 ESTIMATORS = (
-    ("logged", "as it was driven"),
-    ("fqe", "the policy by a fitted model (fqe)"),
+    ("logged", "as the logs were driven"),
+    ("fqe", "the policy, by a fitted model (fqe)"),
     ("pdwis", "by importance weights (pdwis)"),
     ("wdr", "by both (wdr)"),
 )
@@ -77,7 +77,7 @@ def ingest(document: Document) -> list[str]:
     }
     if unknown:
         why = ", ".join(dict.fromkeys(unknown.values()))
-        lines.append(f"unknown of some or all rows ({why}): {', '.join(unknown)}")
+        lines.append(f"unknown for some or all rows ({why}): {', '.join(unknown)}")
     if dropped:
         worst = sorted(dropped.items(), key=lambda item: -item[1])[:3]
         lines.append(f"ticks left out: {', '.join(f'{why} {n:,}' for why, n in worst)}")
@@ -100,7 +100,7 @@ def coverage(document: Document) -> list[str]:
     unknown = [row["condition"] for row in rows if row["rows"] is None]
     lines = [f"rows: {', '.join(held)}"]
     lines += [f"no row of {', '.join(none)}"] if none else []
-    return lines + ([f"unknown, for want of a signal: {', '.join(unknown)}"] if unknown else [])
+    return lines + ([f"unknown, as a signal is missing: {', '.join(unknown)}"] if unknown else [])
 
 
 def audit(document: Document) -> list[str]:
@@ -112,7 +112,7 @@ def audit(document: Document) -> list[str]:
             lines.append(f"{len(found)} {word}: {', '.join(item['audit'] for item in found)}")
         if status == "fail":
             lines += [f"{item['audit']}: {item['doc']}" for item in found]
-    return [*lines, "`restock audit STORE` says what each means"] if lines else ["all passed"]
+    return [*lines, "`restock audit STORE` explains each one"] if lines else ["all passed"]
 
 
 def mix(document: Document) -> list[str]:
@@ -120,11 +120,13 @@ def mix(document: Document) -> list[str]:
     short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
     lines = [f"panel {document['id']}: {count(document['rows'], 'row')} to learn from"]
     if held := document["evaluation_split"]["rows"]:
-        lines[0] += f", {held:,} held out to judge by"
+        lines[0] += f", {held:,} held out for evaluation"
     if note := document["evaluation_split"]["note"]:
         lines.append(f"held out: {note}")
     if short:
-        lines.append(f"fewer rows than asked for of {', '.join(short)}: more logs or the twin help")
+        lines.append(
+            f"fewer rows than wanted of {', '.join(short)}: more logs or the twin would help"
+        )
     return lines
 
 
@@ -150,7 +152,7 @@ def fit(document: Document) -> list[str]:
     untold = [item["name"] for item in first["estimates"] if not item["fitted"]]
     lines = [f"fitted: {', '.join(told) or 'nothing'}"]
     if untold:
-        lines.append(f"not told by these logs: {', '.join(untold)}")
+        lines.append(f"not identified by these logs: {', '.join(untold)}")
     return lines
 
 
@@ -229,8 +231,8 @@ def on_logs(document: Document) -> list[str]:
         why = next((row["refused"] for row in own.values() if row["refused"]), None)
         if why:
             lines.append(
-                f"refused: {why}. So nothing says whether the policy is better than how these logs"
-                " were driven: a fitted model's word alone is no evidence"
+                f"refused: {why}. So it is not known whether the policy is better than the logs' "
+                "drivers: a fitted model alone is no evidence"
             )
     return lines + list(document["notes"])
 

@@ -50,7 +50,8 @@ def check(to: Settings, recording: str) -> Stage:
     return Stage(
         "check",
         "Does the profile fit?",
-        "A dry run of one recording: what is used, what is missing, what would come of it.",
+        "A dry run of one recording: what is used, what is missing, and how many transitions "
+        "would result.",
         ["profile", "check", str(to.profile), recording, *to.reading],
         reads=to.profile_file,
         outcome=outcomes.check,
@@ -62,9 +63,9 @@ def ingest(to: Settings) -> Stage:
     return Stage(
         "ingest",
         "Recordings to labelled transitions",
-        "Topics become steps of the control clock (held causally, never interpolated), steps"
-        " become observation, action and reward, and SQL labels each with its conditions."
-        " Where recordings contain the true condition, the labels are scored.",
+        "Topics become steps of the control clock (held causally, never interpolated). Steps "
+        "become observations, actions and rewards, and SQL labels each step with its conditions."
+        " If recordings contain the true condition, the labels are scored.",
         [
             *("ingest", *to.logs, "--store", str(to.store)),
             *(*to.with_profile, *to.reading, *tags),
@@ -80,9 +81,9 @@ def ingest(to: Settings) -> Stage:
 def coverage(to: Settings) -> Stage:
     return Stage(
         "coverage",
-        "What is on each shelf?",
-        "Hours of the easy aisle, seconds of the wet floor: the store is plain Parquet, and"
-        " the question is plain SQL.",
+        "What do the logs cover?",
+        "Hours of the easy aisle, seconds of the wet floor: the store is plain Parquet, and the "
+        "query is plain SQL.",
         ["sql", str(to.store), COVERAGE],
         outcome=outcomes.coverage,
     )
@@ -96,7 +97,7 @@ def audit(to: Settings) -> Stage:
         " stops you here.",
         ["audit", str(to.store)],
         expected=(0, 1),
-        remark="an audit failed: a pipeline would stop here, the demo goes on",
+        remark="an audit failed: a pipeline would stop here, the demo continues",
         outcome=outcomes.audit,
     )
 
@@ -105,9 +106,9 @@ def mix(to: Settings) -> Stage:
     return Stage(
         "mix",
         "A replay panel that keeps the rare conditions in stock",
-        "Each shelf has the whole episodes that met its condition. Natural, wanted, drawn and"
-        " after weights stand side by side, and what is missing is told in rows and hours of"
-        " logging; the result is a pinned panel with an id.",
+        "Each stratum holds the whole episodes that met its condition. Its natural, wanted and "
+        "drawn shares and the share after weights are shown side by side, and missing data is "
+        "given in rows and hours of logging. The result is a pinned panel with an id.",
         ["mix", str(to.store), "--mixture", to.mixture, "--out", str(to.panel)],
         reads=to.mixture_file,
         writes=(to.panel,),
@@ -120,7 +121,7 @@ def mix_uniform(to: Settings) -> Stage:
     return Stage(
         "mix-uniform",
         "The same logs as they are, to compare with",
-        "Every row with the same probability: shelves only keep the books.",
+        "Every row has the same probability; strata are only used for the statistics.",
         ["mix", str(to.store), "--mixture", "uniform", "--out", str(to.uniform_panel)],
         writes=(to.uniform_panel,),
     )
@@ -133,7 +134,8 @@ def floor(to: Settings) -> Stage:
     return Stage(
         "floor",
         "The floor, as the recordings show it",
-        "The map of the recordings, else their scans, else the way that was driven.",
+        "Made from the map in the recordings, else from their scans, else from the path that was "
+        "driven.",
         [
             *("twin", "layout", "--from", str(to.store), *given, *to.with_definitions),
             *("--out", str(to.floor), "--png", str(picture)),
@@ -150,8 +152,8 @@ def fit(to: Settings, horizon_s: float) -> Stage:
     return Stage(
         "fit",
         "The twin's robot, fitted to these logs",
-        "The logged commands are driven again in the twin, and its parameters sought under which"
-        " it moves as the robot did.",
+        "The logged commands are driven again in the twin, to find the parameters with which it "
+        "moves as the robot did.",
         ["twin", "fit", str(to.store), "--out", str(to.fitted), *few],
         writes=(to.fitted,),
         outcome=outcomes.fit,
@@ -164,8 +166,8 @@ def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
     folder = to.store / "gap"
     return Stage(
         "gap",
-        "Is the twin worth trusting?",
-        "How far the twin ends from the log when it is driven by the logged commands.",
+        "Can the twin be trusted?",
+        "How far from the log the twin ends when it drives the logged commands.",
         ["twin", "gap", str(to.store), *calibrated, "--out", str(folder), *horizons, "--most=100"],
         writes=(folder,),
         outcome=outcomes.gap,
@@ -179,9 +181,10 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
         "Train: first on the panel, then online in the twin"
         if twin
         else "Train on the logs alone, without a twin",
-        f"About {to.seconds:.0f} s of double DQN. Half of each batch comes from the logs by"
-        " quotas, half is fresh, of missions that go wrong more often. Q chooses among what"
-        " the twin's operator finds plausible. Every row the critic is fed is recorded.",
+        f"About {to.seconds:.0f} s of double DQN. Half of each batch comes from the logs by "
+        "quotas; half is fresh, from missions that go wrong more often. The policy chooses by Q "
+        "among actions that the twin's operator finds plausible. Every row that the critic is fed "
+        "is recorded.",
         [
             *("train", "--panel", str(to.panel), "--out", str(to.run)),
             *(("--seconds", f"{to.seconds:g}") if twin else ()),
@@ -201,10 +204,10 @@ def train_beside_uniform(to: Settings) -> Stage:
     return replace(
         fed,
         title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
-        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed."
-        " Half of each batch comes from the logs, of the first by quotas, of the other uniformly;"
-        " half is fresh, of missions that go wrong more often. Q chooses among what the twin's"
-        " operator finds plausible. Every row is recorded.",
+        why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed. "
+        "Half of each batch comes from the logs: by quotas in the first, uniformly in the "
+        "other. Half is fresh, from missions that go wrong more often. The policy chooses by "
+        "Q among actions that the twin's operator finds plausible. Every row is recorded.",
         beside=(
             *("train", "--panel", str(to.uniform_panel), "--out", str(to.uniform)),
             *("--seconds", f"{to.seconds:g}", "--device", to.device),
@@ -235,7 +238,7 @@ def even_out(to: Settings) -> Stage:
     return Stage(
         "even-out",
         "As many steps for both",
-        "The one that has driven less goes on until both have made the same number of steps.",
+        "The one that has driven less continues until both have made the same number of steps.",
         ["train", "--resume", str(to.uniform), "--env-steps", "AS_THE_OTHER"],
         shows_progress=True,
         decided=decided,
@@ -308,7 +311,7 @@ def evaluate_on_ways(to: Settings) -> Stage:
     """Driven on the ways that robots really drove, where the floor is that of the logs."""
     return Stage(
         "ways",
-        "Evaluate on the ways of the logs",
+        "Evaluate on the routes of the logs",
         "Start and goal of the logged episodes that the panel holds out.",
         [
             *("eval", str(to.run), "--episodes", str(to.episodes), "--missions", "logged"),
@@ -323,7 +326,7 @@ def judge(to: Settings) -> Stage:
     """Off-policy: what the policy is worth by logs that it did not learn from."""
     return Stage(
         "judge",
-        "What is it worth by the logs alone, beside how they were driven?",
+        "How good is the policy, by the logs alone, compared with their drivers?",
         "Off-policy evaluation on episodes that the panel holds out.",
         ["eval", str(to.run), "--on-logs", "own"],
         outcome=outcomes.on_logs,
@@ -334,8 +337,8 @@ def judge(to: Settings) -> Stage:
 def report(to: Settings) -> Stage:
     return Stage(
         "report",
-        "One page with all of it",
-        "What it was fed, what it learnt, where it fails.",
+        "One page with all results",
+        "What the policy was fed, what it learned, and where it fails.",
         ["report", str(to.run)],
         writes=(to.run / "report.html",),
     )

@@ -23,17 +23,16 @@ ODOMETRY = "--odometry-as-command"
 
 @dataclass
 class StartCommand:
-    """From recordings of a robot to a policy for it and a report, in one command.
+    """Make a policy and a report from recordings of a robot, in one command.
 
-    Proposes a profile (OUT/profile.toml), checks it, ingests, shows the coverage, mixes a panel,
-    makes the floor, fits the twin, measures whether it may be trusted, trains, evaluates and
-    reports. Each stage prints the command that it is, what came of it, and its file. Where the twin
-    is not to be trusted, a policy is trained on the logs alone, and judged on logs that it did not
-    learn from.
+    It proposes a profile (OUT/profile.toml), checks it, ingests, shows the coverage, mixes a panel,
+    makes the floor, fits the twin, measures whether the twin can be trusted, trains, evaluates and
+    reports. Each stage prints its command, its result and its files. If the twin cannot be trusted,
+    a policy is trained on the logs alone, and evaluated on logs that it did not learn from.
 
-    Run the same command again after an edit of OUT/profile.toml or an interruption: stages that are
-    done and whose inputs are the same are not done again. Where a person must decide it stops, says
-    what to type, and exits with 3.
+    After an edit of OUT/profile.toml or an interruption, run the same command again: finished
+    stages whose inputs have not changed are skipped. If a person must decide something, it stops,
+    prints what to type, and exits with 3.
 
     Example: `restock start bags/ --out mine`
     """
@@ -41,43 +40,43 @@ class StartCommand:
     paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="BAG")]
     """Recordings of one kind of robot: files, bag folders, or folders of them."""
     out: Path
-    """Where everything goes: profile.toml, store, panel, run, and run/report.html."""
+    """The output folder: profile.toml, store, panel, run, and run/report.html."""
     profile: str | None = None
-    """A profile that is there already, in place of a proposed one."""
+    """Use this existing profile; do not propose one."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
-    """The robot's length and width in metres, as 0.6x0.5, for the proposal."""
+    """For the proposal: the robot's length and width in metres, for example 0.6x0.5."""
     urdf: Path | None = None
-    """The robot's URDF, for the proposal, in place of the recording's /robot_description."""
+    """For the proposal: the robot's URDF. It replaces the recording's /robot_description."""
     odometry_as_command: bool = False
-    """Let the proposal take odometry for commands where none was recorded."""
+    """Let the proposal use odometry as the command if no command was recorded."""
     map: Path | None = None
-    """The map.yaml that the robot localised in, where the recordings do not hold their map."""
+    """The map.yaml in which the robot was localised, if the recordings do not contain the map."""
     salvage: bool = False
-    """Read what is intact of truncated or damaged recordings."""
+    """Also read what is intact in damaged or truncated recordings."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
-    """Whose drives the recordings are: robot, site, or any other name. May be given several
-    times."""
+    """A tag for the recordings: robot, site, or any other name. May be given several times."""
     typestore: str | None = None
-    """Distribution whose message definitions serve recordings without their own (humble)."""
+    """ROS 2 distribution whose message definitions are used for recordings without their own.
+    Default: humble."""
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg): definitions of a robot's own types,
-    for recordings that carry none."""
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
+    recordings that do not contain the definitions."""
     mixture: str = "coverage"
-    """What the learner is fed: a shipped mixture's name, or a TOML file."""
+    """The mixture that the learner is fed: the name of a shipped one, or a TOML file."""
     minutes: float = 5.0
-    """About how long all of it may take, on two cores, once the logs are ingested: half of it is
+    """About how long everything after ingest may take on two cores. Half of the time is
     training."""
     twin: Literal["auto", "yes", "no"] = "auto"
-    """Whether to train and evaluate in the twin: auto is where its gap to nominal driving is within
+    """Whether to train and evaluate in the twin. auto: only if its gap in nominal driving is within
     the limits of `restock twin gap`."""
     accept: bool = False
-    """Go on with the proposal as it is where it left a choice to a person."""
+    """Continue with the proposal as it is, even if it left a choice to a person."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the network trains."""
     dry_run: bool = False
-    """Print the commands that would run, and run none."""
+    """Print the commands that would run; run nothing."""
     json: bool = False
     """Print one JSON document at the end: {"stages": [{"name", "command", "status", "outcome",
     "files", "seconds", …}], "stopped", "report"}."""
@@ -136,7 +135,9 @@ class StartCommand:
             parse_tags(self.tag, empty=True)
         if self.out.exists() and not self.out.is_dir():
             raise ConfigError(
-                "is a file", where=str(self.out), remedy="name a folder with --out: it may be new"
+                "is a file",
+                where=str(self.out),
+                remedy="give a folder with --out: it need not exist",
             )
         from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.decoding.definitions import refuse_unknown
@@ -189,7 +190,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     from restock.cli.start.stage import Stop
     from restock.cli.start.work import escape
 
-    again = f"then run the same command again: what is done is kept in {asked.out}"
+    again = f"then run the same command again: finished stages are kept in {asked.out}"
     own = asked.profile is not None
     to = Settings(
         logs=asked.paths,
@@ -209,15 +210,15 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     readable = found.document.get("recordings", ())
     salvaging = "add --salvage to this command: it reads what is intact of damaged recordings"
     if not (found.good or readable):
-        known = "name a file, a bag's folder, or a folder of bags"
+        known = "give a file, a bag's folder, or a folder of bags"
         if any("cannot be read" in why for why in found.errors):
-            known = "what can be done for each is said above; or name other recordings"
+            known = "see the message for each above, or give other recordings"
         return Stop(
             "no recording can be read",
             (salvaging if any("--salvage" in why for why in found.errors) else known,),
         )
     if not found.good:
-        work.say(f"   going on with the {len(readable)} that can be read; or {salvaging}")
+        work.say(f"   continuing with the {len(readable)} that can be read; or {salvaging}")
     recording = fullest(found.document) or asked.paths[0]
 
     if not own and not edited(to.profile, asked.out):
@@ -233,14 +234,14 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
             Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
             return Stop(
                 "; ".join(proposed.document["problems"]),
-                ("name recordings of a robot on wheels",),
+                ("give recordings of a robot on wheels",),
             )
         if problems := proposed.document.get("problems"):
-            told = (f"edit {to.profile}: its first lines say what is missing", again)
+            told = (f"edit {to.profile}: its first lines list what is missing", again)
             if proposed.document.get("missing"):
                 told = (
-                    "name recordings that hold it; or, where a topic in these does,"
-                    f" edit {to.profile}, whose first lines list their topics",
+                    "give recordings that contain it; or, if a topic in these recordings does, "
+                    f"edit {to.profile}, whose first lines list the topics",
                     again,
                 )
             if any(ODOMETRY in problem for problem in problems):
@@ -251,18 +252,18 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         driving = proposed.document.get("commands", [])
         if driving and not asked.accept:
             return Stop(
-                f"several topics may be what drives the robot: {', '.join(driving)}; the first of"
-                " them was taken",
+                f"several topics may be the command that drives the robot: {', '.join(driving)}; "
+                "the profile uses the first",
                 (
                     f"edit `topic` of [inputs.command] in {to.profile}, and run the same command"
                     " again",
-                    "or add --accept to it, where the first one is right",
+                    "or add --accept to it, if the first one is right",
                 ),
             )
     elif asked.urdf is not None or asked.footprint is not None:
         work.say(
-            f"   [yellow]{escape(str(to.profile))} is a person's: --urdf and --footprint are for a"
-            " proposal, and change nothing[/]"
+            f"   [yellow]{escape(str(to.profile))} was edited: --urdf and --footprint apply only "
+            "to a proposed profile, and have no effect[/]"
         )
     if others := [] if own or work.plan else of_other_kinds(asked.out):
         mine = [row for row in readable if row["path"] not in others]
@@ -270,7 +271,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         recording = fullest({"recordings": mine}) or recording
     checked = work.do(stages.check(to, recording))
     if not checked.good:
-        known = "; where that is of another robot, name only the recordings of this one"
+        known = "; if it is of another robot, give only the recordings of this one"
         return Stop(
             f"the profile does not fit {recording}",
             (f"edit {to.profile}{known if len(readable) > 1 else ''}", again),
@@ -287,7 +288,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         return Stop(
             "the mixture does not fit these logs",
             (
-                "write one for them (docs/mixture.md), and add --mixture FILE to the command",
+                "write one that fits (docs/mixture.md), and add --mixture FILE to the command",
                 again,
             ),
         )
@@ -301,8 +302,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
                 f"{to.map} cannot be the floor of these recordings",
                 (
                     *(sized if any("--footprint" in why for why in floor.errors) else ()),
-                    "name the map.yaml that the robot localised in, or leave out --map: the floor"
-                    " is then that of the recordings",
+                    "give the map.yaml in which the robot was localised, or leave out --map: the "
+                    "floor is then made from the recordings",
                     again,
                 ),
             )
@@ -325,7 +326,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     to = replace(to, train=tuple(settings))
     trained = work.do(stages.train(to, twin=twin))
     if not trained.good:
-        return Stop("training did not come to its end", (*trained.errors[:2], again))
+        return Stop("training did not finish", (*trained.errors[:2], again))
     judged = []
     if twin:
         goal = has_goal(to.profile)
@@ -336,8 +337,8 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
         judged.append(work.do(stages.judge(to)))
     else:
         work.say(
-            "\n[yellow]These logs are too short to hold any of them out: nothing says what the"
-            " policy is worth. Ingest more.[/]"
+            "\n[yellow]These logs are too short to hold any of them out, so the policy cannot be "
+            "evaluated. Ingest more recordings.[/]"
         )
     reported = work.do(stages.report(to))
     if not reported.good:
@@ -345,7 +346,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     if failed := [ended for ended in judged if not ended.good]:
         why_failed = [one for ended in failed for one in ended.errors[:1]]
         names = " and ".join(f"`{ended.command}`" for ended in failed)
-        return Stop(f"the report is without what failed: {names}", (*why_failed, again))
+        return Stop(f"the report lacks the stages that failed: {names}", (*why_failed, again))
     return None
 
 

@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from restock.replay.trace.trace import Trace
 
 OPENING = """\
-Recordings of a robot in a warehouse become a policy. Most of such driving is
-an easy aisle; wet floor, blocked aisles and people who step out are rare, and
+Recordings of a robot in a warehouse become a policy. Most of the driving is in
+an easy aisle. Wet floors, blocked aisles and people who step out are rare, and
 a learner hardly sees them.
 
   1. Recordings become rows, each labelled with what happened at that moment.
-  2. Rare rows get shelves of their own; every batch is filled from all shelves.
+  2. Rare conditions get quotas, so that every batch contains all of them.
   3. A network learns from the logs alone: the policy before fine-tuning.
-  4. Another goes on in a simulation of the robot, the twin: the one after.
-  5. A third goes on as well, fed uniformly: with the logs as they are.
-  6. All drive the same missions as the scripted planner of the robot.
+  4. Another one continues in a simulation, the twin: the policy after it.
+  5. A third one continues, too, but is fed uniformly, with the logs as they are.
+  6. All drive the same missions as the robot's scripted planner.
 
-At the end: before and after, the shelves before and after, one rare event
-followed from the recording's message to the update that learnt from it, and
-what to try with your own recordings."""
+At the end you see the policies before and after, the shares of conditions
+before and after mixing, one rare event followed from the recording's message
+to the update that learned from it, and what to try with your own recordings."""
 
 _CELLS = 30  # of a bar of 100 %
 RARE = "all rare ones"
@@ -97,14 +97,14 @@ def trained(to: Settings) -> str:
     most = max(steps, default=0)
     lines = [f"Fine-tuned means {most:,} steps in the twin here; docs/learning.md has more."]
     if not most:
-        lines = ["Time was up before anything was driven: more --seconds fine-tune it."]
+        lines = ["The time was up before anything was driven: give more --seconds."]
     if to.uniform.is_dir():
         lines += [
             "Fed uniformly has the same network, settings and seed"
             + (", as many steps, and every" if most else ", and every"),
-            "row of the logs alike: what is compared are feeds, not methods, and so",
+            "row of the logs has the same probability. This compares feeds, not methods, so",
             f"`restock compare {to.uniform} {to.run}` refuses",
-            "(--treatment mixture says that feeds are meant). One seed each is one draw:",
+            "(unless --treatment mixture is given). One seed each is a sample of one:",
             "docs/evidence.md has ten.",
         ]
     return "\n".join(lines)
@@ -116,7 +116,7 @@ def shelves(panel: Path) -> list[str]:
 
     strata = Panel.open(panel).strata
     width = max(len(stratum.name) for stratum in strata)
-    lines = [f"{'shelf':<{width}}    rows  in the logs  in a batch"]
+    lines = [f"{'stratum':<{width}}    rows  in the logs  in a batch"]
     for stratum in strata:
         natural, drawn = (round(_CELLS * s) for s in (stratum.natural_share, stratum.share))
         bar = "█" * min(natural, drawn) + "▒" * (drawn - natural) + "·" * (natural - drawn)
@@ -124,7 +124,7 @@ def shelves(panel: Path) -> list[str]:
             f"{stratum.name:<{width}}  {stratum.rows:>6,}  {stratum.natural_share:>11.1%}"
             f"  {stratum.share:>10.1%}  {bar}".rstrip()
         )
-    return [*lines, "█ as before   ▒ added by its quota   · left out for it"]
+    return [*lines, "█ as in the logs   ▒ added by the quota   · removed by the quota"]
 
 
 def rare_event(to: Settings) -> list[str]:
@@ -189,11 +189,12 @@ def _told(trace: Trace, to: Settings) -> list[str]:
         *lines,
         f"row        {audit['transition_id']}, driven by the {audit['behaviour_policy']}",
         f"           labelled {audit['condition']}; reward {audit['reward']:.2f}{ended}",
-        f"shelf      {stratum.name}: {stratum.natural_share:.1%} of the logs,"
-        f" {stratum.share:.1%} of what is drawn of them",
-        f"           its episode's rows were drawn {drawn:,} times; all rows alike: {even:,.0f}",
+        f"stratum    {stratum.name}: {stratum.natural_share:.1%} of the logs,"
+        f" {stratum.share:.1%} of the draws from the logs",
+        f"           its episode's rows were drawn {drawn:,} times; with equal probability: "
+        f"{even:,.0f}",
         f"update     {audit['gradient_step']:,}, row {audit['batch_row']} of its batch",
-        f"           the critic expected {audit['q']:.2f}, its target said {target:.2f}",
+        f"           the critic predicted {audit['q']:.2f}, its target was {target:.2f}",
     ]
 
 
@@ -231,11 +232,11 @@ def next_steps(to: Settings) -> list[str]:
         "restock start BAG --out mine",
         "    the same stages on your own bag or MCAP file; it proposes how topics become signals",
         f'restock sql {store} "FROM coverage_by_condition"',
-        "    your questions, in SQL: docs/sql.md says what there is to ask",
+        "    your questions, in SQL: docs/sql.md lists tables and columns",
         f"restock gaps {store} --mixture coverage",
-        "    what the logs lack, and which missions would fill it",
+        "    what the logs lack, and which missions would fill the gaps",
         f"restock diagnose {run}",
-        "    where a critic fails: by what it was fed, or by its target?",
+        "    why a critic fails: because of what it was fed, or of its target?",
         "docs/tutorial.md, docs/your-robot.md",
         "    what replay and target do, cell by cell; your robot, from bags to a policy",
     ]

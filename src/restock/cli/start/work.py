@@ -69,9 +69,9 @@ class Work:
             self._known = read_json(record)
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise RestockError(
-                "already exists, and not from `restock start`",
+                "already exists, and was not made by `restock start`",
                 where=str(out),
-                remedy="give another --out",
+                remedy="choose another --out",
             )
         (out / FOLDER).mkdir(parents=True, exist_ok=True)
         self._keep()

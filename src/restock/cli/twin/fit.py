@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 class FitCommand:
     """Fit the twin's robot to a store's logs, and write a perturbation that training uses.
 
-    Drives the logged commands again in the twin, open loop on an empty floor, and searches for the
-    friction, payload, wheel radius, track, latency and gain under which it moves as the robot
-    did: first over the whole ranges on few segments, then by least squares on all. What the log
-    does not identify stays as it was, with the reason; a quarter of the log is held out to show the
-    gap before and after. See docs/calibration.md.
+    It drives the logged commands again in the twin, open loop on an empty floor, and searches for
+    the friction, payload, wheel radius, track, latency and gain with which the twin moves as the
+    robot did: first over the whole ranges on few segments, then by least squares on all. A
+    parameter that the log does not identify keeps its value, and the reason is printed. A quarter
+    of the log is held out to measure the gap before and after. See docs/calibration.md.
 
     Example: `restock twin fit store/ --out fitted.toml`
     """
@@ -29,39 +29,42 @@ class FitCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     out: Path | None = None
-    """Where the perturbation goes, as TOML; with --per-recording a schedule over the robots.
-    Nothing is overwritten."""
+    """The TOML file to write: a perturbation, or with --per-recording a schedule over the robots.
+    An existing file is not overwritten."""
     parameters: str | None = None
-    """Which parameters, e.g. latency_s,gain (default: all but left_friction_scale)."""
+    """The parameters to fit, e.g. latency_s,gain. Default: all except left_friction_scale."""
     recording: tuple[str, ...] = ()
-    """Only these recordings, by their ids."""
+    """Use only these recordings, by their ids."""
     per_recording: bool = False
-    """Fit each recording by itself, for robots that differ."""
+    """Fit each recording separately, for robots that differ."""
     base: Path | None = None
-    """A perturbation (TOML): values that are not fitted, and the reference (default: nominal)."""
+    """A perturbation (TOML) with the values that are not fitted; also the reference. Default:
+    nominal."""
     timestep_s: float | None = None
-    """Physics timestep to fit at; values are effective, so the one training uses (default: the
-    base's, .01)."""
+    """Physics timestep for the fit. Fitted values hold for this timestep, so use the one of
+    training. Default: that of --base, else 0.01."""
     horizon_s: float = 3.0
-    """Length of the segments that are driven again."""
+    """Length in seconds of the segments that are driven again."""
     held_out: float = 0.25
-    """Share of the log held out: whole recordings where there are four, else the end of each."""
+    """Share of the log that is held out: whole recordings if there are at least four, else the end
+    of each one."""
     search: int = 64
-    """Points of the coarse search, a power of two."""
+    """Number of points of the coarse search, a power of two."""
     segments: int = 200
-    """Number of segments at most."""
+    """The largest number of segments."""
     seed: int = 0
-    """Of the search, the draw of segments and the bootstrap."""
+    """Seed of the search, of the sample of segments and of the bootstrap."""
     threads: int = 1
-    """For the physics; the result does not depend on it."""
+    """Number of threads for the physics. The result does not depend on it."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     task: str | None = None
-    """Hash of the task whose rows are fitted, where the store has several."""
+    """Hash of the task whose rows are used, if the store has several tasks."""
     profile: str | None = None
-    """The profile whose [robot] is driven (default: the one that the store's rows carry)."""
+    """The profile whose [robot] is driven. Default: the one stored with the rows."""
     dry_run: bool = False
-    """Fit and print, and write nothing."""
+    """Fit and print; write nothing."""
     json: bool = False
     """Print one JSON document: {"fits": [{"estimates", "warnings", "held_out", …}], "out"}."""
 
@@ -75,7 +78,7 @@ class FitCommand:
         from restock.train.twin.calibration.logged_steps import recordings_of
 
         if self.out is not None and self.out.exists():
-            raise ConfigError("already exists", where=str(self.out), remedy="name another --out")
+            raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         with Store(self.store, version=given_version(self.version)) as store:
             groups: list[tuple[str, ...]] = [self.recording]
             if self.per_recording:

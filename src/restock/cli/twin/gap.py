@@ -13,22 +13,22 @@ if TYPE_CHECKING:
     from restock.train.twin.physics.perturbation import Perturbation
 
 _IN_SAMPLE = (
-    "The twin was calibrated on most of these very logs: `restock twin fit` says what is left of"
-    " the gap on logs held out."
+    "The twin was calibrated on most of these logs. `restock twin fit` shows the remaining gap on "
+    "held-out logs."
 )
 
 
 @dataclass
 class GapCommand:
-    """Drive a store's logged commands again in the twin, and measure how far it is from the log.
+    """Measure the gap between the twin and a store's logs, by driving the logged commands again.
 
-    Per condition: the error of pose and signals after 1, 3 and 6 s, open loop, and of
-    observation and reward after one step from each logged state; of the nominal twin, and
-    with --perturbation of a calibrated one beside it. Beside them odometry, dead-reckoned, and
-    the floor that localisation noise sets. Names the conditions in which the twin should not be
-    trusted, by the limits below, each with 95 % confidence over episodes. See docs/calibration.md.
+    For each condition, it measures the error of pose and signals after 1, 3 and 6 s, open loop, and
+    of observation and reward after one step from each logged state: for the nominal twin and, with
+    --perturbation, for a calibrated one. For comparison it shows dead-reckoned odometry, and the
+    least error that localisation noise allows. It lists the conditions in which the twin should not
+    be trusted, by the limits below, with 95 % confidence over episodes. See docs/calibration.md.
 
-    Exit code 0 whatever the gap; with --check 1 where a condition is untrusted.
+    The exit code is 0 whatever the gap. With --check, it is 1 if a condition is untrusted.
 
     Example: `restock twin gap store/ --perturbation fitted.toml --out store/gap`
     """
@@ -36,41 +36,45 @@ class GapCommand:
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store."""
     perturbation: Path | None = None
-    """The calibrated twin, e.g. what `restock twin fit` wrote."""
+    """A perturbation that calibrates the twin, e.g. written by `restock twin fit`."""
     fit: bool = False
     """Calibrate the twin on this store first, as `restock twin fit STORE` does by default."""
     out: Path | None = None
-    """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows what
-    it finds in RUN/gap or STORE/gap. A gap measured before is replaced."""
+    """A folder for gap.json, Parquet tables and a page (index.html). `restock report` shows a gap
+    in RUN/gap or STORE/gap. An earlier gap in the folder is replaced."""
     horizons: str = "1,3,6"
-    """Seconds to drive open loop."""
+    """The horizons, in seconds, to drive open loop."""
     trust_horizon_s: float = 3.0
-    """The horizon of the verdict."""
+    """The horizon, in seconds, that decides the verdict."""
     trust_position_m: float = 0.2
-    """Trusted where nine in ten segments end within this of the log."""
+    """A condition is trusted if nine in ten segments end within this distance (m) of the log."""
     trust_reward: float = 1.0
-    """Trusted where the one-step reward is off by less than so many times the reward's spread."""
+    """A condition is trusted if the error of the one-step reward is less than this many times the
+    reward's standard deviation."""
     min_segments: int = 20
-    """With fewer a condition is unknown."""
+    """With fewer segments, the verdict on a condition is unknown."""
     min_episodes: int = 5
-    """From fewer a condition is unknown."""
+    """With fewer episodes, the verdict on a condition is unknown."""
     most: int = 400
-    """Segments per condition and horizon at most, drawn evenly; of single steps five times as many.
+    """The largest number of segments per condition and horizon, spread evenly; for single steps,
+    five times as many.
     """
     seed: int = 0
-    """Of that draw, the floor's noise and the bootstrap."""
+    """Seed of the noise in the localisation floor and of the bootstrap, and of the sample of
+    segments."""
     timestep_s: float | None = None
-    """Physics timestep (default: the perturbation's, .01)."""
+    """Physics timestep. Default: that of the perturbation, else 0.01."""
     threads: int = 1
-    """For the physics; the result does not depend on it."""
+    """Number of threads for the physics. The result does not depend on it."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
-    """The store as it was: a version's number, or a time (2026-11-01T08:00Z); the newest."""
+    """An earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default: the
+    newest."""
     task: str | None = None
-    """Hash of the task whose rows are compared, where the store has several."""
+    """Hash of the task whose rows are used, if the store has several tasks."""
     profile: str | None = None
-    """The profile whose [robot] is driven (default: the one that the store's rows carry)."""
+    """The profile whose [robot] is driven. Default: the one stored with the rows."""
     check: bool = False
-    """Exit 1 where a condition is untrusted."""
+    """Exit 1 if a condition is untrusted."""
     json: bool = False
     """Print one JSON document: {"untrusted", "verdicts", "paths", "observations", "rewards",
     "not_done", "about"}."""

@@ -20,10 +20,10 @@ class LayoutCommand:
     """Describe a floor: its size, aisles and goals, and which episodes fit on it.
 
     A floor is `default`, `generated:SEED`, `narrow:SEED`, a TOML file, or the map.yaml of a ROS
-    occupancy map. --from makes it from what a recording shows instead: from its map (or --map), or
-    its scans, or the way that was driven; missions start and end where the robot really was. --out
-    writes it as TOML, which `restock train --set env.layouts=FILE.toml` drives on, or as map.yaml
-    with a PGM. See docs/layouts.md.
+    occupancy map. With --from, the floor is made from a recording instead: from its map (or --map),
+    or its scans, or the path that was driven. Missions then start and end where the robot was in
+    the recording. --out writes the floor as TOML, for `restock train --set env.layouts=FILE.toml`,
+    or as map.yaml with a PGM. See docs/layouts.md.
 
         restock twin layout map.yaml --out hall.toml --png hall.png
         restock twin layout --from drive.mcap --out floor.toml --png floor.png
@@ -32,27 +32,32 @@ class LayoutCommand:
     floor: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[FLOOR]")] = None
     """The floor."""
     source: Annotated[str | None, tyro.conf.arg(name="from", metavar="STORE|BAG")] = None
-    """A recording, or a store: make the floor from what it shows."""
+    """Make the floor from this recording or store."""
     map: Path | None = None
-    """The map.yaml that the robot of --from localised in, in place of a map in the recording."""
+    """With --from: the map.yaml in which the robot was localised. It replaces a map in the
+    recording."""
     by: Literal["map", "scans", "corridor"] | None = None
-    """What to make it from (default: the first of these that --from has)."""
+    """With --from: what to make the floor from. Default: the first of these that the recording
+    has."""
     profile: str | None = None
-    """The robot of --from: a profile by name or TOML file. Says what its pose and its scan are,
-    and how large it is (default: that of the store, else guessed by the topics)."""
+    """With --from: the profile of the robot, a name or a TOML file. It gives the topics of pose and
+    scan, and the robot's size. Default: that of the store, else a proposal from the topics."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
-    """How large it is, in metres, before anything else that says it."""
+    """With --from: the robot's length and width in metres. It overrides all other sources."""
     typestore: str | None = None
-    """Message definitions for bags that carry none, e.g. humble, jazzy (default humble)."""
+    """ROS 2 distribution whose message definitions are used for recordings without their own.
+    Default: humble."""
     definitions: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """A folder of .msg and .idl files: definitions of a robot's own types, for bags that carry
-    none."""
+    """A folder of .msg and .idl files (PACKAGE/msg/NAME.msg) that define a robot's own types, for
+    recordings that do not contain the definitions."""
     out: Path | None = None
-    """Write it here: FILE.toml, or map.yaml (and map.pgm beside it). Nothing is overwritten."""
+    """Write the floor to this file: FILE.toml, or map.yaml (and map.pgm beside it). Existing files
+    are not overwritten."""
     png: Path | None = None
-    """Draw it here, from above."""
+    """Draw the floor from above, into this PNG file."""
     zones: Path | None = None
-    """Write the parts of --from's floor here, as [[zone]] of a profile in the map's frame."""
+    """With --from: write the zones of the floor to this file, as [[zone]] tables for a profile, in
+    the map frame."""
     json: bool = False
     """Print the description as JSON."""
 
@@ -74,7 +79,7 @@ class LayoutCommand:
         remarks: list[str] = []
         if surveyed is not None:
             if not facts["episodes"]:
-                surveyed.notes.append("no mission fits on it: the robot moved too little")
+                surveyed.notes.append("no mission fits on this floor: the robot moved too little")
             facts = {**surveyed.facts(), **facts, "notes": surveyed.notes}
             remarks = [f"made from {surveyed.source}", *surveyed.notes]
         if self.out is not None:
@@ -102,10 +107,14 @@ class LayoutCommand:
         for path in written:
             if path.exists():
                 raise RestockError(
-                    "already exists", where=str(path), remedy="give another name, or remove it"
+                    "already exists",
+                    where=str(path),
+                    remedy="choose another name, or remove the file",
                 )
             if not path.parent.is_dir():
-                raise RestockError("no such folder", where=str(path.parent), remedy="make it first")
+                raise RestockError(
+                    "no such folder", where=str(path.parent), remedy="create it first"
+                )
         return written
 
     def _floor(self) -> tuple[Warehouse, Surveyed | None]:
@@ -139,7 +148,7 @@ class LayoutCommand:
         for name in ("map", "by", "profile", "footprint", "typestore", "definitions", "zones"):
             if getattr(self, name) is not None:
                 raise ConfigError(
-                    f"--{name} is about the recording that --from names",
+                    f"--{name} applies only with --from",
                     where="restock twin layout",
                     remedy=f"leave out --{name}, or give --from STORE or BAG",
                 )

@@ -22,12 +22,12 @@ LEARNED = "dqn"  # the behaviour policy's name of what `restock train` made
 class RecordCommand:
     """Drive a simulated robot and write what a real one would log.
 
-    It is the twin with other friction, payload, wheels, latency and sensors than
-    training assumes. It drives one mission after another, and writes odometry, lidar, IMU,
+    The simulated robot is the twin, with other friction, payload, wheels, latency and sensors than
+    training assumes. It drives one mission after another and writes odometry, lidar, IMU,
     localisation, plans, commands, transforms and diagnostics, each at its own rate, delay and
-    resolution, to an MCAP file or a rosbag2 folder that any ROS 2 tool opens. Recording pauses
-    between missions. The same seed gives the same bytes. Nothing is ever overwritten, and Ctrl-C
-    leaves nothing behind.
+    resolution, to an MCAP file or a rosbag2 folder that any ROS 2 tool can open. Recording pauses
+    between missions. The same seed gives the same bytes. Existing files are never overwritten, and
+    Ctrl-C leaves no partial file.
 
         restock record --out drive.mcap --minutes 5
         restock record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
@@ -43,38 +43,38 @@ class RecordCommand:
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
-    """Stop after so many missions instead; or drive those of a missions file, as `restock gaps
-    --missions-out` writes it, until as many as it orders met their kind."""
+    """Stop after this number of missions instead. Or drive the missions of a file that `restock
+    gaps --missions-out` wrote, until the ordered number of missions has met each condition."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
-    """Whose drive it is, such as robot=amr-07: a metadata record of the MCAP file, custom_data of
-    the rosbag2 folder. May be given several times."""
+    """A tag of the recording, such as robot=amr-07. It is stored as a metadata record of the MCAP
+    file, or as custom_data of the rosbag2 folder. May be given several times."""
     start: Annotated[str | None, tyro.conf.arg(metavar="TIME")] = None
-    """When the first mission starts, as 2026-10-05T08:00 (UTC; default 2026-03-02T08:00)."""
+    """Start time of the first mission, in UTC. Default: 2026-03-02T08:00."""
     seed: int = 0
-    """Of everything: missions, floor, traffic, noise, delays."""
+    """Seed of missions, floor, traffic, noise and delays."""
     conditions: str | None = None
-    """Shares of missions, e.g. nominal=.8,wheel_slip=.1,near_collision=.1 (default: the natural
-    nominal=.8,wheel_slip=.07,blocked_aisle=.07,near_collision=.06)."""
+    """Shares of missions, e.g. nominal=.8,wheel_slip=.1,near_collision=.1. Default:
+    nominal=.8,wheel_slip=.07,blocked_aisle=.07,near_collision=.06."""
     policy: str = "handover"
-    """The driver: handover, planner, operator, random, run:DIRECTORY (what that run kept), or
-    onnx:FILE. handover is the fleet: planners, an operator who takes over when one is stuck, and
-    some missions that an operator drives throughout."""
+    """The driver: handover, planner, operator, random, run:DIRECTORY (the policy that the run
+    kept), or onnx:FILE. With handover, a planner drives, an operator takes over when the planner is
+    stuck, and an operator drives some missions from start to end."""
     epsilon: float | None = None
-    """Share of random actions (default: the scripted drivers' own, none of a learned policy)."""
+    """Share of random actions. Default: the scripted drivers' own share; 0 for a learned policy."""
     perturbation: str | None = None
-    """Effective parameters in place of the default ones: a name as in `restock eval`, or a TOML
-    file of a perturbation, or of a schedule that draws one for every mission."""
+    """Effective parameters that replace the default ones: a name as in `restock eval`, or a TOML
+    file with a perturbation, or with a schedule that draws one for every mission."""
     layouts: str = "default"
-    """The floors: default, generated:train, FILE.toml, map.yaml, … as `restock train` takes them; a
-    mission is on one of them that its seed draws."""
+    """The floors, as for `restock train`: default, generated:train, FILE.toml, map.yaml, … The
+    floor of each mission is drawn by its seed."""
     rates: str | None = None
-    """Messages a second of some topics, e.g. odom=20,scan=5."""
+    """Rates of topics in Hz, e.g. odom=20,scan=5."""
     exact: bool = False
-    """Record the nominal twin without sensor noise instead: to check a pipeline."""
+    """Record the nominal twin without sensor noise, to check a pipeline."""
     dry_run: bool = False
-    """Print what would be driven and written, and write nothing."""
+    """Print what would be driven and written; write nothing."""
     json: bool = False
     """Print one JSON document: {"path", "format", "missions", "messages", "topics", …}."""
 
@@ -101,9 +101,9 @@ class RecordCommand:
         )
 
         if self.minutes is not None and self.missions is not None:
-            raise RestockError("--minutes and --missions exclude each other", remedy="give one")
+            raise RestockError("--minutes and --missions cannot be combined", remedy="give one")
         if self.exact and self.perturbation is not None:
-            raise RestockError("--exact and --perturbation exclude each other", remedy="give one")
+            raise RestockError("--exact and --perturbation cannot be combined", remedy="give one")
         hardware = NOISELESS if self.exact else HARDWARE
         plan = RecordingPlan(
             format=self.format or ("mcap" if self.out.suffix == ".mcap" else "rosbag2"),
@@ -128,7 +128,7 @@ class RecordCommand:
         refuse_unfit(floors, [kind for kind, share in plan.kinds.items() if share])
         if isinstance(plan.missions, MissionsFile):
             if self.conditions is not None:
-                raise RestockError("--conditions and a missions file exclude each other")
+                raise RestockError("--conditions and a missions file cannot be combined")
             ordered(plan, floors, planners(floors))
         refuse_existing(self.out)
         if self.dry_run:
@@ -181,7 +181,7 @@ def load_policy(name: str) -> Policy | None:
         raise ConfigError(
             f"unknown policy {name!r}",
             where="--policy",
-            remedy=f"give {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
+            remedy=f"choose one of {', '.join(SCRIPTED)}, run:DIRECTORY or onnx:FILE",
         )
     if policy.version:  # made by Restock: the same policy has the same tag from a run or a file
         policy.name = LEARNED

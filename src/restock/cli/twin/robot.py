@@ -11,19 +11,18 @@ import tyro
 
 @dataclass
 class RobotCommand:
-    """Build the robot of a profile's [robot], and try it: what the twin takes it to be, and what it
-    drives of each action.
+    """Build the robot of a profile's [robot] in the twin, and test how it drives each action.
 
-    Its own MuJoCo model too (`mjcf`): what that lacks is said by name, and the exit code is 2. See
-    docs/robot.md.
+    It also checks a MuJoCo model of your own (`mjcf`): missing parts are listed by name, and the
+    exit code is 2. See docs/robot.md.
 
     Example: `restock twin robot my_robot.toml`
     """
 
     profile: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROFILE")]
-    """A profile: a TOML file, or the name of one that comes with Restock."""
+    """A profile: a TOML file, or the name of a shipped profile."""
     friction: float = 0.8
-    """The floor's coefficient of friction, from .04 to 1.6."""
+    """The floor's coefficient of friction, from 0.04 to 1.6."""
     json: bool = False
     """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
     speed_mps, yaw_rate_radps, driven_mps, driven_radps}]}."""
@@ -37,7 +36,9 @@ class RobotCommand:
         from restock.train.twin.physics.robot_trial import driven_actions, measured, robot_model
 
         if not 0.04 <= self.friction <= 1.6:
-            raise ConfigError(f"must be from .04 to 1.6, got {self.friction:g}", where="--friction")
+            raise ConfigError(
+                f"must be from 0.04 to 1.6, got {self.friction:g}", where="--friction"
+            )
         profile = load_profile(self.profile)
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
         model = robot_model(profile.robot, profile.task.body)
@@ -57,5 +58,5 @@ class RobotCommand:
         rows = [{"": n, "value": value, "from": origin} for n, value, origin in facts]
         output.print_table(rows, title=f"{self.profile}: the robot in the twin")
         sys.stdout.write("\n")
-        output.print_table(driven, title="What it drives, steadily")
+        output.print_table(driven, title="Steady motion for each action")
         return 0

@@ -15,8 +15,7 @@ from restock.cli.twin.robot import RobotCommand
 
 @dataclass
 class TwinCommand:
-    """Fit the twin's robot to logs, measure its gap to them, try the robot, and describe the floors
-    it drives on.
+    """Fit the twin to logs, measure its gap to them, test its robot, and describe its floors.
 
     See docs/calibration.md, docs/robot.md and docs/layouts.md. `restock twin JOB --help` explains
     one job.
