@@ -38,7 +38,7 @@ Engine = Literal["processes", "ray"]
 T = TypeVar("T")
 D = TypeVar("D")
 PATIENCE_S = 10  # for a worker that was told to stop, before it is killed
-AGAIN = "run it again: what is in the store already is left alone"
+AGAIN = "run it again: recordings that are already in the store are skipped"
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,11 @@ class IngestJob:
         except Exception as error:  # noqa: BLE001  (a defect costs its recording, not all of them)
             at = traceback.extract_tb(error.__traceback__)[-1]
             return RecordingError(
-                f"a defect of Restock: {type(error).__name__}: {error}"
+                f"a bug in Restock: {type(error).__name__}: {error}"
                 f" ({Path(at.filename).name}, line {at.lineno})",
                 where=str(path),
-                remedy="please report it; the recording is not in the store, the others are",
+                remedy="please report it; this recording was not added to the store, the others "
+                "were",
             )
 
 
@@ -148,7 +149,7 @@ def _one_by_one(
 def out_of_memory(path: Path) -> RecordingError:
     """The error of a recording for which memory did not suffice."""
     return RecordingError(
-        "memory ran out", where=str(path), remedy=f"with fewer --workers, or more memory, {AGAIN}"
+        "out of memory", where=str(path), remedy=f"use fewer --workers or more memory, then {AGAIN}"
     )
 
 
@@ -157,7 +158,7 @@ def _died(path: Path, code: int) -> RecordingError:
     return RecordingError(
         f"the process that read it {how}",
         where=str(path),
-        remedy=f"where memory ran out, take fewer --workers; {AGAIN}",
+        remedy=f"if out of memory, use fewer --workers; then {AGAIN}",
     )
 
 

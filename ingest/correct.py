@@ -78,7 +78,7 @@ def correct_store(
     for recording, what in given.items():
         if live.get(recording, {}).get("ingest_id") != what.ingest_id:
             raise StoreError(
-                f"recording {recording} was ingested again, or taken out, meanwhile",
+                f"recording {recording} was ingested again or removed in the meantime",
                 where=str(store.path),
                 remedy="list its events again with `restock label STORE --review N`",
             )
@@ -132,7 +132,7 @@ def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> li
         raise StoreError(
             f"the conditions in its manifest cannot be read: {error}",
             where=str(manifest["source_file"]),
-            remedy="a newer Restock wrote them: use that one",
+            remedy="they were written by a newer Restock: use that version",
         ) from error
 
 

@@ -46,7 +46,7 @@ def describe_recording(
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)
         if span and (span[0] < 0 or span[1] == LATEST_NS):
-            notes.append("its log times reach before 1970 or beyond 2262: implausible stamps")
+            notes.append("its log times are before 1970 or after 2262: implausible stamps")
         compared = _clocks(recording) if clocks else {}
         return {
             "path": str(path),
@@ -125,5 +125,5 @@ def _date(stamp_ns: int) -> str:
     try:
         moment = datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC)
     except (OverflowError, ValueError, OSError):
-        return f"{stamp_ns} ns, which is not a date"
+        return f"{stamp_ns} ns is not a date"
     return moment.isoformat().replace("+00:00", "Z")

@@ -127,8 +127,8 @@ def _task(
         os.chdir(folder)
     except OSError:
         return RecordingError(
-            f"the machine that was to read it has no folder {folder}",
+            f"the worker machine has no folder {folder}",
             where=str(path),
-            remedy="put the recordings where every machine of the cluster sees them",
+            remedy="put the recordings in a folder that all machines of the cluster can read",
         )
     return job.prepare(path)

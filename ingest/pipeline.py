@@ -206,7 +206,7 @@ class _Ingest:
             raise RecordingError(
                 f"gives no transition with the profile {self.profile.name!r}: "
                 f"{_why(steps, episodes)}",
-                remedy="choose another --profile, or mend its maximum ages; see docs/ingest.md",
+                remedy="choose another --profile, or correct its maximum ages; see docs/ingest.md",
             )
         provenance = Provenance(
             self.recording.recording_id, self.ingest_id, self.path, software_version()
@@ -284,7 +284,8 @@ class _Ingest:
         try:
             if count != (due := sum(len(one.row) for one in kept)):
                 raise RecordingError(
-                    f"{due - count} of {due} frames are not there any more: it changed meanwhile",
+                    f"{due - count} of {due} frames are missing: the recording changed in the "
+                    "meantime",
                     where=self.path,
                     remedy="ingest it again",
                 )
@@ -315,7 +316,7 @@ class _Ingest:
             for loss in self.recording.lost_messages
         ]
         return lost + [
-            f"{topic}: left out, their stamps are off the clock ({count:,} messages)"
+            f"{topic}: left out, as their stamps do not fit the clock ({count:,} messages)"
             for topic, count in steps.clock.off_clock.items()
         ]
 
@@ -343,20 +344,24 @@ class _Ingest:
         far = int((residual > 0.25).sum())
         if far:
             notes.append(
-                f"{far} of {len(residual)} commands are more than .25 from the nearest action "
-                f"(median {np.median(residual):.2f}, largest {residual.max():.2f}, scaled)"
+                f"{far} of {len(residual)} commands are more than 0.25 from the nearest action "
+                f"(scaled distance; median {np.median(residual):.2f}, largest {residual.max():.2f})"
             )
         if self.corrections:
             idle = sum(not correction.rows for correction in self.corrections)
             notes.append(
                 f"{len(self.corrections)} corrections of its labels are kept"
-                + (f"; {idle} of them speak of conditions or steps that are gone" if idle else "")
+                + (
+                    f"; {idle} of them are about conditions or steps that no longer exist"
+                    if idle
+                    else ""
+                )
             )
         return notes
 
 
 def _why(steps: Steps, episodes: Split) -> str:
     if not len(steps):
-        return "it holds no command, so the control clock has no tick"
+        return "it contains no command, so there are no steps"
     reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     return "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons)

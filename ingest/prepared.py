@@ -103,7 +103,7 @@ def _refusal(
     return RecordingError(
         str(found),
         where=one.result.path,
-        remedy="leave it out; --repeated keep ingests it all the same",
+        remedy="leave it out, or use --repeated keep to ingest it anyway",
     )
 
 
@@ -152,7 +152,7 @@ def _finished(
             return error
     notes = list(one.result.notes)
     if repeats is not None:
-        notes.append(f"{repeats}; the audit `repeated_steps` fails until one is taken out")
+        notes.append(f"{repeats}; the audit `repeated_steps` fails until one of them is removed")
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 
 

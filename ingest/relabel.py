@@ -85,9 +85,9 @@ def relabel_store(
     """
     if version is not None and not dry_run:
         raise StoreError(
-            "a version that was cannot be labelled again",
+            "an earlier version cannot be labelled",
             where=str(store.path),
-            remedy="give --dry-run to see what would change, or leave --version out",
+            remedy="give --dry-run to see what would change, or leave out --version",
         )
     outcomes: list[Relabelled] = []
     stale: list[dict[str, Any]] = []
@@ -128,7 +128,7 @@ def relabel_rows(
     ends = episode_ends(rows)
     if ends is None:
         raise StoreError(
-            f"the rows of {row['source_file']} came without the ends of their episodes",
+            f"the rows of {row['source_file']} lack the ends of their episodes",
             where=str(store.path),
             remedy="ingest the recording again",
         )
@@ -220,7 +220,7 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
     store = StoreWriter(path)
     if not len(store.live()):
         raise StoreError(
-            "no store, or an empty one",
+            "there is no store, or it is empty",
             where=str(path),
             remedy=f"`restock ingest RECORDINGS --store {path}` makes one",
         )

@@ -14,7 +14,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.camera import Camera
 
 NS = 1_000_000_000
-OFF_CLOCK = "its stamp is off the clock"
+OFF_CLOCK = "its stamp does not fit the clock"
 MOST_REASONS = 20  # a file may give another one with each message
 
 

@@ -119,7 +119,7 @@ def _decoded(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
     try:
         with Image.open(io.BytesIO(data), formats=["JPEG", "PNG"]) as image:
             if image.size != (layout.width, layout.height):
-                raise ImageProblem("another size than its header said")
+                raise ImageProblem("its size differs from its header")
             plain = _PLAIN_MODES.get(image.mode)
             array = np.asarray(image.convert(plain) if plain else image)
     except ImageProblem:

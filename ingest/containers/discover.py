@@ -48,7 +48,8 @@ def recordings_in(path: Path | str) -> list[Path]:
             raise RecordingError(
                 "no recording in this folder",
                 where=str(path),
-                remedy=f"links to folders ({links} in it) are not followed: name them, as {path}/*"
+                remedy=f"links to folders ({links} in it) are not followed: give them directly, "
+                f"as {path}/*"
                 if links
                 else f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
             )

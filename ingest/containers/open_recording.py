@@ -116,7 +116,8 @@ class _Opening:
             raise RecordingError(
                 f"a folder that is not a bag: it has no {METADATA}",
                 where=str(self.path),
-                remedy="name one recording, or use `recordings_in` to find those in a folder",
+                remedy="give one recording, or use `recordings_in` to find all recordings in a "
+                "folder",
             )
         metadata, problem = discover.read_metadata(self.path)
         if problem:
@@ -171,7 +172,7 @@ class _Opening:
             raise RecordingError(
                 f"a bag that mixes {' and '.join(sorted(set(self.kinds)))} files",
                 where=str(self.path),
-                remedy="name its files one by one",
+                remedy="give its files one by one",
             )
         if kind == "mcap":
             return "rosbag2-mcap" if self.path.is_dir() else "mcap"

@@ -94,15 +94,15 @@ class Ros1File:
             raise RecordingError(
                 f"ROS 1 bag cannot be read: {error}; and no chunk of it is whole enough to read",
                 where=str(path),
-                remedy="copy or record it again: nothing of it can be salvaged",
+                remedy="copy or record it again: nothing in it can be salvaged",
             ) from error
         self.integrity = "damaged"
         size = path.stat().st_size
         beyond = f"; nothing after byte {walked.stop:,} of {size:,}" if walked.stop < size else ""
         self.damage.append(
             Damage(
-                f"no index ({error}): read chunk by chunk{beyond}, and how many messages are"
-                " lost is not known"
+                f"no index ({error}): read chunk by chunk{beyond}; the number of lost messages is "
+                "not known"
             )
         )
         return walked

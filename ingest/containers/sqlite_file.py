@@ -150,7 +150,7 @@ class SqliteFile:
         if self._copy:
             path, immutable = Path(self._copy.name) / path.name, ""
             names = ", ".join(item.name for item in _sidecars(self.path))
-            self.notes.append(f"{names}: read too, the writer had not merged it")
+            self.notes.append(f"{names}: also read, as the writer had not merged it")
         try:
             connection = _connection(path, immutable)
             guard(connection, _size(self.path))

@@ -20,7 +20,7 @@ Watch = Callable[[str, int, int], None]  # what is being done, how much of it is
 MOST_ENTRIES = 1_000
 LONGEST_TEXT = 4_096  # characters of a name or value
 LONGEST_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
-NOT_KEPT = f"no text, longer than {LONGEST_TEXT:,} characters, or beyond the {MOST_ENTRIES:,}th"
+NOT_KEPT = f"not text, longer than {LONGEST_TEXT:,} characters, or beyond entry {MOST_ENTRIES:,}"
 # What the YAML library raises of an invalid document, or of one that it does not expect.
 INVALID_YAML = (
     *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),

@@ -153,7 +153,7 @@ class TopicReading:
         self._add(lost)
         unexplained = account.expected - account.decoded - sum(account.reasons.values())
         if unexplained > 0:
-            self._add({"counted by the container, but not in it": unexplained})
+            self._add({"counted by the container, but missing": unexplained})
         return account
 
     def columns(self) -> TopicColumns:

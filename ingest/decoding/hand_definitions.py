@@ -50,7 +50,7 @@ def folder_types(folder: str) -> Typesdict:
         raise _refused(folder, "no such folder of definitions")
     files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
     if len(files) > MOST_FILES:
-        raise _refused(folder, f"{len(files):,} definitions in it, and {MOST_FILES:,} at most")
+        raise _refused(folder, f"it holds {len(files):,} definitions, more than {MOST_FILES:,}")
     types: Typesdict = {}
     for file in files:
         parts = [part for part in file.relative_to(root).parts[:-1] if part != "msg"]
@@ -68,13 +68,13 @@ def folder_types(folder: str) -> Typesdict:
             raise RecordingError(
                 f"a definition that cannot be read: {what}",
                 where=str(file),
-                remedy="mend it, or take it out of the folder",
+                remedy="correct the file, or remove it from the folder",
             ) from error
     if not types:
-        raise _refused(folder, "no .msg and no .idl file in it")
+        raise _refused(folder, "it contains no .msg and no .idl file")
     return types
 
 
 def _refused(folder: str, why: str) -> RecordingError:
-    remedy = "--definitions names a folder with PACKAGE/msg/NAME.msg (or .idl) in it"
+    remedy = "--definitions needs a folder that contains PACKAGE/msg/NAME.msg (or .idl)"
     return RecordingError(why, where=folder, remedy=remedy)

@@ -124,7 +124,7 @@ class PolicyNode:
             self.node.create_timer(DIAGNOSTICS_S, self._report, clock=steady),
         ]
         self.pilot = pilot
-        mode = "shadow: it commands nothing" if self.shadow else f"it drives {self.form.topic}"
+        mode = "shadow: it sends no commands" if self.shadow else f"it drives {self.form.topic}"
         self._log(f"{policy.path}: profile {profile.name}, task {task.hash}, {mode}")
 
     def activate(self) -> None:
@@ -303,7 +303,9 @@ class PolicyNode:
         if not self._value("limiter"):
             return None
         if not profile.task.lidar:
-            self._log("no lidar: the limiter keeps speed and acceleration, and sees nothing near")
+            self._log(
+                "no lidar: the limiter limits speed and acceleration, but cannot see obstacles"
+            )
         try:
             return Limits.of(profile.task, profile.robot, msgspec.convert(given, Limiter))
         except (ValueError, msgspec.ValidationError) as error:
@@ -377,7 +379,7 @@ def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = Fa
         if activate:
             done = node.trigger_configure()
             if done != ros.TransitionCallbackReturn.SUCCESS:
-                raise ConfigError("could not be configured: see its log", where=str(policy))
+                raise ConfigError("could not be configured: see the node's log", where=str(policy))
             node.trigger_activate()
         executor.spin()
     except KeyboardInterrupt:

@@ -88,7 +88,7 @@ def with_node_topics(profile: Profile) -> Profile:
         return CustomSignal(topic, kind, path, unit, max_age_s=age_s, doc=doc)
 
     rules = ", ".join(f"{number} {rule}" for number, rule in enumerate(RULES))
-    said = "of what the policy would have driven, behind its limiter"
+    said = "of the command that the policy would have sent, after its limiter"
     signals = {
         "shadow_action": signal(
             ACTION, "std_msgs/msg/Int16", "data", "1", "index of the action that it proposed"

@@ -59,26 +59,27 @@ class LiveObserver:
 
     Raises:
         ConfigError: the profile takes its pose, goals or plans from transforms, which are not
-            held here, or its goals by hindsight.
+            held here, or its goals in hindsight.
     """
 
     def __init__(self, profile: Profile) -> None:
         if profile.frames is not None:
             raise ConfigError(
-                "places messages by transforms ([frames]), which is not done live",
+                "places messages by transforms ([frames]), which is not supported live",
                 where=f"profile {profile.name!r}",
                 remedy="name a topic with the pose in the map frame under [inputs.pose]",
             )
         if profile.inputs.pose is not None and profile.inputs.pose.by_fix:
             raise ConfigError(
-                "takes its pose from satellite fixes, whose frame and heading are not kept live",
+                "takes its pose from satellite fixes, whose frame and heading are not computed "
+                "live",
                 where=f"profile {profile.name!r}",
                 remedy="name a topic with the pose in the map frame under [inputs.pose], such as"
                 " that of robot_localization's navsat_transform_node",
             )
         if profile.goal_source == "hindsight":
             raise ConfigError(
-                "takes its goals by hindsight, and a robot on its way has none",
+                "takes its goals in hindsight, which is not possible live",
                 where=f"profile {profile.name!r}",
                 remedy="name the topics of goal and plan under [inputs.goal] and [inputs.plan],"
                 ' with goal.source = "logged"',

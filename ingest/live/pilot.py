@@ -73,7 +73,7 @@ class Pilot:
         self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and intervention
         self.unreadable: Counter[str] = Counter()  # messages of another type, by topic
         self._was_taken = False
-        self.reason = "nothing decided yet"  # why the last decision was a stop, or ""
+        self.reason = "no decision yet"  # why the last decision was a stop, or ""
 
     @property
     def topics(self) -> dict[str, str]:
@@ -155,7 +155,7 @@ class Pilot:
             unreadable = f"unreadable: {str(error).splitlines()[0]}"
             return self.observer.observe(now_ns), unreadable
         if not observed.problem and self._blind:
-            return observed, "scan: no beam says anything"
+            return observed, "scan: no beam has a valid range"
         return observed, observed.problem
 
     def _limit(

@@ -52,7 +52,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
                 raise RecordingError(
                     f"has no {command.topic} ({command.type})",
                     where=str(recording),
-                    remedy=f"profile {profile.name!r} takes commands from there",
+                    remedy=f"profile {profile.name!r} reads the command from that topic",
                 )
             for connection, now_ns, raw in reader.messages(chosen):
                 message = reader.deserialize(raw, connection.msgtype)

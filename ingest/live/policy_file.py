@@ -35,7 +35,7 @@ class PolicyFile:
         metadata = self._session.get_modelmeta().custom_metadata_map
         if metadata.get("format") != FORMAT:
             raise ConfigError(
-                "is an ONNX model, but says nothing of a task: it was not exported by Restock",
+                "is an ONNX model without a task: it was not exported by Restock",
                 where=str(path),
                 remedy="restock export RUN --to onnx --out policy.onnx",
             )
@@ -66,7 +66,7 @@ class PolicyFile:
         (output,) = self._session.run(["action"], {self._input: observation[None]})
         action = int(np.asarray(output).reshape(-1)[0])
         if not 0 <= action < len(self.profile.task.actions):
-            raise ConfigError(f"chose action {action}, which there is not", where=str(self.path))
+            raise ConfigError(f"chose action {action}, which does not exist", where=str(self.path))
         return action
 
 
@@ -99,7 +99,7 @@ def _profile(metadata: dict[str, str], path: Path, given: Path | str | None) -> 
         return load_profile(metadata.get("profile", ""))
     except ConfigError as error:
         raise ConfigError(
-            f"carries no profile, and none named {metadata.get('profile', '')!r} is at hand",
+            f"contains no profile, and no profile named {metadata.get('profile', '')!r} was found",
             where=str(path),
             remedy="export it again with this Restock, or give its profile's file",
         ) from error

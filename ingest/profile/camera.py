@@ -22,5 +22,5 @@ class Camera(Checked, frozen=True):
 def camera_name_problem(name: str) -> str | None:
     """Why a camera may not have this name, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name):
-        return "a name has small letters, digits and _, and begins with a letter"
+        return "a name consists of lower-case letters, digits and _, and begins with a letter"
     return None

@@ -36,17 +36,17 @@ def check_profile(profile: Profile, where: str) -> None:
                 raise ConfigError(
                     f"`{key}`: no {'condition' if kind == 'outcome' else kind} named {name!r}",
                     where=where,
-                    remedy=f"shipped are {', '.join(known)}; write your own as [[condition]]"
-                    + (' with kind = "exposure"' if kind == "exposure" else ""),
+                    remedy=f"the shipped ones are {', '.join(known)}; write your own as "
+                    "[[condition]]" + (' with kind = "exposure"' if kind == "exposure" else ""),
                 )
     names = [condition.name for condition in profile.definitions]
     if doubled := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(f"`conditions`: {', '.join(doubled)} given twice", where=where)
+        raise ConfigError(f"`conditions`: {', '.join(doubled)} is given twice", where=where)
     for name, source in profile.inputs.items():
         check_input(name, source, where, framed=profile.frames is not None)
     if profile.inputs.scan is not None and not profile.task.sectors:
         raise ConfigError(
-            "`task.sectors` is 0, which is of a robot without a lidar, and `inputs.scan` is given",
+            "`task.sectors` is 0 (a robot without a lidar), but `inputs.scan` is given",
             where=where,
             remedy="give the number of sectors (36 by default), or leave [inputs.scan] out",
         )
@@ -55,9 +55,9 @@ def check_profile(profile: Profile, where: str) -> None:
     if profile.command_through is not None:
         if not profile.command_sources:
             raise ConfigError(
-                "`command_through` is given and no `command_sources`: it says by whom nothing is",
+                "`command_through` is given without `command_sources`",
                 where=where,
-                remedy="name the topics that it chooses among, or leave it out",
+                remedy="give the topics among which it chooses, or leave it out",
             )
         check_command_source(
             COMMAND_THROUGH, profile.command_through, profile.inputs.command, where
@@ -65,15 +65,16 @@ def check_profile(profile: Profile, where: str) -> None:
     pose = profile.inputs.pose
     if profile.inputs.heading is not None and not (pose is not None and pose.by_fix):
         raise ConfigError(
-            "`inputs.heading` is of a pose by latitude and longitude, which has none of its own",
+            "`inputs.heading` applies only to a pose by latitude and longitude, which has no "
+            "heading",
             where=where,
-            remedy="leave it out: other poses say where they face",
+            remedy="leave it out: other poses include the heading",
         )
     if pose is None and profile.frames is None:
         raise ConfigError(
-            "`inputs.pose` is missing, and there is no `frames`",
+            "`inputs.pose` is missing, and so is `frames`",
             where=where,
-            remedy="name the topic of the pose, or take it from /tf: [frames] fixed and base",
+            remedy="give the topic of the pose, or take the pose from /tf: [frames] fixed and base",
         )
     if (profile.inputs.wheels is None) == (profile.motion is None):
         both = profile.motion is not None
@@ -82,32 +83,33 @@ def check_profile(profile: Profile, where: str) -> None:
             if both
             else "`inputs.wheels` is missing, and there is no `motion`",
             where=where,
-            remedy="keep one: wheels where odometry is recorded, motion for speeds from poses"
+            remedy="keep one: wheels if odometry is recorded, motion to compute speeds from poses"
             if both
-            else "name the topic of the odometry, or take speeds from poses: [motion] window_s",
+            else "give the topic of the odometry, or compute speeds from poses: [motion] window_s",
         )
     if profile.motion is not None and "wheel_slip" in profile.shipped_conditions:
         raise ConfigError(
-            "`conditions`: wheel_slip cannot be seen where speeds come from poses ([motion])",
+            "`conditions`: wheel_slip cannot be detected if speeds are computed from poses "
+            "([motion])",
             where=where,
-            remedy="leave wheel_slip out, or name the odometry under [inputs.wheels]",
+            remedy="leave out wheel_slip, or give the odometry under [inputs.wheels]",
         )
     _check_goal(profile, where)
     proposed = profile.inputs.nav_command
     if proposed is not None and proposed.topic == profile.inputs.command.topic:
         raise ConfigError(
-            f"`inputs.nav_command.topic` is the command's own, {proposed.topic}: an observation"
-            " would hold the action that is chosen after it",
+            f"`inputs.nav_command.topic` is the topic of the command, {proposed.topic}: the "
+            "observation would contain the action",
             where=where,
-            remedy="name the topic on which the navigation stack proposes, ahead of whoever"
-            " decides, or leave [inputs.nav_command] out",
+            remedy="give the topic of the navigation stack's proposal, before the command is "
+            "chosen, or leave out [inputs.nav_command]",
         )
     robot, actions = profile.robot, profile.task.actions
     if robot is not None and (problem := beyond_limits(robot, actions)):
         raise ConfigError(
             f"`task.actions`: {problem}",
             where=where,
-            remedy="slow the action down, or correct the limit: the robot would not follow it",
+            remedy="make the action slower, or correct the limit",
         )
     for name in profile.signals:
         if problem := name_problem(name):
@@ -141,8 +143,8 @@ def _check_goal(profile: Profile, where: str) -> None:
             raise ConfigError(
                 f"`inputs.{name}` is missing, and `task.goal` is 'route'",
                 where=where,
-                remedy=f"name the topic of the {name}; or take goals by hindsight, [goal]"
-                ' source = "hindsight"; or set task.goal = "none"',
+                remedy=f"give the topic of the {name}; or take goals in hindsight, [goal] source ="
+                ' "hindsight"; or set task.goal = "none"',
             )
 
 

@@ -61,7 +61,7 @@ class CustomSignal(Checked, frozen=True):
             raise ValueError(f"path {self.path!r} {problem}") from None
         if self.reduce is None and path.lists > 1:
             raise ValueError(
-                f"path {self.path!r} gives lists of lists: name one element, or say reduce"
+                f"path {self.path!r} gives lists of lists: choose one element, or give reduce"
             )
         if self.reduce == "yaw" and path.lists:
             raise ValueError(
@@ -70,9 +70,11 @@ class CustomSignal(Checked, frozen=True):
         if self.reduce not in (None, "yaw") and not path.lists:
             raise ValueError(f"path {self.path!r} gives one value: there is nothing to reduce")
         if self.length is not None and not self.is_list:
-            raise ValueError(f"path {self.path!r} gives one value: a vector's length is of a list")
+            raise ValueError(
+                f"path {self.path!r} gives one value: the length of a vector needs a list"
+            )
         if not self.unit:
-            raise ValueError('unit is empty: write "1" for a quantity without one')
+            raise ValueError('unit is empty: write "1" for a quantity without a unit')
 
     @property
     def read(self) -> SignalPath:
@@ -117,11 +119,11 @@ class CustomSignal(Checked, frozen=True):
 def name_problem(name: str) -> str | None:
     """Why a custom signal may not have this name, or None."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        return "a name has small letters, digits and _"
+        return "a name consists of lower-case letters, digits and _"
     if name in _TAKEN:
-        return "Restock has a column of that name: choose another"
+        return "Restock has a column of this name: choose another name"
     if name in _reserved():
-        return "SQL has a word of that name: choose another"
+        return "this name is a keyword of SQL: choose another name"
     return None
 
 

@@ -49,19 +49,19 @@ FALLBACKS: dict[str, str] = {
     "behaviour_policy": "the profile's behaviour_policy",
     "true_condition": "unknown: labels are not scored",
     "true_exposure": "unknown: exposures are not scored",
-    "perturbation": "unknown: null, as of hardware",
+    "perturbation": "unknown: null, as for hardware",
 }
 MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
 STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
-POLICY_FALLBACK = "whose command it equals: {names}; else the profile's behaviour_policy"
-FIX_FALLBACK = "the direction of the last {track_m:g} m driven, as fixes do not say it"
+POLICY_FALLBACK = "the source whose command it equals: {names}; else the profile's behaviour_policy"
+FIX_FALLBACK = "the direction of the last {track_m:g} m driven, as fixes have no heading"
 POSE_FALLBACK = "from transforms, by [frames]"
-WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be seen"
+WHEELS_FALLBACK = "speeds from the poses of the last {window_s:g} s: slip cannot be detected"
 ROUTE_FALLBACK = "none: the task has no goal, progress is forward displacement"
 HINDSIGHT = {
-    "goal": "by hindsight: where the drive stopped, turned back or came by often",
-    "plan": "by hindsight: the way that was driven",
+    "goal": "in hindsight: where the drive stopped, turned back or passed often",
+    "plan": "in hindsight: the path that was driven",
 }
 
 
@@ -133,7 +133,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
     given = [key for key in FIX_SETTINGS if getattr(source, key) is not None]
     if given and not source.by_fix:
         raise ConfigError(
-            f"`inputs.{name}.{given[0]}` is of a pose by latitude and longitude",
+            f"`inputs.{name}.{given[0]}` applies only to a pose by latitude and longitude",
             where=where,
             remedy="leave it out, or give latitude_deg and longitude_deg",
         )
@@ -149,10 +149,10 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         raise ConfigError(
             f"`inputs.{name}.fields`: {', '.join(problems)}",
             where=where,
-            remedy=f"{name} takes {', '.join(known)}",
+            remedy=f"{name} has the fields {', '.join(known)}",
         )
     if source.stop_holds and name != "command":
-        raise ConfigError(f"`inputs.{name}.stop_holds`: only a command can stop", where=where)
+        raise ConfigError(f"`inputs.{name}.stop_holds` applies only to a command", where=where)
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
             f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
@@ -166,7 +166,7 @@ def _check_wheelbase(key: str, source: Input, where: str) -> None:
         raise ConfigError(
             f"`{key}`: steering_rad and wheelbase_m belong together",
             where=where,
-            remedy="wheelbase_m is the way between the axles, in metres",
+            remedy="wheelbase_m is the distance between the axles, in metres",
         )
 
 
@@ -182,32 +182,35 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
         raise ConfigError(
             f"`{key}`: the name of a behaviour policy has 1 to {MOST_NAME} printable characters",
             where=where,
-            remedy='name who drives by it: "teleop", "navigation"',
+            remedy='name the driver: "teleop", "navigation"',
         )
     if unknown := sorted(source.fields.keys() - COMMAND_SOURCE_FIELDS.keys()):
         raise ConfigError(
             f"`{key}.fields`: unknown {', '.join(map(repr, unknown))}",
             where=where,
-            remedy=f"a source of commands takes {', '.join(COMMAND_SOURCE_FIELDS)}",
+            remedy=f"a source of commands has the fields {', '.join(COMMAND_SOURCE_FIELDS)}",
         )
     complete = "speed_mps" in commanding and len(commanding) == len(source.fields) == 2
     by_button = key != COMMAND_THROUGH and source.fields.keys() == {"pressed"}
     if not (complete or by_button):
         raise ConfigError(
-            f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not say when it drives",
+            f"`{key}.fields`: {', '.join(source.fields) or 'nothing'} does not show when this "
+            "source drives",
             where=where,
             remedy="give speed_mps with yaw_rate_radps (or steering_rad), or pressed alone",
         )
     if source.topic == command.topic and "pressed" not in source.fields:
         raise ConfigError(
-            f"`{key}.topic` is the command's own, {command.topic}: it would always be in force",
+            f"`{key}.topic` is the topic of the command, {command.topic}: this source would "
+            "always be in force",
             where=where,
-            remedy="name the topic of its commands before one of several is chosen",
+            remedy="give the topic of this source's commands, before one of several sources is "
+            "chosen",
         )
     if source.stop_holds or source.optional:
         raise ConfigError(
-            f"`{key}` takes neither stop_holds nor optional",
+            f"`{key}` cannot have stop_holds or optional",
             where=where,
-            remedy="leave both out: a recording may lack a source of commands",
+            remedy="leave out both: a recording may always lack a source of commands",
         )
     _check_wheelbase(key, source, where)

@@ -1,7 +1,7 @@
 """Profiles: how one kind of robot's topics fill the signals, and the task that is learnt on them.
 
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
-of its own, `[task]`, `[goal]` (logged, or by hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
+of its own, `[task]`, `[goal]` (logged, or in hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
 (which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
 transforms), `[motion]` (speeds from poses), `[signals.*]` (custom columns), `[cameras.*]` (frames
 that are kept), `[tags]` (whose drive it is), `[robot]` (what the twin builds), `[limiter]` (of a
@@ -234,9 +234,11 @@ def load_profile(name_or_path: str | Path) -> Profile:
     if not path.is_file():
         near = get_close_matches(where, names, n=1)
         raise ConfigError(
-            "no such profile: neither a file nor one that comes with Restock",
+            "there is no such profile: it is neither a file nor the name of a shipped profile",
             where=where,
-            remedy=f"did you mean {near[0]!r}?" if near else f"shipped are: {', '.join(names)}",
+            remedy=f"did you mean {near[0]!r}?"
+            if near
+            else f"the shipped profiles are: {', '.join(names)}",
         )
     profile = _typed(read_toml(path), where=where, folder=path.parent)
     # Of stores too it would shut out those that an older Restock wrote: here, and in the twin.

@@ -23,7 +23,7 @@ REFUSED = (
     *("include", "plugin", "extension", "composite", "flexcomp", "flex", "replicate", "attach"),
     *("skin", "mesh", "hfield", "texture", "model", "memory"),
 )
-REMEDY = "docs/robot.md says what the model must hold, with one that drives"
+REMEDY = "docs/robot.md says what the model must contain, and has an example"
 
 
 def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
@@ -47,15 +47,20 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
             raise refused(problem, REMEDY)
         return document
     if folder is None:
-        raise refused("names a file, and needs a profile that is a file: it lies beside that")
+        raise refused(
+            "gives a file name, which needs a profile that is a file: the name is "
+            "relative to its folder"
+        )
     path = (folder / given).resolve()
     if Path(given).is_absolute() or not path.is_relative_to(folder.resolve()):
-        raise refused(f"leads out of the profile's folder: {given}", "put it beside the profile")
+        raise refused(
+            f"is outside the profile's folder: {given}", "put it into the profile's folder"
+        )
     try:
         if path.stat().st_size > LARGEST_BYTES:
             raise refused(
                 f"is larger than {LARGEST_BYTES:,} bytes: {given}",
-                "leave meshes out: boxes, cylinders and spheres are what drives",
+                "leave out meshes: boxes, cylinders and spheres are enough to drive",
             )
         text = path.read_text(encoding="utf-8").lstrip("\ufeff \t\r\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -68,27 +73,27 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
 def mjcf_problem(text: str) -> str | None:
     """Why this text cannot be a robot's model; None: by its form it can."""
     if len(text) > LARGEST_BYTES:
-        return f"is longer than {LARGEST_BYTES:,} letters"
+        return f"is longer than {LARGEST_BYTES:,} characters"
     if not _is_text(text):
-        return "is no XML: give a .xml file beside the profile"
+        return "is not XML: give a .xml file in the profile's folder"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        return "has a DOCTYPE or entities, which are not read"
+        return "has a DOCTYPE or entities, which are not allowed"
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:
-        return f"is no XML: {error}"
+        return f"is not XML: {error}"
     if root.tag != "mujoco":
-        return f"is no MJCF: its root is <{root.tag}>, not <mujoco>"
+        return f"is not MJCF: its root is <{root.tag}>, not <mujoco>"
     counts: Counter[str] = Counter()
     for element in root.iter():
         tag = str(element.tag)
         if tag in REFUSED:
-            return f"has a <{tag}>, which is not read"
+            return f"has a <{tag}>, which is not allowed"
         if "file" in element.attrib:
-            return f"names a file in a <{tag}>: no other file is opened"
+            return f"refers to a file in a <{tag}>: no other file is read"
         for key, value in element.attrib.items():
             if re.search(r"\b(nan|inf|infinity)\b", value, re.IGNORECASE) and key != "name":
-                return f"has {key}={value!r} in a <{tag}>, which is no finite number"
+                return f"has {key}={value!r} in a <{tag}>, which is not a finite number"
         counts["joint" if tag == "freejoint" else tag] += 1
     counts["actuator"] = sum(len(part) for part in root.iter("actuator"))
     for tag, most in MOST.items():
@@ -102,7 +107,7 @@ def mjcf_problem(text: str) -> str | None:
             sound = False
         if not sound:
             least, most_s = TIMESTEP_S
-            return f"has option timestep={given!r}, not from {least:g} to {most_s:g} s"
+            return f"has option timestep={given!r}, which must be from {least:g} to {most_s:g} s"
     return None
 
 

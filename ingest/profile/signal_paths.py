@@ -148,8 +148,8 @@ class SignalPath:
                     raise PathProblem(f"{step.name} does not repeat: write it without brackets")
             elif step.choice is None and bare in repeats:
                 raise PathProblem(
-                    f"{step.name} repeats: write {step.name}[0] for one element,"
-                    f" {step.name}[] for a list of all"
+                    f"{step.name} repeats: write {step.name}[0] for one element, or {step.name}[] "
+                    "for the list of all"
                 )
         for path in self.wanted(*ends):
             if path not in kinds:
@@ -158,7 +158,7 @@ class SignalPath:
             choice = self.steps[place].choice
             if choice and (_bare(path) in repeats) == (choice.key is not None):
                 raise PathProblem(
-                    f"{path!r} cannot tell elements apart: it is not one value an element"
+                    f"{path!r} cannot select an element: it does not have one value per element"
                 )
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
@@ -272,4 +272,4 @@ def offer(path: str, paths: list[str]) -> str:
     if near:
         return f"{problem}: did you mean {' or '.join(repr(name) for name in near)}?"
     shown = ", ".join(paths[:12]) + (f" and {len(paths) - 12} more" if len(paths) > 12 else "")
-    return f"{problem}: there are {shown}"
+    return f"{problem}: the fields are {shown}"

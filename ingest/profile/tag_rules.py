@@ -69,7 +69,7 @@ class TagRules(Checked, frozen=True):
         raise RecordingError(
             f"its path does not match {listed}, the from_path in {_TABLE}",
             where=place,
-            remedy='mend the pattern, add one for such paths (from_path = ["…", "…"]), or say'
+            remedy='correct the pattern, add one for such paths (from_path = ["…", "…"]), or give'
             f" {' '.join(f'--tag {name}=…' for name in sorted(asked))}",
         )
 
@@ -107,7 +107,7 @@ class TagRules(Checked, frozen=True):
             return sources, []
         some = ", ".join(repr(name[:40]) for name in left_out[:5])
         return sources, [
-            f"{len(left_out):,} names in its metadata are no tags ({some}"
+            f"{len(left_out):,} names in its metadata cannot be tags ({some}"
             f"{', …' if len(left_out) > 5 else ''}): too long, not printable, of several values, or"
             f" beyond the {MOST_TAGS}th"
         ]
@@ -157,7 +157,7 @@ def resolve_tags(
     kept = {name: value for name, value in before.items() if name not in told}
     if kept:
         notes.append(
-            f"tags kept from the ingest before: {in_words(kept)} (--tag NAME= takes one off)"
+            f"tags kept from the earlier ingest: {in_words(kept)} (--tag NAME= removes one)"
         )
     return Told({name: value for name, value in (told | kept).items() if value}, notes)
 
@@ -166,9 +166,9 @@ def _contradiction(
     name: str, first: tuple[str, str], other: tuple[str, str], where: str
 ) -> RecordingError:
     return RecordingError(
-        f"its tag {name!r} is {first[0][:80]!r} by {first[1]}, and {other[0][:80]!r} by {other[1]}",
+        f"its tag {name!r} is {first[0][:80]!r} in {first[1]}, but {other[0][:80]!r} in {other[1]}",
         where=where,
-        remedy=f"say which it is: --tag {name}={first[0][:80]} or --tag {name}={other[0][:80]}",
+        remedy=f"choose one: --tag {name}={first[0][:80]} or --tag {name}={other[0][:80]}",
     )
 
 
@@ -182,7 +182,7 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
     parts = list(_parts(pattern.removeprefix("/")))
     if not pattern.startswith("/") and "**" in parts and not re.match(r"[^{*?]", pattern):
         raise ValueError(
-            f"from_path {pattern!r}: with ** it must begin with a folder's own name, or with /"
+            f"from_path {pattern!r}: a pattern with ** must begin with a folder's name, or with /"
         )
     if "**" in parts[-1:] or not all(parts):
         raise ValueError(f"from_path {pattern!r}: its last part is the recording's name, such as *")
@@ -192,7 +192,7 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
     text += _of_part(last, pattern)
     names = re.findall(r"\(\?P<(\w+)>", text)
     if not names:
-        raise ValueError(f"from_path {pattern!r} names no tag: such as {{robot}}/*")
+        raise ValueError(f"from_path {pattern!r} contains no tag, such as {{robot}}/*")
     if doubled := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"from_path {pattern!r}: {{{doubled[0]}}} is in it twice")
     try:
@@ -224,7 +224,7 @@ def _of_part(part: str, pattern: str) -> str:
             end = _closing(rest)
             name, colon, fits = rest[1:end].partition(":")
             if not re.fullmatch(r"[A-Za-z_]\w*", name):
-                raise ValueError(f"from_path {pattern!r}: {{{name}}} is no name of a tag")
+                raise ValueError(f"from_path {pattern!r}: {{{name}}} is not a name of a tag")
             try:
                 re.compile(fits)
             except re.error as error:

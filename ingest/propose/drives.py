@@ -61,7 +61,7 @@ def propose_for_drives(
         RecordingError: there is no recording.
     """
     if not recordings:
-        raise RecordingError("no recording given", remedy="name at least one")
+        raise RecordingError("no recording given", remedy="give at least one")
     if len(recordings) == 1:
         return propose_profile(
             *(recordings[0], name),

@@ -37,7 +37,7 @@ ARMS = ("trajectory_msgs/msg/JointTrajectory", "control_msgs/", "moveit_msgs/")
 CAMERAS = re.compile(r"sensor_msgs/msg/(Image|CompressedImage|CameraInfo|PointCloud2?)$")
 ALONGSIDE = re.compile(r"tf2_msgs/|rcl_interfaces/|rosgraph_msgs/|std_msgs/|diagnostic_msgs/")
 RISES_M = 0.5  # of a pose between its 5th and 95th percentile: no floor's
-ON_WHEELS = "Restock is for robots on wheels: give a recording of one, with its velocity commands"
+ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its velocity commands"
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class RobotTraits:
             self.command.split("/")[-1],
         ]
         topics = ", ".join(sorted(name for name, _ in self.inputs))
-        return "; ".join(filter(None, told)) or topics or "nothing that tells of a robot"
+        return "; ".join(filter(None, told)) or topics or "nothing that describes a robot"
 
 
 def robot_traits(recording: Recording) -> RobotTraits:
@@ -188,22 +188,25 @@ def no_wheeled_robot(
     flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
     if not (command and located) and flying:
         told = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
-        return f"taken for a drone's recording (it has {told}): {ON_WHEELS}"
+        return f"this looks like a drone's recording (it has {told}): {ON_WHEELS}"
     rises_m, lifted = _rises_m(recording), _lifted(recording, command)
     if rises_m > RISES_M and (flying or lifted):
         told = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
-        return f"taken for a drone's recording (it rises by {rises_m:.1f} m, {told}): {ON_WHEELS}"
+        return (
+            f"this looks like a drone's recording (it rises by {rises_m:.1f} m, {told}): "
+            f"{ON_WHEELS}"
+        )
     if command:
         return None
     arm = sorted(t for t in types if t.startswith(ARMS))
     if arm and not located:
         told = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
-        return f"taken for an arm's recording ({told}): {ON_WHEELS}"
+        return f"this looks like a robot arm's recording ({told}): {ON_WHEELS}"
     rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
     if types and not rest and any(CAMERAS.search(t) for t in types):
         return (
-            "taken for a recording of cameras alone (it has images or point clouds, no velocity"
-            " command and no odometry): record the command and a pose beside them"
+            "this looks like a recording of sensors alone (it has images or point clouds, but no "
+            "velocity command and no odometry): also record the command and a pose"
         )
     return None
 

@@ -43,7 +43,7 @@ def profile_lines(
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
     lines = [
-        f"# Proposed from {recording.path.name}: check what stands in comments, then run",
+        f"# Proposed from {recording.path.name}: check the comments, then run",
         f"# restock profile check THIS_FILE {recording.path.name}",
         *(f"# NOT USABLE YET: {problem}" for problem in problems),
         *_trial_lines(trial),
@@ -73,8 +73,9 @@ def profile_lines(
         lines += seen.motion.lines()
     if seen.signals:
         lines += [
-            "# Custom signals: columns of the table, for conditions and queries. To have one, take",
-            "# away the first # of its lines; docs/profile.md says what a path may be.",
+            "# Custom signals: columns of the table, for conditions and queries. To use one, "
+            "remove",
+            "# the first # of its lines; docs/profile.md describes paths.",
             "",
         ]
     for signal in seen.signals:
@@ -126,7 +127,7 @@ def _trial_lines(trial: Trial) -> list[str]:
         return []
     most = [f"{reason} {count:,}" for reason, count in list(trial.dropped.items())[:3]]
     dropped = f" (dropped: {', '.join(most)})" if most else ""
-    return [f"# Of it come {trial.transitions:,} transitions, of {trial.ticks:,} ticks{dropped}."]
+    return [f"# It gives {trial.transitions:,} transitions from {trial.ticks:,} ticks{dropped}."]
 
 
 def _said(trial: Trial, *keys: str) -> list[str]:
@@ -154,7 +155,7 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
-        f"# {told} beyond {reached:g} {unit} were commanded, which the robot did not reach."
+        f"# {told} beyond {reached:g} {unit} were commanded, but not reached by the robot."
         for told, reached, unit in zip(
             ("Speeds", "Yaw rates"), commands.reached, ("m/s", "rad/s"), strict=True
         )
@@ -210,8 +211,8 @@ def steered_by(seen: Evidence) -> str:
     topic, kind = seen.roles["command"][0]
     if seen.turns.problem:
         return (
-            f"{topic.name} drives a robot that steers as a car, and {seen.turns.problem}: say in"
-            " [inputs.command] which it is, yaw_rate_radps, or steering_rad with wheelbase_m"
+            f"{topic.name} drives a robot that steers as a car, and {seen.turns.problem}: set in "
+            "[inputs.command] which one it is, yaw_rate_radps, or steering_rad with wheelbase_m"
         )
     path = kind.fields["steering_rad" if seen.turns.is_angle else "yaw_rate_radps"]
     if seen.turns.is_angle:
@@ -249,9 +250,9 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     return [
-        "[task.body]  # it decides what is near",
+        "[task.body]  # the outline, from which clearance is measured",
         f"# {footprint.source}"
-        + ("" if footprint.measured else ", or say --footprint LENGTHxWIDTH"),
+        + ("" if footprint.measured else ", or give --footprint LENGTHxWIDTH"),
         *(f"# {note}" for note in seen.footprint_notes),
         *_said(trial, "task.body"),
         f"length_m = {round(footprint.length_m, 4):g}",
@@ -340,9 +341,10 @@ def _input_lines(
         ),
         *(
             [
-                "# What the navigation stack proposes, by its name, beside the command that is"
-                f" driven ({seen.commands.topic}):",
-                "# part of the observation. Wrong where it comes after that command.",
+                "# The navigation stack's proposal, by its name. It is part of the observation,",
+                f"# beside the command that is driven ({seen.commands.topic}). Remove it if it "
+                "comes"
+                " after that command.",
             ]
             if role == "nav_command"
             else []

@@ -33,12 +33,12 @@ LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
 
 # What a recording lacks -> what to do about it.
 REMEDIES = {
-    "command": "record the topic that the robot is driven by (geometry_msgs/msg/Twist)",
-    "pose": "nothing says where the robot is; record a localisation, odometry, or the transforms"
-    " of /tf and /tf_static",
+    "command": "record the topic of the command that drives the robot (geometry_msgs/msg/Twist)",
+    "pose": "no topic contains the robot's pose; record localisation, odometry, or the transforms "
+    "of /tf and /tf_static",
 }
 INSTEAD_OF_COMMANDS = (
-    "; or, where the measured motion may stand in for commands, --odometry-as-command"
+    "; or, if the measured motion may be used as the command, add --odometry-as-command"
 )
 
 
@@ -94,7 +94,7 @@ def propose_profile(
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:
     """A profile from what was gathered, tried on the recording that it was gathered from.
 
-    With `goal_decided` its goal is not left out where this recording alone has few by hindsight.
+    With `goal_decided` its goal is not left out where this recording alone has few in hindsight.
     """
     recording = seen.recording
     missing = [
@@ -134,7 +134,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if seen.turns is not None and not seen.turns.problem:
         advice.append(Advice("inputs.command", steered_by(seen)))
     if seen.robot.guessed_steering and not seen.commands.steered:
-        advice.append(Advice("robot.drive", f"it seems to steer as a car: {seen.turned.why}"))
+        advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
@@ -163,13 +163,13 @@ def _by_rate(
         return seen, trial
     if other.seconds > GAIN * now.seconds:
         why = (
-            f"a tick a command makes rows of {now.seconds:.0f} s, one a period of"
-            f" {other.seconds:.0f} s: commands pause, and hold."
+            f"one tick per command gives {now.seconds:.0f} s of rows, one per period "
+            f"{other.seconds:.0f} s: commands pause, and hold."
         )
     elif other.even_s > UNEVEN * now.even_s and GAIN * other.seconds > now.seconds:
         why = (
-            f"a tick a command leaves {now.even_s:.0f} s that the twin can follow, one a period"
-            f" {other.even_s:.0f} s: commands come unevenly."
+            f"with one tick per command the twin can follow {now.even_s:.0f} s, with one per "
+            f"period {other.even_s:.0f} s: commands come unevenly."
         )
     else:
         return seen, trial

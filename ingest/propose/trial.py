@@ -64,7 +64,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     except RecordingError as error:
         return Trial(problem=f"{error.what}; {error.remedy}" if error.remedy else error.what)
     if not len(steps):
-        return Trial(problem="it holds no command, so the control clock has no tick")
+        return Trial(problem="it contains no command, so there are no steps")
     episodes = split(profile.task, steps)
     endings = Counter(episode.ended_by for episode in episodes.episodes)
     asked = _Advisor(profile, topics, steps, episodes)
@@ -129,12 +129,12 @@ class _Advisor:
                 if (number := self._with_age(name, age)) > GAIN * self.now
             ]
             text = (
-                f"{source.max_age_s:g} s drops {count:,} of {len(self.steps):,} ticks:"
-                f" {source.topic} is up to {ages.max(initial=0.0):.1f} s old;"
-                f" {self.now:,} transitions" + "".join(f", {one}" for one in tried)
+                f"{source.max_age_s:g} s drops {count:,} of {len(self.steps):,} ticks: "
+                f"{source.topic} is up to {ages.max(initial=0.0):.1f} s old; {self.now:,} "
+                "transitions" + "".join(f", {one}" for one in tried)
             )
             if name == "command" and tried:
-                text += " (right only where the robot drives on with its last command)"
+                text += " (correct only if the robot continues with its last command)"
             found.append(Advice(f"inputs.{name}.max_age_s", text))
         return found
 
@@ -167,8 +167,9 @@ class _Advisor:
         if number <= 2 * self.now:
             return []
         text = (
-            f"a tick a command makes {self.now:,} transitions; if the robot drives on with its last"
-            f' command, steps = "rate" and no inputs.command.max_age_s make {number:,}'
+            f"one tick per command gives {self.now:,} transitions; if the robot continues with "
+            "its last command, steps"
+            f' = "rate" without inputs.command.max_age_s gives {number:,}'
         )
         return [Advice("clock.steps", text)]
 
@@ -185,9 +186,10 @@ class _Advisor:
             return []
         body = self.profile.task.body
         text = (
-            f"by an outline of {body.length_m:g} x {body.width_m:g} m the lidar sees something"
-            f" nearer than {NEAR_M:g} m at {near:,} of {len(clearance):,} ticks, inside the robot"
-            f" at {inside:,}: these become near_collision and recovery. Measure it"
+            f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
+            f"nearer than {NEAR_M:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
+            f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
+            "robot"
         )
         return [Advice("task.body", text)]
 

@@ -236,8 +236,8 @@ class _Drifts:
         unstamped = any(STAMP not in topics[name].fields and len(inside[name]) for name in topics)
         if unstamped and spread > self.tolerance_ns:
             raise RecordingError(
-                f"log time and header stamps drift apart, and {source} places a message between two"
-                f" of its own only within {spread / NS:.2f} s (1st to 99th percentile), more than"
+                f"log time and header stamps drift apart, and {source} gives the time of a "
+                f"message only within {spread / NS:.2f} s (1st to 99th percentile), more than"
                 f" the {self.tolerance_ns / NS:g} s of half a control period",
                 remedy='set [clock] alignment = "log_time" in the profile',
             )

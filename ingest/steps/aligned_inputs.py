@@ -271,7 +271,7 @@ def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
     edges = Edges.of(frames, inputs.topics)
     if "pose" not in inputs.by_name and (why := edges.missing(frames.base, frames.fixed)):
         raise RecordingError(
-            why, remedy="mend `frames` in the profile; see `restock profile check`"
+            why, remedy="correct `frames` in the profile; see `restock profile check`"
         )
     named = {frame for name in ("goal", "plan") for frame in inputs.frames_of(name)}
     return edges.only({frames.base, frames.fixed, *named})
@@ -307,8 +307,8 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
         frames = sorted({*inputs.frames_of("goal"), *inputs.frames_of("plan")} - {""})
         if len(frames) > 1:
             notes.append(
-                f"goals and plans are in the frames {', '.join(frames)}, and are taken as if in"
-                " one: the profile has no [frames]"
+                f"goals and plans are in the frames {', '.join(frames)}, and are treated as if "
+                "they were in one frame: the profile has no [frames]"
             )
     return notes
 
@@ -326,6 +326,6 @@ def sideways_notes(source: Input, fields: Mapping[str, FieldColumn]) -> list[str
     if not count:
         return []
     return [
-        f"command: {count:,} of {len(aside):,} messages of {source.topic} ask for a speed sideways,"
-        f" up to {np.nanmax(np.abs(aside)):.2g} m/s: an action has none, and it is left out"
+        f"command: {count:,} of {len(aside):,} messages of {source.topic} contain a sideways "
+        f"speed, up to {np.nanmax(np.abs(aside)):.2g} m/s, which is ignored: actions have none"
     ]

@@ -96,7 +96,7 @@ class _ScanReducer:
         column = fields[path]
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             raise RecordingError(
-                f"{path!r} of {self.topic} is not one number a message",
-                remedy="mend `inputs.scan.fields` in the profile",
+                f"{path!r} of {self.topic} is not one number per message",
+                remedy="correct `inputs.scan.fields` in the profile",
             )
         return np.asarray(column, np.float64)

@@ -178,8 +178,8 @@ class Custom:
             for name, column in self.columns.items()
             if column.unread
         ] + [
-            f"signals.{name}: {count:,} of {len(column.values):,} messages have another length than"
-            f" {column.signal.length}: null"
+            f"signals.{name}: {count:,} of {len(column.values):,} messages do not have the length "
+            f"{column.signal.length}: null"
             for name, column in self.columns.items()
             if (count := column.of_other_length)
         ]

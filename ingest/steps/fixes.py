@@ -27,7 +27,7 @@ MAX_STD_M = 5.0  # of a fix, where it says and the profile does not
 TRACK_M = 1.0
 _BLOCK, _SIDES = 64, 16
 NO_FIX, UNCERTAIN, NOT_DRIVEN, NO_HEADING = (
-    *("no fix", "fix too uncertain", "heading unknown until it has driven"),
+    *("no fix", "fix too uncertain", "heading unknown until the robot has driven"),
     "no heading yet",
 )
 

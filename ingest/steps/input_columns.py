@@ -55,8 +55,8 @@ class InputColumns:
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             source = self.by_name[name]
             raise RecordingError(
-                f"{source.fields[key]!r} of {source.topic} is not one number a message",
-                remedy=f"mend `inputs.{name}.fields.{key}` in the profile",
+                f"{source.fields[key]!r} of {source.topic} is not one number per message",
+                remedy=f"correct `inputs.{name}.fields.{key}` in the profile",
             )
         return np.asarray(column, np.float64)
 

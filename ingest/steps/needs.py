@@ -88,7 +88,7 @@ def wanted_fields(
         have = ", ".join(sorted(available)) or "none"
         raise RecordingError(
             f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
-            remedy=f"its topics are {have}; choose another --profile or see `restock info`",
+            remedy=f"its topics are {have}; choose another --profile, or see `restock info`",
         )
     wanted: dict[str, list[str]] = {}
     optional = {FRAME_ID}
@@ -182,7 +182,7 @@ def input_problems(
         if (topic := available.get(camera.topic)) is None:
             continue
         if topic.type not in TYPES:
-            what = f"{camera.topic} holds {topic.type}, which is no image"
+            what = f"{camera.topic} holds {topic.type}, which is not an image"
             wrong.setdefault(what, []).append(f"cameras.{name}")
         elif leaves is not None and (field := other_field(topic.type, leaves[camera.topic])):
             has = f"its {topic.type} has no {field!r} as ROS defines it"

@@ -64,7 +64,7 @@ class TableCommits(StoreReader):
     def expect_folder(self) -> None:
         """Raises StoreError where there is a file in place of the store."""
         if self.path.folder is not None and self.path.folder.is_file():
-            raise StoreError("is a file, not a store", where=str(self.path), remedy="name a folder")
+            raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
 
     def allow_nulls(self, names: Collection[str]) -> None:
         """Let these signals be null: in a store of an older Restock the clearance of a robot
@@ -164,9 +164,9 @@ class TableCommits(StoreReader):
         for recording, ingest in instead_of.items():
             if shown.get(recording) != ingest:
                 raise StoreError(
-                    f"recording {recording} was ingested again meanwhile",
+                    f"recording {recording} was ingested again in the meantime",
                     where=str(self.path),
-                    remedy="try again; the store is as that ingest left it",
+                    remedy="try again; the store is in the state after that ingest",
                 )
 
     def again_on_conflict(self, work: Callable[[], T]) -> T:
@@ -186,7 +186,7 @@ class TableCommits(StoreReader):
         raise StoreError(
             f"other writers were faster {ATTEMPTS} times: {first_line(conflict)}",
             where=str(self.path),
-            remedy="try again when they are done; the store is as it was",
+            remedy="try again when they are done; the store is unchanged",
         )
 
 

@@ -43,8 +43,8 @@ _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
 _ENCODED = re.compile(r"%[0-9A-Fa-f]{2}")
 # What a server or a client says -> what it means, and what to do.
 _MEANINGS = (
-    ("NoSuchBucket|Bucket .* not found", "there is no such bucket",
-     "make it first, or mend the address"),
+    ("NoSuchBucket|Bucket .* not found", "this bucket does not exist",
+     "create it first, or correct the address"),
     ("InvalidAccessKeyId|InvalidClientTokenId", "the server does not know the access key",
      "check AWS_ACCESS_KEY_ID (and AWS_ENDPOINT_URL)"),
     ("SignatureDoesNotMatch", "the server refused the signature",
@@ -85,14 +85,14 @@ class Location:
             return cls(f"s3://{match['bucket']}" + (f"/{prefix}" if prefix else ""), None)
         if scheme := _SCHEME.match(text):
             raise StoreError(
-                f"a store cannot lie on {scheme[1]}:",
+                f"a store cannot be on {scheme[1]}:",
                 where=text,
-                remedy="name a folder, or s3://bucket/prefix",
+                remedy="give a folder, or s3://bucket/prefix",
             )
         if _ENCODED.search(str(Path(text).absolute())):
             # Delta's library takes it for an encoded character, and reads somewhere else.
             raise StoreError(
-                "a store cannot lie below a folder with a percent sign and two hex digits in it",
+                "the path of a store cannot contain a percent sign followed by two hex digits",
                 where=text,
                 remedy="choose another folder, or rename it",
             )

@@ -44,9 +44,9 @@ class RepeatedDrive:
 
     def __str__(self) -> str:
         return (
-            f"{self.rows:,} transitions ({self.share:.0%}) are those of {self.source_file}"
-            f" (recording {self.recording_id}, {self.share_of_other:.0%} of it) under other ids:"
-            " the same drive twice"
+            f"{self.rows:,} transitions ({self.share:.0%}) are also in {self.source_file} "
+            f"(recording {self.recording_id}, {self.share_of_other:.0%} of it), with other ids: "
+            "the same drive twice"
         )
 
 

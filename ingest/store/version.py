@@ -33,7 +33,7 @@ def parse_version(text: str) -> Version:
         raise StoreError(
             f"{text!r} is neither the number of a version nor a time",
             where="--version",
-            remedy="give 12, or a time such as 2026-11-01T08:00Z",
+            remedy="give a number such as 12, or a time such as 2026-11-01T08:00Z",
         ) from None
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
 
@@ -69,6 +69,6 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
     if not before:
         first = min(made.values()).isoformat(timespec="milliseconds")
         raise StoreError(
-            f"there was no version at {moment.isoformat()}: its first is of {first}", where=where
+            f"there was no version at {moment.isoformat()}: the first is from {first}", where=where
         )
     return max(before)

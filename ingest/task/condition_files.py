@@ -121,14 +121,16 @@ def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> d
         return ConfigError(f"`{key}.file` {what}", where=where, remedy=remedy)
 
     if "sql" in entry:
-        raise refused("stands beside `sql`: give one of them")
+        raise refused("is given together with `sql`: give only one of them")
     if not isinstance(name, str) or not name.endswith(".sql"):
         raise refused(f"must name a .sql file, got {name!r}")
     if folder is None:
-        raise refused("needs a profile that is a file: it is looked for beside it")
+        raise refused("needs a profile that is a file: the name is relative to its folder")
     path = (folder / name).resolve()
     if Path(name).is_absolute() or not path.is_relative_to(folder.resolve()):
-        raise refused(f"leads out of the profile's folder: {name}", "put it beside the profile")
+        raise refused(
+            f"is outside the profile's folder: {name}", "put it into the profile's folder"
+        )
     try:
         if path.stat().st_size > LARGEST_BYTES:
             raise refused(f"is larger than {LARGEST_BYTES:,} bytes: {name}")

@@ -26,10 +26,10 @@ SANDBOX: dict[str, str | bool | int | float | list[str]] = {
     "memory_limit": "4GB",
 }
 _REFUSED = {
-    "SUBQUERY": "it holds a query: a condition is one expression over the steps",
-    "STAR": "it holds *: name the columns",
-    "PARAMETER": "it holds a parameter",
-    "POSITIONAL_REFERENCE": "it names a column by its place: use its name",
+    "SUBQUERY": "it contains a query: a condition must be one expression over the steps",
+    "STAR": "it contains *: name the columns",
+    "PARAMETER": "it contains a parameter",
+    "POSITIONAL_REFERENCE": "it refers to a column by position: use its name",
 }
 # Macros of DuckDB's own that compute from their arguments alone; the others look around.
 _MACROS = ("list_", "array_")
@@ -86,7 +86,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
     if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
         return "it is more than one expression"
     if not _plain_query(node):
-        return "it closes its own bracket: a condition is one expression over the steps"
+        return "its brackets do not match: a condition must be one expression over the steps"
     for part in _walk(node["select_list"][0]):
         if reason := _refuse(part, timing):
             return reason
@@ -125,23 +125,23 @@ def _refuse(part: dict[str, Any], timing: str) -> str | None:
     if kind in _REFUSED:
         return _REFUSED[kind]
     if kind == "FUNCTION" and part["function_name"].lower() in _GROWING:
-        return f"{part['function_name']}() may grow without bound: it is not allowed here"
+        return f"{part['function_name']}() can use unlimited memory: it is not allowed here"
     if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
-        return f"{part['function_name']}() looks outside the steps: it is not allowed here"
+        return f"{part['function_name']}() reads data other than the steps: it is not allowed here"
     if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():
-        return f"{part['column_names'][-1]} looks outside the steps: it is not allowed here"
+        return f"{part['column_names'][-1]} reads data other than the steps: it is not allowed here"
     return _refuse_window(part, timing) if kind == "WINDOW" else None
 
 
 def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
     name = part["function_name"]
     if not any(_column(item) == "episode_index" for item in part["partitions"]):
-        return f"{name}() sees other episodes: write OVER episode, or OVER (episode ROWS …)"
+        return f"{name}() would see other episodes: write OVER episode, or OVER (episode ROWS …)"
     if timing == "post":
         return None
     ahead = f'timing is "pre", but {name}() may look at later steps: '
     if part["type"] not in _BACKWARD:
-        return ahead + 'say timing = "post"'
+        return ahead + 'set timing = "post"'
     orders = [(item["type"], _column(item["expression"])) for item in part["orders"]]
     if not orders or orders[0] not in [
         (kind, column)
@@ -156,7 +156,7 @@ def _refuse_window(part: dict[str, Any], timing: str) -> str | None:
         return ahead + "end its frame at CURRENT ROW"
     offset = part["arguments"][1:2] if part["type"] == "WINDOW_LAG" else []
     if not all(_constant(item["expression"]) for item in offset):
-        return ahead + "lag by a plain number"
+        return ahead + "give lag() a constant number"
     return None
 
 

@@ -86,12 +86,14 @@ class Condition(Checked, frozen=True):
             raise ValueError(f"uncertain must be [low, high] in [0, 1], got {self.uncertain}")
         if self.kind == "exposure" and (self.timing != "pre" or self.probability):
             raise ValueError(
-                f"an exposure is a situation known before acting: timing must be 'pre', without a"
-                f" probability, got timing {self.timing!r}"
+                f"an exposure is a situation known before acting: timing must be 'pre', and there "
+                f"can be no probability; got timing {self.timing!r}"
             )
         for name in (*self.constants, *self.let):
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-                raise ValueError(f"let and constants: a name is letters, digits and _: {name!r}")
+                raise ValueError(
+                    f"let and constants: a name must be letters, digits and _: {name!r}"
+                )
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name) or self.name == NOMINAL:
             raise ValueError(
                 f"name must be letters, digits and _, and not {NOMINAL!r}: {self.name!r}"
@@ -239,7 +241,7 @@ def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[st
         except pa.ArrowInvalid as error:
             raise ConfigError(f"its SQL gives {column.type}, not a number", where=where) from error
         if len(wrong := values[(values < 0) | (values > 1)]):
-            raise ConfigError(f"it must be in [0, 1], and gives {wrong[0]:.4g}", where=where)
+            raise ConfigError(f"it must be in [0, 1], but gives {wrong[0]:.4g}", where=where)
         found[condition.name] = values.astype(np.float32)
     return found
 
@@ -300,7 +302,7 @@ def _evaluate(
                         _query(connection, [(condition, part)])
                     except duckdb.Error as error:
                         raise ConfigError(
-                            f"its SQL does not run over the steps: {_first_line(error)}",
+                            f"its SQL fails on the steps: {_first_line(error)}",
                             where=_where(condition, part),
                             remedy=f"the steps have the columns {', '.join(steps.column_names)}",
                         ) from error
@@ -313,7 +315,7 @@ def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> 
     taken = {"row_", *(name.lower() for name in columns)}
     for name in (*condition.constants, *condition.let):
         if name.lower() in taken:
-            raise ConfigError(f"{name!r} is taken: give it another name",
+            raise ConfigError(f"{name!r} is already used: choose another name",
                               where=f"condition {condition.name!r}")  # fmt: skip
         taken.add(name.lower())
     for name, sql in (*condition.let.items(), ("", getattr(condition, which))):

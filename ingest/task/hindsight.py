@@ -1,4 +1,4 @@
-"""Goals by hindsight: where a drive got to is the goal of what led there (arXiv:1707.01495).
+"""Goals in hindsight: where a drive got to is the goal of what led there (arXiv:1707.01495).
 
 For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
 where it ended: where the robot stood still, where it turned back, a place that it visited often, or
@@ -23,7 +23,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.task import Task
 from restock.toml import Checked
 
-NO_MISSION = "goal: none by hindsight"  # what ticks without one are counted as
+NO_MISSION = "goal: none in hindsight"  # what ticks without one are counted as
 STANDING = f"{NO_MISSION}, standing still"
 NOWHERE = f"{NO_MISSION}, nowhere far enough"
 
@@ -38,7 +38,7 @@ GoalSource = Literal["logged", "hindsight"]
 class GoalRules(Checked, frozen=True):
     """The `[goal]` of a profile: where a route's goals come from."""
 
-    source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or by hindsight
+    source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or in hindsight
     still_s: Annotated[float, Meta(gt=0)] = 3.0  # that a robot stands for, to have arrived
     wait_s: Annotated[float, Meta(ge=0)] = 10.0  # of standing before it sets off: in its mission
     shortest_m: Annotated[float, Meta(gt=0)] | None = None  # start to goal; None: 3 goal radii
@@ -70,13 +70,13 @@ class Missions:
     def __str__(self) -> str:
         if not len(self.goals_m):
             return (
-                f"goals: none by hindsight, as the robot got nowhere {self.shortest_m:g} m from"
-                f" where it set off ({self.driven_m:.1f} m driven)"
+                f"goals: none in hindsight, as the robot was never {self.shortest_m:g} m from "
+                f"where it started ({self.driven_m:.1f} m driven)"
             )
         ends = Counter(self.ended_at).most_common()
         places = len(np.unique(self.goals_m, axis=0))
         return (
-            f"goals: by hindsight, over {self.driven_m:.0f} m driven; missions {len(self.goals_m)}"
+            f"goals: in hindsight, over {self.driven_m:.0f} m driven; missions {len(self.goals_m)}"
             f" ({', '.join(f'{why} {n}' for why, n in ends)}), places {places}; each mission"
             " arrives by construction, so no success is counted"
         )

@@ -40,8 +40,8 @@ class Lidar(Checked, frozen=True):
     def check(self) -> None:
         if not 0 < self.angle_max_rad - self.angle_min_rad <= 2 * math.pi + 1e-3:
             raise ValueError(
-                "angle_max_rad must be above angle_min_rad, by at most a full turn, got"
-                f" {self.angle_min_rad:g} and {self.angle_max_rad:g}"
+                "angle_max_rad must be greater than angle_min_rad, by at most a full turn; got "
+                f"{self.angle_min_rad:g} and {self.angle_max_rad:g}"
             )
 
 
@@ -77,11 +77,13 @@ class Robot(Checked, frozen=True):
         known = {*self.__struct_fields__, *(f"lidar.{n}" for n in Lidar.__struct_fields__)}
         for name in self.origin:
             if name not in known or name in ("origin", "lidar"):
-                raise ValueError(f"origin names no value of the robot: {name!r}")
+                raise ValueError(f"origin refers to a value that the robot does not have: {name!r}")
         if self.wheelbase_m is None and self.drive == "ackermann":
             raise ValueError("an ackermann robot needs wheelbase_m")
         if self.drive != "ackermann" and (self.max_steering_rad or self.max_steering_rate_radps):
-            raise ValueError(f"a robot of {self.drive} drive does not steer: no max_steering_*")
+            raise ValueError(
+                f"a robot with {self.drive} drive does not steer: leave out max_steering_*"
+            )
 
     @property
     def min_turning_radius_m(self) -> float:
@@ -118,8 +120,8 @@ def refuse_beyond_steering(
         raise ConfigError(
             f"`task.actions`: {problem}",
             where=where,
-            remedy="give the action more speed or less turn; where the steering allows more, say"
-            " so in [robot]",
+            remedy="give the action more speed or a lower yaw rate; or, if the robot can steer "
+            "tighter, correct [robot]",
         )
 
 

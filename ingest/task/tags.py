@@ -41,11 +41,12 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
             raise ConfigError(
                 f"{name} is given twice, as {tags[name]!r} and as {value!r}",
                 where=flag,
-                remedy="a recording has one value of a tag: ingest those of each by itself",
+                remedy="a recording has one value of a tag: ingest the recordings of each value "
+                "separately",
             )
     if len(tags) > MOST_TAGS:
         raise ConfigError(
-            f"{len(tags)} tags are more than the {MOST_TAGS} there may be", where=flag
+            f"{len(tags)} tags are too many: at most {MOST_TAGS} are allowed", where=flag
         )
     return tags
 
@@ -54,8 +55,8 @@ def tag_problem(name: str, value: str) -> str | None:
     """Why this cannot be a tag, or None."""
     if not 0 < len(name) <= LONGEST_NAME or "=" in name or not name.isprintable():
         return (
-            f"{name[: LONGEST_NAME + 1]!r} is no name of a tag: 1 to {LONGEST_NAME} characters,"
-            " without = and control characters"
+            f"{name[: LONGEST_NAME + 1]!r} is not a name of a tag: use 1 to {LONGEST_NAME} "
+            "characters, without = and control characters"
         )
     if len(value) > LONGEST_VALUE:
         return f"the value of {name} has {len(value):,} characters, more than {LONGEST_VALUE}"

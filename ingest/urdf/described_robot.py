@@ -72,7 +72,9 @@ def read_urdf(path: Path) -> str:
         ) from error
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"is no URDF: {error}", where=str(path), remedy="give the robot's URDF, as XML in UTF-8"
+            f"is not a URDF: {error}",
+            where=str(path),
+            remedy="give the robot's URDF, as XML in UTF-8",
         ) from error
 
 
@@ -122,7 +124,7 @@ def described_robot(
         values["lidar.z_m"] = lidar
     meshes = _meshes(description, boxes)
     if meshes:
-        notes.append(f"{meshes} links have meshes alone, whose size is in other files: left out")
+        notes.append(f"{meshes} links have only meshes, whose size is in other files: left out")
     rounded = {key: _rounded(value) for key, value in values.items()}
     return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
 
@@ -284,7 +286,7 @@ def _lidar_z(places: dict[str, Place], frame: str, floor: float, notes: list[str
     if not wanted or place is None or not np.isfinite(place.at_m).all():
         return None
     if place.rotation[2, 2] < 0.9:
-        notes.append(f"the lidar ({frame}) does not lie level, as the twin's does")
+        notes.append(f"the lidar ({frame}) is not level, unlike the twin's")
     if abs(place.at_m[1]) > 0.02:
         notes.append(f"the lidar ({frame}) is {place.at_m[1]:.2f} m to the left of the middle")
     return float(place.at_m[2]) - floor
@@ -303,8 +305,8 @@ def _no_wheels(description: Description, places: dict[str, Place], wheels: list[
     has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
         return (
-            f"{description.name!r} has {len(wheels)} wheels, but no driven pair on two sides whose"
-            " radius is known (a mesh has none): say wheel_radius_m and track_m in [robot]"
+            f"{description.name!r} has {len(wheels)} wheels, but no driven pair on both sides "
+            "with a known radius (a mesh has none): give wheel_radius_m and track_m in [robot]"
         )
     rotors = [
         joint

@@ -64,17 +64,17 @@ class Description:
 def read_description(text: str) -> Description | str:
     """A description, or why it cannot be used."""
     if len(text) > LONGEST:
-        return f"{len(text):,} letters are too long for a robot's description"
+        return f"{len(text):,} characters are too many for a robot's description"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        return "a robot's description declares no entities"
+        return "a robot's description must not declare entities"
     try:
         robot = ET.fromstring(text)  # no entities: checked above
     except (ET.ParseError, ValueError) as error:
-        return f"is no XML ({error})"
+        return f"is not XML ({error})"
     if any("${" in value for e in robot.iter() for value in e.attrib.values()):
-        return "is a xacro file, not a URDF: write it out first (`xacro FILE > robot.urdf`)"
+        return "is a xacro file, not a URDF: convert it first (`xacro FILE > robot.urdf`)"
     if robot.tag != "robot":
-        return f"is no URDF: it begins with <{robot.tag}>, not with <robot>"
+        return f"is not a URDF: it begins with <{robot.tag}>, not with <robot>"
     links = {str(link.get("name")): link for link in robot.findall("link")}
     if len(links) > MOST_LINKS:
         return f"{len(links):,} links are too many for a robot"

@@ -195,7 +195,9 @@ def test_an_unknown_encoding_and_a_short_raw_image_are_counted(tmp_path: Path) -
 
 
 def test_a_topic_that_is_no_image_is_refused_and_one_that_is_missing_said(bag: Path) -> None:
-    with pytest.raises(RecordingError, match=r"/odom holds nav_msgs/msg/Odometry, which is no im"):
+    with pytest.raises(
+        RecordingError, match=r"/odom holds nav_msgs/msg/Odometry, which is not an im"
+    ):
         ingest(bag, profile_with('[cameras.front]\ntopic = "/odom"\n'), store=None)
     missing = ingest(bag, profile_with('[cameras.front]\ntopic = "/nowhere"\n'), store=None)
     assert {"input": "cameras.front", "instead": "no frame: no message of /nowhere"} in (

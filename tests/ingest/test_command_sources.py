@@ -245,12 +245,12 @@ def test_a_recording_without_the_multiplexers_output_is_of_unknown_drivers(silen
 def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
     text = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").read_text()
     chain = "[command_through]\ntopic = '/chosen'\ntype = 'geometry_msgs/msg/Twist'\n"
-    with pytest.raises(ConfigError, match="`command_through` is given and no"):
+    with pytest.raises(ConfigError, match="`command_through` is given without"):
         parse_profile(
             text + chain + "fields = {speed_mps = 'linear.x', yaw_rate_radps = 'angular.z'}",
             where="p",
         )
-    with pytest.raises(ConfigError, match="does not say when it drives"):
+    with pytest.raises(ConfigError, match="does not show when this source drives"):
         parse_profile(text + SOURCES + chain + "fields = {speed_mps = 'linear.x'}", where="p")
 
 
@@ -258,10 +258,14 @@ def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
     ("old", "new", "said"),
     [
         ('"buttons[4]"', '"button[4]"', None),
-        ('pressed = "buttons[4]"', 'speed_mps = "axes[1]"', "does not say when it drives"),
+        (
+            'pressed = "buttons[4]"',
+            'speed_mps = "axes[1]"',
+            "does not show when this source drives",
+        ),
         ('pressed = "buttons[4]"', 'presed = "buttons[4]"', "unknown 'presed'"),
         ("[command_sources.teleop]", '[command_sources.""]', "1 to 64 printable"),
-        ("fields =", "optional = true\nfields =", "neither stop_holds nor optional"),
+        ("fields =", "optional = true\nfields =", "cannot have stop_holds or optional"),
     ],
 )
 def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, capsys):

@@ -100,11 +100,11 @@ def test_the_version_of_labels_follows_what_can_change_them():
             FILE.replace("wheel_speed_mps - 0.5", "lead(wheel_speed_mps) OVER episode"),
             "'over_mps",
         ),
-        (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is taken"),
+        (FILE.replace("let smooth_mps", "let pose_x_m"), "'pose_x_m' is already used"),
         (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "1.5"), "in \\[0, 1\\]"),
         (FILE.replace("1 / (1 + exp(-smooth_mps / lidar_noise_m))", "'much'"), "not a number"),
         (FILE.replace("1 / (1 +", "1 / (unheard_of +"), "probability of condition 'fast'"),
-        (FILE.replace("1 / (1 +", "1 / ((SELECT 1) +"), "holds a query"),
+        (FILE.replace("1 / (1 +", "1 / ((SELECT 1) +"), "contains a query"),
     ],
 )
 def test_a_probability_keeps_the_rules_of_a_label(text, said):

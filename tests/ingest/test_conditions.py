@@ -227,21 +227,21 @@ def test_a_condition_that_does_not_run_is_named():
 
 
 REFUSED = {
-    "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it holds a query",
-    "EXISTS (FROM duckdb_settings())": "it holds a query",
-    "clearance_m > (SELECT avg(clearance_m) FROM steps)": "it holds a query",
-    "read_text('/etc/passwd') IS NULL": "does not run over the steps",
-    "getenv('HOME') = 'x'": "does not run over the steps",
-    "current_setting('home_directory') = 'x'": "looks outside the steps",
-    "user = 'x'": "looks outside the steps",
-    "current_date > '2026-01-01'": "looks outside the steps",
-    "random() < 0.5": "looks outside the steps",
-    "age(TIMESTAMP '2026-01-01') > INTERVAL 1 DAY": "looks outside the steps",
-    "sleep_ms(100000) IS NULL": "looks outside the steps",
-    "length(repeat('x', 4000000000)) > 1": "may grow without bound",
-    "len(range(3000000000)) > 1": "may grow without bound",
-    "pg_get_viewdef('x') = 'x'": "looks outside the steps",
-    "ATTACH 'x.db'": "does not run over the steps",
+    "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it contains a query",
+    "EXISTS (FROM duckdb_settings())": "it contains a query",
+    "clearance_m > (SELECT avg(clearance_m) FROM steps)": "it contains a query",
+    "read_text('/etc/passwd') IS NULL": "fails on the steps",
+    "getenv('HOME') = 'x'": "fails on the steps",
+    "current_setting('home_directory') = 'x'": "reads data other than the steps",
+    "user = 'x'": "reads data other than the steps",
+    "current_date > '2026-01-01'": "reads data other than the steps",
+    "random() < 0.5": "reads data other than the steps",
+    "age(TIMESTAMP '2026-01-01') > INTERVAL 1 DAY": "reads data other than the steps",
+    "sleep_ms(100000) IS NULL": "reads data other than the steps",
+    "length(repeat('x', 4000000000)) > 1": "can use unlimited memory",
+    "len(range(3000000000)) > 1": "can use unlimited memory",
+    "pg_get_viewdef('x') = 'x'": "reads data other than the steps",
+    "ATTACH 'x.db'": "fails on the steps",
     "COPY steps TO 'x.csv'": "syntax error",
     "true); ATTACH 'x.db'; SELECT (true": "SELECT",
     "true; COPY steps TO 'x.csv'": "syntax error",
@@ -250,15 +250,15 @@ REFUSED = {
     "true) FROM steps WHERE (true": "syntax error",
     "true) UNION ALL SELECT (true": "more than one expression",
     "true /*": "comment",
-    "COLUMNS(*) > 1": "it holds *",
-    "$1": "it holds a parameter",
-    "max(clearance_m) OVER () > 1": "sees other episodes",
-    "lead(bumped) OVER episode": 'say timing = "post"',
+    "COLUMNS(*) > 1": "it contains *",
+    "$1": "it contains a parameter",
+    "max(clearance_m) OVER () > 1": "would see other episodes",
+    "lead(bumped) OVER episode": 'set timing = "post"',
     "max(bumped) OVER (episode ROWS BETWEEN 1 PRECEDING AND 1 FOLLOWING)": "at CURRENT ROW",
-    "lag(bumped, -1) OVER episode": "lag by a plain number",
+    "lag(bumped, -1) OVER episode": "give lag() a constant number",
     "max(bumped) OVER (PARTITION BY episode_index)": "write OVER episode",
     "max(bumped) OVER (PARTITION BY episode_index ORDER BY step_index DESC)": "write OVER episode",
-    "percent_rank() OVER episode > 0.5": 'say timing = "post"',
+    "percent_rank() OVER episode > 0.5": 'set timing = "post"',
 }
 
 
@@ -301,7 +301,7 @@ def test_times_with_a_zone_do_not_follow_the_machine(machine: str):
 def test_a_condition_sees_no_variable_of_the_program():
     secret = pa.table({"z": [1]})
     assert len(secret) == 1
-    with pytest.raises(ConfigError, match="it holds a query"):
+    with pytest.raises(ConfigError, match="it contains a query"):
         label(steps(3), [Condition("x", "pre", "(SELECT z FROM secret) = 1")])
 
 

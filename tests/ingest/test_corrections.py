@@ -118,7 +118,7 @@ def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
 
     (tmp_path / "amr.toml").write_text(WAREHOUSE)  # no such condition: kept, and said
     assert ingest(tmp_path) == 0
-    assert "2 of them speak of conditions or steps that are gone" in capsys.readouterr().out
+    assert "2 of them are about conditions or steps that no longer exist" in capsys.readouterr().out
     profile(tmp_path, HALF_WAY)
     assert ingest(tmp_path) == 0
     assert "2 corrections of its labels are kept" in capsys.readouterr().out
@@ -141,7 +141,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_not_corrected(store: Path) -
     with Store(store) as opened:
         recording = opened.sql("SELECT min(recording_id) FROM recordings").fetchall()[0][0]
     given = {recording: RecordingCorrections("another", [])}
-    with pytest.raises(StoreError, match="ingested again, or taken out"):
+    with pytest.raises(StoreError, match="ingested again or removed"):
         correct_store(StoreWriter(store), given)
 
 

@@ -160,10 +160,10 @@ def test_the_future_is_not_seen():
 @pytest.mark.parametrize(
     ("table", "said"),
     [
-        (signal("clearance_m", "v"), "`signals.clearance_m`: Restock has a column of that name"),
-        (signal("logged_ns", "v"), "`signals.logged_ns`: Restock has a column of that name"),
-        (signal("select", "v"), "`signals.select`: SQL has a word of that name"),
-        (signal("Speed", "v"), "`signals.Speed`: a name has small letters"),
+        (signal("clearance_m", "v"), "`signals.clearance_m`: Restock has a column of this name"),
+        (signal("logged_ns", "v"), "`signals.logged_ns`: Restock has a column of this name"),
+        (signal("select", "v"), "`signals.select`: this name is a keyword of SQL"),
+        (signal("Speed", "v"), "`signals.Speed`: a name consists of lower-case letters"),
         (signal("s", "a..b"), "`signals.s`: path 'a..b' cannot be read at '.b'"),
         (signal("s", "a[].b[]"), "`signals.s`: path 'a[].b[]' gives lists of lists"),
         (signal("s", "a", 'reduce = "min"'), "there is nothing to reduce"),
@@ -216,7 +216,7 @@ def test_check_says_what_the_topic_offers_instead(tmp_path, capsys):
         "`signals.b.path`: /joint_states: no field 'header.stmp': did you mean 'header.stamp' or"
         " 'header.frame_id'?",
         "`signals.c.path`: /joint_states: velocity repeats: write velocity[0] for one element,"
-        " velocity[] for a list of all",
+        " or velocity[] for the list of all",
     ]
     (row,) = [row for row in said["inputs"] if row["input"] == "signals.e"]
     assert (row["messages"], row[""]) == (0, "did you mean /bumper?")
@@ -367,11 +367,11 @@ def test_a_vector_has_one_length_and_others_are_null_and_counted():
     assert held[15:] == [None] * 15
     (row,) = steps.custom.rows()
     assert (row["type"], row["messages"], row["found"], row["unread"]) == ("list[2]", 4, 2, 2)
-    assert any("2 of 4 messages have another length than 2" in note for note in steps.notes)
+    assert any("2 of 4 messages do not have the length 2" in note for note in steps.notes)
 
 
 def test_a_vectors_length_is_part_of_what_a_column_means(tmp_path: Path):
-    with pytest.raises(ConfigError, match="a vector's length is of a list"):
+    with pytest.raises(ConfigError, match="the length of a vector needs a list"):
         parse_profile(with_signals(signal("s", "v[0]", "length = 2")), where="p")
     two, three, none = (
         parse_profile(with_signals(signal("s", "v[]", *more)), where="p").signals["s"].field("s")

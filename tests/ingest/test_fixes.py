@@ -233,7 +233,7 @@ def test_a_profile_is_proposed_and_no_fix_is_no_tick(bag, tmp_path, capsys):
     dropped = {one["reason"]: one["count"] for one in row["drops"]}
     assert dropped["pose: no fix"] == 5  # a second of ticks
     assert dropped["pose: fix too uncertain"] == 1
-    assert dropped["pose: heading unknown until it has driven"] >= 10
+    assert dropped["pose: heading unknown until the robot has driven"] >= 10
     with Store(store) as opened:
         rows = opened.sql("FROM transitions ORDER BY stamp_ns").to_arrow_table()
     at_s = (rows["pose_stamp_ns"].to_numpy() - 1_700_000_000 * 10**9) * 1e-9
@@ -260,7 +260,7 @@ def test_the_heading_of_an_imu_stands_in_for_the_track(tmp_path):
     at_s = (rows["pose_stamp_ns"].to_numpy() - 1_700_000_000 * 10**9) * 1e-9
     turned = rows["pose_yaw_rad"].to_numpy()
     assert turned == pytest.approx(drive(at_s)[2], abs=0.01)
-    with pytest.raises(ConfigError, match="has none of its own"):
+    with pytest.raises(ConfigError, match="which has no heading"):
         parse_profile(WAREHOUSE + "\n" + heading, where="warehouse.toml")
 
 

@@ -287,7 +287,7 @@ def test_frames_that_differ_without_transforms_are_said():
         ('[frames]\nbase = "map"\n[clock]', "fixed and base are the same frame"),
         ("[frames]\nmax_age_s = 0\n[clock]", "max_age_s must be above 0"),
         ("[frames]\nfixd = 3\n[clock]", "unknown key `frames.fixd`"),
-        ("[clock]", "`inputs.pose` is missing, and there is no `frames`"),
+        ("[clock]", "`inputs.pose` is missing, and so is `frames`"),
     ],
 )
 def test_what_a_profile_may_not_say_of_frames(frames, said):

@@ -1,4 +1,4 @@
-"""Goals by hindsight: where a drive got to is the goal of what led there."""
+"""Goals in hindsight: where a drive got to is the goal of what led there."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_bag_without_goals_becomes_missions_that_say_so(tmp_path, capsys) -> N
             "SELECT one.instead FROM (SELECT unnest(stand_ins) AS one FROM recordings)"
             " WHERE one.input = 'goal'"
         ).fetchall()
-        assert stand_in[0][0].startswith("by hindsight")
+        assert stand_in[0][0].startswith("in hindsight")
     assert main(["audit", str(tmp_path / "store"), "--json"]) in (0, 1)
     audits = {one["audit"]: one for one in json.loads(capsys.readouterr().out)["audits"]}
     assert audits["goals_by_hindsight"]["status"] == "info"
@@ -127,7 +127,7 @@ def test_no_feature_but_goal_and_route_changes_with_what_came_after(tmp_path, ca
 def test_a_robot_that_gets_nowhere_has_no_goal_and_the_proposal_says_so(tmp_path, capsys) -> None:
     _, file, said = proposed(Turntable(20.0), tmp_path, capsys)
     assert load_profile(file).task.goal == "none"
-    assert "by hindsight" in said["toml"]
+    assert "in hindsight" in said["toml"]
     assert said["transitions"] > 90
 
 
@@ -144,7 +144,7 @@ def test_the_key_is_checked_and_leaves_other_profiles_as_they_were(tmp_path) -> 
 
 def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
     _, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
-    with pytest.raises(ConfigError, match="by hindsight, and a robot on its way has none"):
+    with pytest.raises(ConfigError, match="in hindsight, which is not possible live"):
         LiveObserver(load_profile(file))
 
 

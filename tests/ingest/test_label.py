@@ -123,7 +123,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
         return found
 
     writer.rows = rows_and_a_rival  # type: ignore[method-assign]
-    with pytest.raises(StoreError, match="ingested again meanwhile"):
+    with pytest.raises(StoreError, match="ingested again in the meantime"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
 
@@ -132,17 +132,17 @@ def test_rows_without_their_episodes_ends_are_refused(store):
     writer = StoreWriter(store)
     original = writer.rows
     writer.rows = lambda *key: original(*key).replace_schema_metadata(None)  # type: ignore[method-assign]
-    with pytest.raises(StoreError, match="without the ends of their episodes"):
+    with pytest.raises(StoreError, match="lack the ends of their episodes"):
         relabel_store(writer, lambda name: [Condition("always", "pre", "true")])
 
 
 def test_wrong_usage(store, tmp_path, capsys):
     assert main(["label", str(tmp_path / "none")]) == 2
-    assert "no store, or an empty one" in capsys.readouterr().err
+    assert "there is no store, or it is empty" in capsys.readouterr().err
     bad = tmp_path / "bad.toml"
     bad.write_text(TEXT + SOON.format("lead(pose_x_mm) OVER episode > 2"))
     assert main(["label", str(store), "--profile", str(bad)]) == 2
-    assert "`condition[0].sql` ('soon'): its SQL does not run" in capsys.readouterr().err
+    assert "`condition[0].sql` ('soon'): its SQL fails" in capsys.readouterr().err
 
 
 def test_the_ends_are_kept_with_the_rows(store):

@@ -128,7 +128,7 @@ def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
     text = file.read_text()
     for wrong, what in (
         (text.replace("[motion]", "# [motion]").replace("window_s", "# window_s"), "no `motion`"),
-        (text.replace('"near_collision"', '"wheel_slip"'), "wheel_slip cannot be seen"),
+        (text.replace('"near_collision"', '"wheel_slip"'), "wheel_slip cannot be detected"),
         (text.replace("window_s = 0.", "window_s = -0."), "motion.window_s must be in"),
     ):
         file.write_text(wrong)

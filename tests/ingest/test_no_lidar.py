@@ -210,7 +210,7 @@ def test_a_quota_on_an_unknown_condition_says_why_it_is_empty(blind):
         line = next(line for line in plan.strata if line.name == "near_collision")
         assert (line.note, line.rows, line.missing_rows) == ("unknown: no lidar", 0, 0)
         refusing = parse_mixture(MIXTURE.format(more='shortfall = "refuse"'), where="mix.toml")
-        with pytest.raises(MixtureError, match=r"near_collision wants 40\.0%, and is unknown of"):
+        with pytest.raises(MixtureError, match=r"near_collision wants 40\.0%, and is unknown in"):
             plan_panel(store.connection, refusing, known)
 
 

@@ -56,16 +56,16 @@ def cameras() -> dict[str, tuple[str, TopicColumns]]:
     [
         (flight("/mavros/setpoint_velocity/cmd_vel"), "a drone's recording (it rises by 2.6 m"),
         (flight(None), "a drone's recording (it has trajectory_msgs/msg/MultiDOF"),
-        (arm(), "an arm's recording (it has trajectory_msgs/msg/JointTrajectory"),
-        (cameras(), "a recording of cameras alone"),
+        (arm(), "a robot arm's recording (it has trajectory_msgs/msg/JointTrajectory"),
+        (cameras(), "a recording of sensors alone"),
     ],
 )
 def test_it_is_said_once_what_it_is_taken_for(topics, said, tmp_path, capsys):
     bag = write_topics(topics, tmp_path / "bag", storage="mcap")
     assert main(["profile", "new", str(bag), "--json"]) == 3
     (problem,) = json.loads(capsys.readouterr().out)["problems"]
-    assert f"taken for {said}" in problem
-    assert problem.endswith(("with its velocity commands", "a pose beside them"))
+    assert f"this looks like {said}" in problem
+    assert problem.endswith(("with its velocity commands", "and a pose"))
 
 
 def test_a_robot_on_a_ramp_is_on_wheels(tmp_path, capsys):
@@ -81,8 +81,8 @@ def test_start_says_so_and_leaves_no_profile_to_edit(tmp_path, capsys):
         bag = write_topics(topics, tmp_path / f"bag{number}")
         assert main(["start", str(bag), "--out", str(out), "--json"]) == 3
         stopped = json.loads(capsys.readouterr().out)["stopped"]
-        assert stopped["why"].startswith("taken for a")
-        assert stopped["remedies"] == ["name recordings of a robot on wheels"]
+        assert stopped["why"].startswith("this looks like a")
+        assert stopped["remedies"] == ["give recordings of a robot on wheels"]
         assert not (out / "profile.toml").exists()
 
 

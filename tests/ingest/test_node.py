@@ -174,7 +174,7 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
         robot.sense(ranges=np.full(beams, nothing, np.float32))
         graph.fire()
         assert speeds(graph)[-1] == (0.0, 0.0)
-        assert pilot.reason == "scan: no beam says anything"
+        assert pilot.reason == "scan: no beam has a valid range"
         robot.drive()
     # Another type on a topic: left out.
     graph.send("/odom", message_class("std_msgs/msg/Bool")())

@@ -57,11 +57,11 @@ def test_zones_are_looked_up_in_order():
         ('topic = "/scan"', "topic = 3", "`inputs.scan.topic`: Expected `str`, got `int`"),
         ("sectors = 36", "sectors = 3", "task.sectors must be even and 4 or more, or 0, got 3"),
         ("sectors = 36", "sectors = 5", "task.sectors must be even and 4 or more, or 0, got 5"),
-        ("sectors = 36", "sectors = 0", "`task.sectors` is 0, which is of a robot without a lidar"),
+        ("sectors = 36", "sectors = 0", "`task.sectors` is 0 (a robot without a lidar)"),
         ("control_period_s = 0.2", "control_period_s = 0", "task.control_period_s must be above 0"),
         ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
         ('"recovery"', '"recvery"', "no condition named 'recvery'"),
-        ('"recovery"', '"recovery", "recovery"', "recovery given twice"),
+        ('"recovery"', '"recovery", "recovery"', "recovery is given twice"),
         (
             '{ x_m = "pose.pose',
             '{ x = "pose.pose',
@@ -103,7 +103,7 @@ def test_a_condition_of_ones_own():
 def test_a_name_that_is_nearly_one(tmp_path):
     with pytest.raises(ConfigError, match="did you mean 'turtlebot3'"):
         load_profile("turtlebot")
-    with pytest.raises(ConfigError, match="shipped are: turtlebot3, warehouse_amr"):
+    with pytest.raises(ConfigError, match="the shipped profiles are: turtlebot3, warehouse_amr"):
         load_profile(tmp_path / "none.toml")
 
 
@@ -124,7 +124,9 @@ def test_what_stands_in_is_said():
 
 def test_a_proposal_is_not_read_from_the_command_itself():
     text = TEXT.replace('"/cmd_vel_nav"', '"/cmd_vel"')
-    with pytest.raises(ConfigError, match=r"`inputs.nav_command.topic` is the command's own"):
+    with pytest.raises(
+        ConfigError, match=r"`inputs.nav_command.topic` is the topic of the command"
+    ):
         parse_profile(text, where="mine")
 
 
@@ -233,13 +235,13 @@ def test_a_condition_may_lie_in_a_file_beside_the_profile(tmp_path):
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ('file = "../tight.sql"', "`condition[0].file` leads out of the profile's folder"),
-        ('file = "/etc/passwd.sql"', "`condition[0].file` leads out of the profile's folder"),
-        ('file = "link.sql"', "`condition[0].file` leads out of the profile's folder"),
+        ('file = "../tight.sql"', "`condition[0].file` is outside the profile's folder"),
+        ('file = "/etc/passwd.sql"', "`condition[0].file` is outside the profile's folder"),
+        ('file = "link.sql"', "`condition[0].file` is outside the profile's folder"),
         ('file = "none.sql"', "`condition[0].file` cannot be read: none.sql"),
         ('file = "p.toml"', "`condition[0].file` must name a .sql file"),
         ('file = "big.sql"', "`condition[0].file` is larger than 100,000 bytes"),
-        ('file = "tight.sql"\nsql = "true"', "`condition[0].file` stands beside `sql`"),
+        ('file = "tight.sql"\nsql = "true"', "`condition[0].file` is given together with `sql`"),
         ('file = "bare.sql"', "missing key `condition[0].timing`"),
     ],
 )
@@ -265,7 +267,7 @@ def test_a_file_of_a_condition_stays_beside_the_profile(entry, said, tmp_path):
         ("clearance_m", "its SQL gives float, not a boolean"),
         ("clearance_m <", "its SQL cannot be read: syntax error"),
         ("lead(bumped) OVER episode", 'timing is "pre", but lead() may look at later steps'),
-        ("(SELECT content FROM read_text('/etc/passwd')) = ''", "it holds a query"),
+        ("(SELECT content FROM read_text('/etc/passwd')) = ''", "it contains a query"),
         ("getenv('HOME') = ''", "does not exist"),
     ],
 )

@@ -73,7 +73,7 @@ def test_commands_twice_a_second_make_no_gaps(tmp_path, capsys):
     assert profile.task.control_period_s == pytest.approx(0.5)
     assert profile.clock.max_gap_s > 2 * profile.task.control_period_s
     assert said["advice"] == [
-        {"key": "task.body", "text": "a guess, as nothing in the recording says: --footprint"}
+        {"key": "task.body", "text": "a guess, as the recording does not contain it: --footprint"}
     ]
 
 
@@ -138,7 +138,7 @@ def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):
     assert main(["profile", "check", str(file), str(bag)]) == 0
     out = capsys.readouterr().out
     assert "try: `recovery` holds on 48 of 48 transitions" in out
-    assert "try: `task.body`: by an outline of 0.6 x 0.5 m" in out
+    assert "try: `task.body`: with an outline of 0.6 x 0.5 m" in out
     other = tmp_path / "small"
     other.mkdir()
     small = Commanded(10.0, nearest_m=0.28)

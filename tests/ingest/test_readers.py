@@ -419,7 +419,7 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
         everything(recording)
         lost = [account for account in recording.accounts.values() if account.lost]
         assert [account.lost for account in lost] == [5]
-        assert recording.lost_messages[0].reason == "counted by the container, but not in it"
+        assert recording.lost_messages[0].reason == "counted by the container, but missing"
 
 
 def without_summary(path: Path, *, missing: int) -> Path:

@@ -91,7 +91,7 @@ def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
     footprint = link("base_footprint") + joint("base_footprint", "0 0 -0.12", kind="fixed")
     found = of(robot(wheels((0, 0.2), (0, -0.2), radius=mesh), footprint))
     assert found.values["wheel_radius_m"] == pytest.approx(0.07)
-    assert "meshes alone" in found.notes[-1]
+    assert "only meshes" in found.notes[-1]
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_wheel_that_is_a_mesh_stands_on_the_floor() -> None:
             robot(*(link(rotor) + joint(rotor, "1 0 0", "0 0 1") for rotor in "abcd")),
             "looks like a drone",
         ),
-        (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on two sides"),
+        (robot(wheels((0, 0.2), (0.1, 0.2))), "no driven pair on both sides"),
     ],
 )
 def test_what_does_not_roll_is_named(text: str, message: str) -> None:
@@ -120,12 +120,15 @@ def test_what_does_not_roll_is_named(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<robot", "is no XML"),
-        ("<!DOCTYPE r [<!ENTITY a 'ha'><!ENTITY b '&a;&a;'>]><robot>&b;</robot>", "no entities"),
-        ("<!DOCTYPE r SYSTEM 'file:///etc/passwd'><robot/>", "no entities"),
+        ("<robot", "is not XML"),
+        (
+            "<!DOCTYPE r [<!ENTITY a 'ha'><!ENTITY b '&a;&a;'>]><robot>&b;</robot>",
+            "must not declare entities",
+        ),
+        ("<!DOCTYPE r SYSTEM 'file:///etc/passwd'><robot/>", "must not declare entities"),
         (robot(wheels((0, 0.2), (0, -0.2))).replace("0.8 0.5", "${length} 0.5"), "xacro file"),
         ("<sdf version='1.6'/>", "begins with <sdf>"),
-        ("<robot>" + "<link name='a'/>" + " " * 4_000_000 + "</robot>", "too long"),
+        ("<robot>" + "<link name='a'/>" + " " * 4_000_000 + "</robot>", "too many"),
         ("<robot>" + "".join(f"<link name='{i}'/>" for i in range(6000)) + "</robot>", "too many"),
     ],
 )

@@ -122,7 +122,7 @@ def both(place: str) -> list[str]:
 
 def test_a_bucket_that_is_not_there_is_named(s3_server):
     for said in both("s3://no-such-bucket/store"):
-        assert said.startswith("s3://no-such-bucket/store: there is no such bucket\n")
+        assert said.startswith("s3://no-such-bucket/store: this bucket does not exist\n")
 
 
 def test_a_server_that_is_not_there_is_said_so(s3_server, monkeypatch, hurried):
@@ -189,4 +189,4 @@ def test_no_store_where_there_is_none(s3_server, run):
     assert f"s3://{BUCKET}/nothing: no such store" in err
     code, _, err = run("sql", "gs://bucket/store", "FROM coverage")
     assert code == 2
-    assert "cannot lie on gs:" in err
+    assert "cannot be on gs:" in err

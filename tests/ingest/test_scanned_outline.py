@@ -66,13 +66,13 @@ def test_no_outline_reaches_to_what_the_lidar_saw(tmp_path, capsys):
     profile, text = proposed(tmp_path, capsys, Turning(12.0))
     body = profile.task.body
     assert (body.length_m, body.width_m) == (pytest.approx(0.4), pytest.approx(0.4))
-    assert "by the lidar, which saw nothing nearer than 0.25 m: MEASURE IT" in text
+    assert "from the lidar, which saw nothing nearer than 0.25 m: MEASURE IT" in text
 
 
 def test_a_robot_that_kept_away_is_as_large_as_guessed(tmp_path, capsys):
     profile, text = proposed(tmp_path, capsys, Turning(12.0, nearest_m=0.9))
     assert (profile.task.body.length_m, profile.task.body.width_m) == (0.6, 0.5)
-    assert "A GUESS, as nothing in the recording says" in text
+    assert "A GUESS, as the recording does not contain it" in text
 
 
 def test_one_odd_return_makes_no_robot_smaller(tmp_path, capsys):

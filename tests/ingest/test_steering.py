@@ -70,7 +70,7 @@ def test_drives_of_the_twin_tell_a_robot_that_steers(name: str, seed: int) -> No
     found = shown(name, seed, spot=True)
     assert (found.steers, found.pivots) == (name == "ackermann", name != "ackermann")
     if found.steers:
-        assert "told to turn on the spot, by" in found.why
+        assert "commanded to turn on the spot, by" in found.why
         tightest_m = CAR.wheelbase_m / math.tan(CAR.max_steering_rad)
         assert found.turning_m == pytest.approx(tightest_m, rel=0.15)
 
@@ -82,7 +82,7 @@ def test_a_robot_that_was_never_asked_to_turn_on_the_spot_is_no_car(name: str, s
     assert not found.pivots
     assert not found.steers or name == "ackermann"
     if not found.steers:
-        assert "never turned on the spot, nor was it told to" in found.why
+        assert "never turned on the spot, and was never commanded to" in found.why
 
 
 def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
@@ -150,8 +150,11 @@ def test_a_proposal_names_a_robot_that_steers_with_its_evidence(
     source = bag(tmp_path / "bag", pivots=False)
     assert main(["profile", "new", str(source), "--out", str(file), "--json"]) == 0
     advice = {one["key"]: one["text"] for one in json.loads(capsys.readouterr().out)["advice"]}
-    assert "it seems to steer as a car: told to turn on the spot, by 6.3" in advice["robot.drive"]
-    assert "# CONFIRM THAT IT STEERS AS A CAR" in file.read_text()
+    assert (
+        "it seems to steer like a car: commanded to turn on the spot, by 6.3"
+        in advice["robot.drive"]
+    )
+    assert "# CONFIRM THAT IT STEERS LIKE A CAR" in file.read_text()
     profile = load_profile(file)
     assert profile.robot is not None
     assert profile.robot.drive == "ackermann"
@@ -167,7 +170,7 @@ def test_a_proposal_says_that_a_robot_turned_on_the_spot(tmp_path: Path) -> None
 
 
 REAL = {
-    "jetacker": "CONFIRM THAT IT STEERS AS A CAR: told to turn on the spot",
+    "jetacker": "CONFIRM THAT IT STEERS LIKE A CAR: commanded to turn on the spot",
     "robots/racecar-ackermann/BIGPATH.bag": "its commands are steering angles",
 }
 

@@ -294,7 +294,7 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
 @pytest.mark.parametrize(
     ("place", "said"),
     [
-        ("gs://bucket/store", "cannot lie on gs:"),
+        ("gs://bucket/store", "cannot be on gs:"),
         ("some%20where/store", "percent sign"),
     ],
 )

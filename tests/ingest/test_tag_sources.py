@@ -117,10 +117,10 @@ def test_hostile_metadata_is_bounded_and_counted(tmp_path):
     assert len(rest[2]) == MOST_ENTRIES - 1
     assert r"key \xff\xfe\xfd07" in rest[2]
     left_out = 1 + 5_000 - (MOST_ENTRIES - 1)
-    assert notes[0].startswith(f"{left_out:,} entries of its metadata: no text, longer than")
+    assert notes[0].startswith(f"{left_out:,} entries of its metadata: not text, longer than")
     told = resolve_tags(TagRules(), path, [large, rest], {}, {})
     assert len(told.tags) == MOST_TAGS
-    assert f"{MOST_ENTRIES - MOST_TAGS:,} names in its metadata are no tags" in told.notes[0]
+    assert f"{MOST_ENTRIES - MOST_TAGS:,} names in its metadata cannot be tags" in told.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -185,14 +185,14 @@ def test_patterns_of_paths(pattern, path, tags):
 @pytest.mark.parametrize(
     ("table", "says"),
     [
-        ('from_path = "*/x"', "names no tag"),
-        ('from_path = "{robot}/**"', "with ** it must begin with a folder's own name"),
+        ('from_path = "*/x"', "contains no tag"),
+        ('from_path = "{robot}/**"', "a pattern with ** must begin with a folder's name"),
         ('from_path = "fleet/{robot}/**"', "its last part is the recording's name"),
-        ('from_path = "{a b}/*"', "{a b} is no name of a tag"),
+        ('from_path = "{a b}/*"', "{a b} is not a name of a tag"),
         ('from_path = "{a/*"', "its braces do not match"),
         ('from_path = "{a:[}/*"', "unterminated character set"),
         ('from_path = ["{a}/*", "{a}/{a}"]', "{a} is in it twice"),
-        ('from_metadata = { "a=b" = "c" }', "'a=b' is no name of a tag"),
+        ('from_metadata = { "a=b" = "c" }', "'a=b' is not a name of a tag"),
         ('from_folder = "{a}/*"', "from_folder"),
     ],
 )
@@ -217,10 +217,10 @@ def test_sources_that_agree_or_add_to_each_other():
 @pytest.mark.parametrize(
     ("name", "own", "says"),
     [
-        ("robot", [("a", "", "x")], "'x' by a, and 'amr-07' by its path ({site}/{robot}/*)"),
-        ("map", [("a", "", "x"), ("b", "", "y")], "'x' by a, and 'y' by b"),
-        ("map", [("a", "left", "x"), ("b", "right", "y")], "'x' by a, and 'y' by b"),
-        ("line", [("a", "", "x"), ("b", "", "y")], "'x' by a, and 'y' by b"),
+        ("robot", [("a", "", "x")], "'x' in a, but 'amr-07' in its path ({site}/{robot}/*)"),
+        ("map", [("a", "", "x"), ("b", "", "y")], "'x' in a, but 'y' in b"),
+        ("map", [("a", "left", "x"), ("b", "right", "y")], "'x' in a, but 'y' in b"),
+        ("line", [("a", "", "x"), ("b", "", "y")], "'x' in a, but 'y' in b"),
     ],
 )
 def test_sources_that_contradict_each_other(name, own, says):
@@ -228,7 +228,7 @@ def test_sources_that_contradict_each_other(name, own, says):
     with pytest.raises(RecordingError) as refused:
         resolve_tags(RULES, PLACE, said, {}, {})
     assert f"its tag {name!r} is {says}" in refused.value.what
-    assert f"say which it is: --tag {name}=x or --tag {name}=" in str(refused.value.remedy)
+    assert f"choose one: --tag {name}=x or --tag {name}=" in str(refused.value.remedy)
     told = resolve_tags(RULES, PLACE, said, {name: "decided"}, {})
     assert told.tags[name] == "decided"
 
@@ -238,7 +238,7 @@ def test_records_that_mean_two_things_by_a_name():
     own = [("l", "left", {"serial": "1"}), ("r", "right", {"serial": "2"})]
     told = resolve_tags(TagRules(), PLACE, own, {}, {})
     assert told.tags == {}
-    assert "1 names in its metadata are no tags ('serial')" in told.notes[0]
+    assert "1 names in its metadata cannot be tags ('serial')" in told.notes[0]
     rules = TagRules(from_metadata={"lidar": "left.serial", "site": "nowhere"})
     assert resolve_tags(rules, PLACE, own, {}, {}).tags == {"lidar": "1", "serial": "2"}
 

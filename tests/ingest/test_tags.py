@@ -77,7 +77,7 @@ def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     assert (row["status"], row["version"]) == ("tagged", 2)
     assert row["tags"] == {"robot": "amr-07", "site": "oslo"}
     assert row["notes"] == [
-        "tags kept from the ingest before: site=oslo (--tag NAME= takes one off)"
+        "tags kept from the earlier ingest: site=oslo (--tag NAME= removes one)"
     ]
     assert asked(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
     assert asked(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
@@ -106,12 +106,12 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
     [
         (["robot"], "'robot' is not KEY=VALUE"),
         (["robot="], "'robot=' is not KEY=VALUE"),
-        (["=amr"], "'' is no name of a tag"),
-        ([f"{'r' * 65}=a"], "r' is no name of a tag: 1 to 64 characters"),
+        (["=amr"], "'' is not a name of a tag"),
+        ([f"{'r' * 65}=a"], "r' is not a name of a tag: use 1 to 64 characters"),
         (["robot=a", "robot=b"], "robot is given twice, as 'a' and as 'b'"),
         ([f"robot={'x' * 257}"], "the value of robot has 257 characters, more than 256"),
         (["robot=\x1b[2J"], "the value of robot has control characters"),
-        ([f"t{n}=x" for n in range(MOST_TAGS + 1)], "65 tags are more than the 64 there may be"),
+        ([f"t{n}=x" for n in range(MOST_TAGS + 1)], "65 tags are too many: at most 64 are allowed"),
     ],
 )
 def test_tags_of_another_form_are_refused(texts, says):

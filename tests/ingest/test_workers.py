@@ -89,8 +89,8 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (MemoryError(), "memory ran out\n  with fewer --workers"),
-        (KeyError("x"), "a defect of Restock: KeyError: 'x' (test_workers.py, line "),
+        (MemoryError(), "out of memory\n  use fewer --workers"),
+        (KeyError("x"), "a bug in Restock: KeyError: 'x' (test_workers.py, line "),
     ],
 )
 def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatch, error, said):

@@ -89,10 +89,10 @@ class FileBytes:
             part = os.pread(self._file.fileno(), left, stop - left)
             if not part:
                 raise RecordingError(
-                    f"it shrank while it was read: {self._size:,} bytes when it was opened, and"
-                    f" {self.path.stat().st_size:,} now",
+                    f"it shrank while it was read: it had {self._size:,} bytes when it was "
+                    f"opened, and has {self.path.stat().st_size:,} now",
                     where=str(self.path),
-                    remedy="read it when nothing writes it any more, or read a copy",
+                    remedy="read it when nothing writes to it, or read a copy",
                 )
             parts.append(part)
             left -= len(part)

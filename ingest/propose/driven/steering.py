@@ -82,16 +82,19 @@ class DriveEvidence:
         if self.pivots:
             turned = max(self.pivoted_rad, self.followed_rad)
             return f"it turned on the spot, by {turned:.1f} rad in all"
-        asked = f"told to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
+        asked = f"commanded to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
         asked += f" {max(self.followed_rad, 0.0):.1f}"
         if self._declined:
             return f"{asked}, though it drove {self.driven_m:.1f} m"
         if self.stops_at_m is not None:
-            return f"told to turn tighter it stayed on circles of {self.stops_at_m:.2g} m and more"
+            return (
+                f"commanded to turn tighter, it stayed on circles of {self.stops_at_m:.2g} m and "
+                "more"
+            )
         if self.asked_rad:
             return f"{asked}: too little to tell"
         turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
-        return f"in {turns} it never turned on the spot, nor was it told to"
+        return f"in {turns} it never turned on the spot, and was never commanded to"
 
     @staticmethod
     def joined(drives: Sequence[DriveEvidence]) -> DriveEvidence:

@@ -66,8 +66,9 @@ def camera_lines(cameras: list[CameraTopic]) -> list[str]:
     if not cameras:
         return []
     lines = [
-        "# Cameras: frames kept beside the rows, as recorded. To keep one's, take away the first #",
-        "# of its lines; docs/profile.md says what is kept.",
+        "# Cameras: frames kept beside the rows, as recorded. To keep those of one, remove the "
+        "first #",
+        "# of its lines; docs/profile.md describes what is kept.",
         "",
     ]
     for camera in cameras:

@@ -68,7 +68,7 @@ class Candidate:
             f"topic = {json.dumps(self.topic.name)}",
             f'type = "{self.topic.type}"',
             f"path = {json.dumps(self.path)}",
-            f'unit = "{unit}"' + ("" if self.unit else "  # a guess: say which"),
+            f'unit = "{unit}"' + ("" if self.unit else "  # a guess: check it"),
         ]
         if max_age_s is not None:
             lines.append(f"max_age_s = {max_age_s:g}")

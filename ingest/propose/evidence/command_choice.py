@@ -39,7 +39,7 @@ class CommandChoice:
 
     lines: list[str] = field(default_factory=list)
     policy: str = "unknown"
-    why: str = "who drove, where no topic says"
+    why: str = "the driver, if no topic tells"
 
     def toml(self, wheelbase_m: float) -> list[str]:
         """The tables; a source that steers does so about the command's wheelbase."""

@@ -48,7 +48,9 @@ class Footprint:
         return low <= self.length_m <= high and low <= self.width_m <= high
 
 
-GUESS = Footprint(0.6, 0.5, "A GUESS, as nothing in the recording says: MEASURE IT", measured=False)
+GUESS = Footprint(
+    0.6, 0.5, "A GUESS, as the recording does not contain it: MEASURE IT", measured=False
+)
 
 
 def parse_footprint(text: str) -> Footprint:

@@ -20,7 +20,7 @@ class GoalChoice:
 
     @classmethod
     def of(cls, *, logged: bool) -> GoalChoice:
-        """Where goals and plans were not recorded, they come by hindsight."""
+        """Where goals and plans were not recorded, they come in hindsight."""
         return cls("logged" if logged else "hindsight")
 
     def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
@@ -28,7 +28,9 @@ class GoalChoice:
         without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
         if self.source != "hindsight" or without <= transitions:
             return self
-        return GoalChoice(None, f"by hindsight {without:,} ticks have none, {transitions:,} one")
+        return GoalChoice(
+            None, f"in hindsight, {without:,} ticks have no goal and {transitions:,} have one"
+        )
 
     def task_lines(self, length_m: float) -> list[str]:
         """What [task] says of it, for a robot of this length."""
@@ -52,6 +54,6 @@ class GoalChoice:
             return []
         return [
             "[goal]  # no goal and plan seen",
-            'source = "hindsight"  # where a drive stopped, turned back or came by often',
+            'source = "hindsight"  # where a drive stopped, turned back or passed often',
             "",
         ]

@@ -38,7 +38,8 @@ class MotionChoice:
 
     def lines(self) -> list[str]:
         return [
-            "[motion]  # no odometry: speeds are the slope of the last poses; slip cannot be seen",
+            "[motion]  # no odometry: speeds are the slope of the last poses; slip cannot be "
+            "detected",
             *(f"# {comment}" for comment in self.comments),
             f"window_s = {self.window_s:g}",
             "",
@@ -118,13 +119,13 @@ def fix_lines(recording: Recording, topic: str) -> list[str]:
     """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
     fixes = fixes_in(recording, topic)
     origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
-    how = "they do not say how good they are" if usual is None else f"of {usual:.2g} m, mostly"
+    how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
     return [
         f"# Metres east and north of the origin; fixes {how}. Yaw is the direction of the last",
         "# track_m driven (backing up looks turned round), or by an IMU that knows north:",
         "# [inputs.heading], with orientation of sensor_msgs/msg/Imu.",
         *([f"origin_deg = [{origin[0]:.7f}, {origin[1]:.7f}]  # the first fix"] if origin else []),
-        f"max_std_m = {MAX_STD_M:g}  # a fix that says it is worse is none",
+        f"max_std_m = {MAX_STD_M:g}  # fixes with a larger standard deviation are not used",
         f"track_m = {max(TRACK_M, round(3 * (usual or 0.0), 1)):g}",
     ]
 

@@ -33,7 +33,7 @@ class RobotProposal:
     origin: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rolls: bool = True  # False: a description says that it has no wheels
-    drive_why: str = "A GUESS: nothing says"
+    drive_why: str = "A GUESS: the recording does not tell"
 
     @property
     def described(self) -> bool:
@@ -70,7 +70,7 @@ class RobotProposal:
             why = "its commands are steering angles"
             sharpest = max(sharpest, told_rad)
         else:
-            why = f"CONFIRM THAT IT STEERS AS A CAR: {shown.why}"
+            why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
             if shown.turning_m is not None:
                 sharpest = math.atan(wheelbase_m / shown.turning_m)
         if sharpest != USUAL_STEERING_RAD:
@@ -100,9 +100,9 @@ class RobotProposal:
         own = {key: value for key, value in values.items() if "." not in key}
         lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
         drive, told = own.pop("drive", None), self.described
-        guess = {} if told else {"wheelbase_m": "  # A GUESS by the outline: MEASURE IT"}
+        guess = {} if told else {"wheelbase_m": "  # A GUESS from the outline: MEASURE IT"}
         lines = [
-            "[robot]  # what the twin builds; what is left out follows from the outline's size",
+            "[robot]  # what the twin builds; missing values follow from the size of the outline",
             *(f"# {note}" for note in notes),
             *([] if told else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
             f'drive = "{drive or "differential"}"',

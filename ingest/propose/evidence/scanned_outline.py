@@ -67,7 +67,7 @@ class ScannedOutline:
         return Footprint(
             length,
             width,
-            f"A GUESS by the lidar, which saw nothing nearer than {self.nearest_m:.2f} m{parts}:"
+            f"A GUESS from the lidar, which saw nothing nearer than {self.nearest_m:.2f} m{parts}:"
             " MEASURE IT",
             measured=False,
         )
@@ -151,7 +151,7 @@ def _range_m(
     own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
     why = ""
     if low < LEAST_RANGE_M:
-        low, why = LEAST_RANGE_M, "  # the lidar says less; 0 is where nothing came back"
+        low, why = LEAST_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
     if own_m > low:
         low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
     return round(low, 3), min(round(high, 3), 4.0), why
@@ -186,5 +186,5 @@ def with_lidar(footprint: Footprint, place: tuple[float, float, str] | None) -> 
     if place is None or abs(place[0]) > footprint.length_m / 2:
         return footprint
     x, yaw, base = place
-    source = f"of {base}, by transforms; that the middle is there is a guess"
+    source = f"of {base}, by transforms; that this is the middle is a guess"
     return replace(footprint, lidar_x_m=x, lidar_yaw_rad=yaw, lidar_source=source)
