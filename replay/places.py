@@ -58,7 +58,7 @@ def open_place(
     with duckdb.connect() as connection:
         if not _add(connection, path, "main"):
             raise StoreError(
-                "neither a store, a run nor a panel" if path.exists() else "nothing is there",
+                "it is not a store, a run or a panel" if path.exists() else "it does not exist",
                 where=str(path),
                 remedy=f"`restock ingest RECORDINGS --store {path}` makes a store",
             )

@@ -103,13 +103,13 @@ def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
     robots = sorted({row["robot"] for row in periods})
     if "untagged" in robots:
         notes.append(
-            "Recordings without the tag `robot` are taken for one robot, untagged:"
-            " `restock ingest --tag robot=NAME` tells robots apart."
+            "Recordings without the tag `robot` count as one robot, untagged. Use `restock ingest "
+            "--tag robot=NAME` to tell robots apart."
         )
     for robot in robots:
         seen = {row["period"] for row in periods if row["robot"] == robot}
         if len(seen) == 1:
-            notes.append(f"{robot} drove in one {every} only: it has no reference of its own.")
+            notes.append(f"{robot} drove in one {every} only, so it has no reference of its own.")
     own = [row for row in tests if row["against"] == OWN]
     if few := sum(row["verdict"] == "too few" for row in own):
         notes.append(
@@ -118,7 +118,7 @@ def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
         )
     if single := sum(row["samples"] == "episodes" and row["p"] is not None for row in own):
         notes.append(
-            f"{single:,} compare episode by episode, for want of recordings (two a {every}): what"
-            " differs from drive to drive may be taken for drift there."
+            f"{single:,} compare episode by episode, as there are too few recordings (fewer than "
+            f"two per {every}): differences between drives may be mistaken for drift there."
         )
     return notes

@@ -54,7 +54,7 @@ class MissionsFile(Checked, frozen=True, kw_only=True):
         if self.format != FORMAT:
             raise ValueError(f"format is {self.format!r}, this Restock reads {FORMAT!r}")
         if not self.missions:
-            raise ValueError("it names no missions")
+            raise ValueError("it contains no missions")
 
 
 def read_missions(path: str | Path) -> MissionsFile:
@@ -80,7 +80,7 @@ def of_list(found: ShoppingList, *, store: str, store_version: int, mixture: str
             "there is nothing to write a missions file of: "
             + ("no gap has a known rate" if found.gaps else "there are no gaps"),
             where=store,
-            remedy="leave --missions-out out" + ("; write one by hand" if found.gaps else ""),
+            remedy="leave out --missions-out" + ("; write one by hand" if found.gaps else ""),
         )
     orders = [
         MissionOrder(

@@ -285,10 +285,10 @@ def _signals(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, Any], Row
     new = counts.get("in", 0) >= LEAST_EPISODES
     if new and sum(counts.values()) > counts["in"]:
         of_a, of_b = "change <> 'in'", "change = 'in'"
-        words = "the episodes that are new in b against those of a"
+        words = "the new episodes of b, compared with those of a"
     elif counts.get("out", 0) >= LEAST_EPISODES and sum(counts.values()) > counts["out"]:
         of_a, of_b = "change = 'out'", "change <> 'out'"
-        words = "the episodes of b against those that are no longer there"
+        words = "the episodes of b, compared with those that were removed"
     else:
         return {"compared": None}, []
     columns = _in_both(

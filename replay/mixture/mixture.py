@@ -52,7 +52,9 @@ class OtherStore(Checked, frozen=True):
 
     def check(self) -> None:
         _check_rates(self.represents)
-        _require(bool(self.name) and "/" not in self.name, f"no name for a store: {self.name!r}")
+        _require(
+            bool(self.name) and "/" not in self.name, f"not a valid name for a store: {self.name!r}"
+        )
         _require(
             self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken"
         )
@@ -80,7 +82,7 @@ class SourceShares(Checked, frozen=True):
             fixed = [portion for portion in portions if isinstance(portion, int | float)]
             _require(
                 len(fixed) == len(portions),
-                "sources: leave `fresh` out beside a schedule: it gets what is left",
+                "sources: leave out `fresh` if there is a schedule: it gets the rest",
             )
             total = sum(fixed) + self.fresh
             _require(
@@ -153,7 +155,7 @@ class EvaluationSplit(Checked, frozen=True):
     def check(self) -> None:
         _require(
             not self.robots or self.by == "robot",
-            f'evaluation_split.robots names robots: it needs by = "robot", not {self.by!r}',
+            f'evaluation_split.robots needs by = "robot", got {self.by!r}',
         )
 
 
@@ -217,7 +219,7 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
         _require(self.floor <= self.cap, f"{name!r} needs floor <= cap")
         _require(
             self.unit == "episode" or self.min_steps == 1,
-            f'min_steps of {name!r} is of episodes: it needs unit = "episode"',
+            f'min_steps of {name!r} applies to episodes: it needs unit = "episode"',
         )
 
 
@@ -299,7 +301,7 @@ class Mixture(Checked, frozen=True):
         )
         names = [rule.name for rule in self.strata]
         _require(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")
-        _require(not any("/" in name for name in names), "a stratum's name cannot hold a /")
+        _require(not any("/" in name for name in names), "a stratum's name cannot contain a /")
         given = sum(rule.share for rule in self.strata if isinstance(rule.share, int | float))
         _require(given <= 1 + 1e-6, f"shares of strata sum to {given:g}, above 1")
 
@@ -324,7 +326,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
         text = path.read_text(encoding="utf-8")
     else:
         raise ConfigError(
-            f"no mixture {name!r}",
+            f"there is no mixture {name!r}",
             remedy=f"it is now called {_RENAMED[name]!r}"
             if name in _RENAMED
             else f"give a TOML file, or one of {', '.join(shipped_mixtures())}",

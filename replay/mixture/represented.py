@@ -77,9 +77,9 @@ def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: 
     """The rates as given; what is left to the other strata by their rows."""
     if unknown := sorted(set(rates) - set(names)):
         raise MixtureError(
-            f"source {source!r}: `represents` gives a rate of {', '.join(unknown)}, which is no"
-            " stratum",
-            remedy=f"there is {', '.join(names)}",
+            f"source {source!r}: `represents` gives a rate for {', '.join(unknown)}, which is not "
+            "a stratum",
+            remedy=f"the strata are {', '.join(names)}",
         )
     share = np.array([rates.get(name, 0.0) for name in names])
     other = np.where([name in rates for name in names], 0, rows)
@@ -102,8 +102,8 @@ def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: 
     ]
     if untold:
         raise MixtureError(
-            f"source {source!r} has rows of {', '.join(untold)}, and the rates that it represents"
-            " say that these never occur",
+            f"source {source!r} has rows of {', '.join(untold)}, but by its `represents`"
+            " they never occur",
             remedy=f"give their rates: represents = {{ {untold[0]} = 0.001 }}; or weigh no"
             ' stratum: [correction] pre and post = "none"',
         )
@@ -139,7 +139,7 @@ def refuse_archives(
             raise MixtureError(
                 f"the source {source.name!r} looks like an archive: {mine} of its {all_mine}"
                 f" episodes are of {name}, {theirs[0]} of {theirs[1]} of the other sources",
-                remedy=f"say in {place_of} what its rows stand for: "
+                remedy=f"say in {place_of} what its rows represent: "
                 + ('represents = "archive" (the rates of the main store), ' if number else "")
                 + f'represents = {{ {natural} }} (rates), or "natural" (it is as it occurs)',
             )

@@ -52,7 +52,7 @@ def plan_shares(
         return "; ".join(
             f"{rule.name} wants {wanted[i]:.1%}, "
             + (
-                f"and is unknown of every row: {why}"
+                f"and is unknown in every row: {why}"
                 if (why := untold.get(rule.name))
                 else f"its {rows[i]} rows in {episodes[i]} episodes allow {limit[i]:.1%}"
             )
@@ -90,7 +90,7 @@ def within_limits(
         )
     if granted.sum() <= 0:
         raise MixtureError(
-            "no stratum has rows that may be drawn",
+            "no stratum has rows that can be drawn",
             remedy="`restock audit` shows what the store holds; lower min_rows or the conditions",
         )
     notes = np.where(short, "short of rows", "")

@@ -258,7 +258,7 @@ def _put(partial: Path, out: Path, force: bool) -> None:
                 old.rename(out)
             raise
         raise PanelError(
-            "another builder was faster", where=str(out), remedy="use the panel that is there"
+            "another builder was faster", where=str(out), remedy="use that panel"
         ) from error
     finally:
         shutil.rmtree(old, ignore_errors=True)

@@ -65,8 +65,8 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
             raise MixtureError(
                 f"every row is older than max_age_days = {mixture.max_age_days:g}: the newest is"
                 f" {youngest:,.1f} days old",
-                remedy="raise it, or say in the mixture when ages count to:"
-                " as_of = 2026-01-31T00:00:00Z",
+                remedy="raise it, or set in the mixture the date to which ages are counted: as_of "
+                "= 2026-01-31T00:00:00Z",
             )
         out.add("too old", too_old)
     if mixture.max_versions_behind is not None:
@@ -118,8 +118,8 @@ def repeats_of(
         raise MixtureError(
             f"all {int(repeated.sum())} rows outside the evaluation split repeat its steps:"
             " the same drive is in the store more than once",
-            remedy="take the repeated recordings out (`restock audit` names them:"
-            " `repeated_steps`), or ingest more",
+            remedy="remove the repeated recordings (the audit `repeated_steps` lists them), or "
+            "ingest more",
         )
     return repeated
 
@@ -295,9 +295,9 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
     if untold.any():
         of = len(np.unique(codes(table, "recording_id")[untold]))
         raise MixtureError(
-            f"{int(untold.sum()):,} rows of {of:,} recordings have no {column}: they could be of"
-            " one that is held out",
-            remedy=f"`restock ingest RECORDING --tag {column}=…` says which, or leave them out:"
+            f"{int(untold.sum()):,} rows of {of:,} recordings have no {column}: they could belong "
+            "to one that is held out",
+            remedy=f"add it with `restock ingest RECORDING --tag {column}=…`, or leave them out:"
             f' where = "{column} IS NOT NULL"',
         )
     names = table[column].combine_chunks().dictionary.to_pylist()
@@ -307,7 +307,7 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
         if absent := sorted(set(rule.robots) - set(there)):
             raise MixtureError(
                 f"evaluation_split.robots: no rows of {', '.join(absent)}",
-                remedy=f"there is {', '.join(there)}",
+                remedy=f"the robots are {', '.join(there)}",
             )
         if set(there) == set(rule.robots):
             raise MixtureError(

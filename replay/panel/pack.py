@@ -161,9 +161,9 @@ class Packer:
         rows.put(ends, (part["next_observation"], next_observation), (part["discount"], discount))
         if not all(np.isfinite(one).all() for one in (observation, next_observation, returns)):
             raise PanelError(
-                "an observation or a reward is NaN or infinite, which no network survives",
+                "an observation or a reward is NaN or infinite, which makes training fail",
                 where=f"recording {batch.column('recording_id')[0].as_py()}",
-                remedy=f"`restock audit` names them; a mixture leaves them out with {FINITE}",
+                remedy=f"`restock audit` lists the rows; a mixture leaves them out with {FINITE}",
             )
 
     def write_meta(self, meta: Path, evaluation_split: Path) -> None:

@@ -142,7 +142,7 @@ class Panel:
     def task(self) -> Task:
         """The task that made these rows. Raises PanelError where the source did not say."""
         if not self.header.task_json:
-            raise PanelError("it does not carry its task", where=str(self.path))
+            raise PanelError("it does not contain its task", where=str(self.path))
         try:
             return msgspec.json.decode(self.header.task_json, type=Task)
         except msgspec.MsgspecError as error:
@@ -213,9 +213,9 @@ class Panel:
         """
         if not self.header.mixture.return_to_go:
             raise PanelError(
-                "it carries no return-to-go",
+                "it contains no return-to-go",
                 where=str(self.path),
-                remedy="say `return_to_go = true` in the mixture and mix again",
+                remedy="set `return_to_go = true` in the mixture and mix again",
             )
         return np.asarray(self.meta_column("return_to_go"), np.float32)
 

@@ -156,7 +156,7 @@ def _refuse_below_natural(lines: Sequence[Stratum]) -> None:
         for line in below
     )
     raise MixtureError(
-        f"its correction leaves less of a stratum than the logs hold: {of_them}",
+        f"its correction gives a stratum a smaller share than it has in the logs: {of_them}",
         remedy='set unit = "episode" (whole episodes need no correction), or [correction] post ='
         ' "density_ratio" (keeps the boost; a larger clip keeps more) or "none" (keeps all of it,'
         ' and its bias); below_natural = "allow" mixes it as it is',

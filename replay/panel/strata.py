@@ -97,7 +97,7 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
         asked = of_kind(conditions, mixture.each_condition.kind)
         if not asked and mixture.each_condition.kind == "exposure":
             raise ConfigError(
-                "each_condition asks for exposures, and the store knows none",
+                "each_condition asks for exposures, but the store has none",
                 where="mixture",
                 remedy="name some in the profile (`exposures`) and ingest the recordings again",
             )
@@ -136,7 +136,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
         priority, timing = condition.priority, condition.timing
     else:
         raise ConfigError(
-            f"stratum {rule.name!r} is no condition or exposure of this store and has no `where`",
+            f"stratum {rule.name!r} is not a condition or exposure of this store, and has no "
+            "`where`",
             where="mixture",
             remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
         )

@@ -158,8 +158,8 @@ class _Reading:
         raise LabelError(
             "; ".join(shown) if len(shown) == 1 else "\n    ".join(["", *shown]),
             where=str(self.path),
-            remedy="mend or remove these lines; `restock label STORE --review N` lists events with"
-            " the steps that they have now",
+            remedy="correct or remove these lines; `restock label STORE --review N` lists events "
+            "with their present steps",
         )
 
     def _lines(self, text: str) -> Iterator[Verdict]:
@@ -188,8 +188,8 @@ class _Reading:
             raise LabelError(
                 f"it has no column {', no column '.join(missing)}",
                 where=str(self.path),
-                remedy="take a file of `restock label STORE --review N --out FILE`, or write one"
-                " with the columns episode_id,condition,first_step,last_step,value",
+                remedy="use a file from `restock label STORE --review N --out FILE`, or write one "
+                "with the columns episode_id,condition,first_step,last_step,value",
             )
 
     def _line(self, line: int, said: Mapping[str, str]) -> Verdict | None:
@@ -265,15 +265,17 @@ class _Reading:
             return None
         episode = found[0]
         if episode.format == "twin":
-            self._problem(verdict.line, "is of the twin, whose true conditions are known")
+            self._problem(
+                verdict.line, "is an episode of the twin, whose true conditions are known"
+            )
             return None
         first, last = verdict.extent or (verdict.first_step, verdict.last_step)
         first, last = min(first, verdict.first_step), max(last, verdict.last_step)
         if len(_between(episode.step, first, last)) != last - first + 1:
             self._problem(
                 verdict.line,
-                f"steps {first} to {last} are not all there: episode {episode.episode_id} has"
-                f" {episode.step[0]} to {episode.step[-1]}",
+                f"steps {first} to {last} do not all exist: episode {episode.episode_id} has "
+                f"{episode.step[0]} to {episode.step[-1]}",
             )
             return None
         if verdict.start_s is not None:
@@ -282,8 +284,9 @@ class _Reading:
             if abs(now_s - verdict.start_s) > _MOVED_S:
                 self._problem(
                     verdict.line,
-                    f"step {verdict.first_step} of {episode.episode_id} is at {now_s:.3f} s now,"
-                    f" and was at {verdict.start_s:.3f} s: it was ingested again since",
+                    f"step {verdict.first_step} of {episode.episode_id} is now at {now_s:.3f} s, "
+                    f"and was at {verdict.start_s:.3f} s: the recording was ingested again in the "
+                    "meantime",
                 )
                 return None
         return episode

@@ -100,7 +100,7 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
     if folder is not None:
         path = Path(folder)
         if not path.is_dir() or not list(path.glob("*.sql")):
-            raise ConfigError("no audits (*.sql) in it", where=str(path))
+            raise ConfigError("it contains no audits (*.sql)", where=str(path))
         by_name |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
     return [by_name[name] for name in sorted(by_name)]
 
@@ -244,12 +244,12 @@ def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
     used = {audit.name: audit.parameters for audit in audits}
     for name, table in thresholds.items():
         if name not in used:
-            remedy = f"there is {', '.join(used)}"
+            remedy = f"the audits are {', '.join(used)}"
             if name in RENAMED:
                 remedy = f"it is now called {RENAMED[name]!r}: rename it"
             raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
         if unknown := sorted(table.keys() - used[name]):
-            remedy = f"it has {', '.join(sorted(used[name])) or 'none'}"
+            remedy = f"its thresholds are {', '.join(sorted(used[name])) or 'none'}"
             if unknown[0] in RENAMED:
                 remedy = f"it is now called {RENAMED[unknown[0]]!r}: rename it"
             raise ConfigError(

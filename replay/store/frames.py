@@ -60,7 +60,7 @@ class CameraFrame:
             raise StoreError(
                 str(problem),
                 where=where,
-                remedy=f"it was recorded so: leave its rows out ({self.source_file})",
+                remedy=f"it was recorded like this: leave out its rows ({self.source_file})",
             ) from problem
 
 

@@ -104,7 +104,7 @@ class Store:
             if version is None:
                 raise
             raise StoreError(
-                f"its version {self.version} cannot be read any more: {error.what}",
+                f"its version {self.version} can no longer be read: {error.what}",
                 where=str(self.path),
                 remedy=f"files are kept for {RETENTION_HOURS // 24} days after their rows were"
                 " replaced: name a newer version, or restore them from a copy",

@@ -57,7 +57,8 @@ def messages_at_tick(
             raise RecordingError(
                 f"is recording {recording.recording_id}, the row is of {recording_id}",
                 where=str(path),
-                remedy="give the recording it was made from; its path then is in the row",
+                remedy="give the recording from which the row was made; the row contains its path "
+                "at the time",
             )
         types = {name: info.type for name, info in recording.topics.items()}
         try:
@@ -67,9 +68,9 @@ def messages_at_tick(
             raise RecordingError(error.what, where=str(path), remedy=error.remedy) from error
     if aligned is None:
         raise RecordingError(
-            f"has no tick {tick} at {stamp_ns} ns by the profile {profile.name!r}",
+            f"has no tick {tick} at {stamp_ns} ns with the profile {profile.name!r}",
             where=str(path),
-            remedy="give the profile that read it with --profile",
+            remedy="give the profile with which it was ingested, with --profile",
         )
     messages = [*_of_inputs(aligned), *_of_transforms(aligned, stamp_ns), *_of_signals(aligned)]
     named = [

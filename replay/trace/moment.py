@@ -109,7 +109,8 @@ def find_moment(
         manifests = rows_of(store.connection, sql_file("trace_manifest.sql"), named)
     if not manifests:
         raise StoreError(
-            "no manifest of the row's recording is left: its task and its clock are not known",
+            "the manifest of the row's recording no longer exists: its task and clock are not "
+            "known",
             where=str(origin.store["path"]),
             remedy="ingest the recording again",
         )
@@ -123,7 +124,7 @@ def find_moment(
     )
     if recording is None:
         moment.notes.append(
-            "scans, plans and the other topics are in the recording alone: give it with"
+            "scans, plans and other topics are only in the recording: give it with"
             f" --recording {row['source_file']}"
         )
         return moment
@@ -133,7 +134,8 @@ def find_moment(
             raise RecordingError(
                 f"is recording {opened.recording_id}, the row is of {row['recording_id']}",
                 where=str(recording),
-                remedy="give the recording it was made from; its path then is in the row",
+                remedy="give the recording from which the row was made; the row contains its path "
+                "at the time",
             )
         messages = opened.raw_between(*moment.window_ns)
         seen = None

@@ -85,9 +85,9 @@ def find_origin(
     for source in sources:
         if not is_store(source.path):
             raise StoreError(
-                "the store is not there (any more)",
+                "the store does not exist (any more)",
                 where=source.path,
-                remedy="say with --store where it is now",
+                remedy="give its new path with --store",
             )
         origin = _look_up(source, transition)
         if origin is not None:
@@ -96,7 +96,7 @@ def find_origin(
     raise StoreError(
         f"no transition {transition} in it",
         where=", ".join(source.path for source in sources),
-        remedy="its recording was taken out, or ingested again with other steps: `restock sql STORE"
+        remedy="its recording was removed, or ingested again with other steps: `restock sql STORE"
         ' "FROM recordings"` lists what is there; `--store` names another store',
     )
 
@@ -109,8 +109,8 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
     then = _read(source, transition)
     if then is None and now is not None:
         now.notes.append(
-            f"version {source.version} of the store cannot be read any more: this is the row of"
-            f" version {now.store['version']}"
+            f"version {source.version} of the store can no longer be read: this is the row of "
+            f"version {now.store['version']}"
         )
         return now
     if then is not None:
@@ -150,7 +150,9 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
         notes=lost,
     )
     if manifest is None:
-        origin.notes.append("no manifest of its recording is left: see the row's own provenance")
+        origin.notes.append(
+            "the manifest of its recording no longer exists: see the row's own provenance"
+        )
         return origin
     if manifest["ingest_id"] != row["ingest_id"]:
         origin.notes.append("the manifest is of a later ingest of the same recording")
@@ -206,7 +208,7 @@ def rows_of(
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
     """What became of a row since."""
     if now is None:
-        return ["the newest version of the store has this row no more"]
+        return ["the newest version of the store no longer has this row"]
     changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
     if not changed:
         return []
@@ -305,15 +307,15 @@ def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -
             (
                 f"profile {name!r} cannot be read from the store ({error.what})"
                 if text
-                else f"profile {name!r} does not come with Restock"
+                else f"profile {name!r} is not a shipped one"
             )
             + ": give its file with --profile to see which topics were read"
         )
         return None
     if profile.hash != manifest["profile_hash"]:
         origin.notes.append(
-            f"profile {name!r} is now {profile.hash}, the recording was read by"
-            f" {manifest['profile_hash']}: topics and ages may differ"
+            f"profile {name!r} is now {profile.hash}, but the recording was ingested with "
+            f"{manifest['profile_hash']}: topics and ages may differ"
         )
     return profile
 

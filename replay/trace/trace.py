@@ -63,7 +63,8 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
     trace = Trace()
     if where.version is not None and not is_store(str(place)):
         raise StoreError(
-            "only a store has versions: rows of runs and panels are of the version that was mixed",
+            "only a store has versions: rows of runs and panels come from the version that was "
+            "mixed",
             where=str(place),
             remedy="leave --version out",
         )
@@ -80,7 +81,7 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
         trace.origin = _origin([StoreVersion(str(place), version)], number, where)
     else:
         raise StoreError(
-            "neither a run, a panel nor a store" if path.exists() else "nothing is there",
+            "it is not a run, a panel or a store" if path.exists() else "it does not exist",
             where=str(path),
         )
     return trace
@@ -92,7 +93,7 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
         raise RunError(
             "is not a run: rows can be listed for a run only",
             where=str(run),
-            remedy="name the ROW: a row number of a panel, a transition id of a store",
+            remedy="give ROW: a row number of a panel, or a transition id of a store",
         )
     table = _audit_table(Path(run))
     with duckdb.connect() as connection:
@@ -111,14 +112,14 @@ def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
         raise PanelError(
             "the run's panel does not exist",
             where=str(panel_path),
-            remedy="say with --panel where it is now",
+            remedy="give its new path with --panel",
         )
     panel = Panel.open(panel_path)
     if panel.id != run_panel.get("id"):
         raise PanelError(
             f"is panel {panel.id}, the run drew from {run_panel.get('id')}",
             where=str(panel_path),
-            remedy="say with --panel where that one is",
+            remedy="give the path of that panel with --panel",
         )
     number = audit.get("panel_row")
     if number is None:  # a run from before audit rows had it
@@ -140,9 +141,7 @@ def _of_panel(trace: Trace, panel: Panel, number: int, where: TracePlaces) -> No
             trace.notes.append("the row in the panel is not the one that was sampled")
     header = panel.header
     if header.store_version < 0:
-        trace.notes.append(
-            "the panel was made from a table in memory: there is no store to look in"
-        )
+        trace.notes.append("the panel was made from a table in memory: there is no store to search")
         return
     sources = [StoreVersion(where.store or header.store, header.store_version)]
     sources += [StoreVersion(other.path, other.version) for other in header.others]
@@ -169,7 +168,7 @@ def _of_twin(
     trace.episode = {"run_seed": document.get("seeds", {}).get("run")}
     if not rows:
         trace.notes.append(
-            "its episode had not ended when the run stopped, or its tables end before"
+            "its episode had not ended when the run stopped, or the tables end before it"
         )
         return
     trace.episode |= rows[0]
@@ -179,7 +178,7 @@ def _of_twin(
             "seed": trace.episode["episode_seed"],
         }
         trace.notes.append(
-            "the twin draws the episode again from its spec; its actions are not kept"
+            "the twin generates the episode again from its spec; the actions are not kept"
         )
         if trace.episode["perturbation"] != "nominal":
             trace.notes.append(
@@ -192,7 +191,7 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
     step, _, place = row.partition("/")
     if not (step.isdigit() and place.isdigit()):
         raise RunError(
-            f"{row!r} names no audit row",
+            f"{row!r} is not an audited row",
             where=str(run),
             remedy="write STEP/ROW, a gradient step and a row of its batch, e.g. 1200/17;"
             f" `restock trace {run}` lists some",
@@ -205,7 +204,8 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
         raise RunError(
             f"the batch of gradient step {step} was not audited, or has no row {place}",
             where=str(run),
-            remedy=f"`restock trace {run}` lists audited rows; record.audit_share says how many",
+            remedy=f"`restock trace {run}` lists audited rows; record.audit_share sets how many "
+            "there are",
         )
     return rows[0]
 
@@ -213,11 +213,11 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
 def _audit_table(run: Path) -> str:
     table = run / "audit.parquet"
     if not table.is_file():
-        raise RunError("it has no audit.parquet", where=str(run), remedy="was it trained at all?")
+        raise RunError("it has no audit.parquet", where=str(run), remedy="train the run first")
     return str(table)
 
 
 def _number(row: str, where: Path, what: str) -> int:
     if not row.isdigit():
-        raise StoreError(f"{row!r} is no {what}", where=str(where))
+        raise StoreError(f"{row!r} is not a {what}", where=str(where))
     return int(row)

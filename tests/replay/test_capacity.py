@@ -94,7 +94,7 @@ def test_whether_coverage_is_saturated_is_said(
     assert found.half_share == found.curve[-2]["cells_share"] < 0.95
     assert not found.saturated
     assert cli.main(["audit", str(growing), "--capacity"]) == 0
-    assert "more recordings will show more" in capsys.readouterr().out
+    assert "more recordings will add more" in capsys.readouterr().out
     rows = recording_transitions(1)
     for name, value in (("condition", "nominal"), ("zone", "cross"), ("action", 1)):
         place = rows.schema.get_field_index(name)
@@ -167,7 +167,7 @@ def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> No
     wide = [*auto, f"replay.batch_size={len(panel) + 1}"]
     least = prepare_new(tmp_path / "run", panel.path, None, wide)
     assert least.config.replay.ring_rows == len(panel) + 1
-    with pytest.raises(ConfigError, match="by the rows of a panel, and there is none"):
+    with pytest.raises(ConfigError, match="from the rows of a panel, but there is none"):
         prepare_new(tmp_path / "run", None, None, auto)
 
 

@@ -118,7 +118,7 @@ def test_a_table_in_memory_names_its_exposures(tmp_path):
 
 def test_a_store_without_exposures_has_none_to_ask_for(tmp_path):
     store = store_of(planted(lambda number: False), tmp_path / "store")
-    with Store(store) as opened, pytest.raises(ConfigError, match="knows none") as caught:
+    with Store(store) as opened, pytest.raises(ConfigError, match="the store has none") as caught:
         plan_panel(opened.connection, load_mixture("exposure"), CONDITIONS)
     assert "ingest" in str(caught.value.remedy)
 

@@ -222,7 +222,7 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
         ("[[missions]]\nkind = 'x'\n", "must say how much"),
         ("[[missions]]\nkind = 'x'\nmissions = 0\n", "missions"),
         ("[[missions]]\nmission = 3\n", "unknown key"),
-        ("missions = []\n", "names no missions"),
+        ("missions = []\n", "contains no missions"),
         ("format = 'other/9'\n[[missions]]\nmissions = 1\n", "other/9"),
     ):
         (tmp_path / "bad.toml").write_text(text)
@@ -232,7 +232,7 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
 
 def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
-    assert "'aisle' cannot make a cell" in capsys.readouterr().err
+    assert "'aisle' cannot define a cell" in capsys.readouterr().err
 
 
 def test_gaps_are_a_table_of_sql(store: Path, tmp_path: Path) -> None:

@@ -186,7 +186,9 @@ def test_what_does_not_fit_the_recording_is_refused() -> None:
     with open_recording(SAMPLE) as recording:
         right = recording.recording_id
     where = {"recording_id": right, "tick": 3, "stamp_ns": 5}
-    with pytest.raises(RecordingError, match="has no tick 3 at 5 ns by the profile 'warehouse_amr"):
+    with pytest.raises(
+        RecordingError, match="has no tick 3 at 5 ns with the profile 'warehouse_amr"
+    ):
         messages_at_tick(SAMPLE, PROFILES["at a fixed rate"], **where)
     with pytest.raises(RecordingError, match="has no tick 9999999 at 5 ns"):
         messages_at_tick(SAMPLE, PROFILES["at a fixed rate"], **where | {"tick": 9_999_999})

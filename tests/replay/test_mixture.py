@@ -63,7 +63,7 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         (
             EVERY + "[sources]\nfresh = 0.5\nlogs = {schedule = 'linear', start = 0.9, end = 0.1,"
             " to_env_steps = 10}",
-            "leave `fresh` out",
+            "leave out `fresh`",
         ),
         (
             EVERY + "[sources]\nlogs = {schedule = 'linear', start = 0.2, end = 0.9,"

@@ -172,4 +172,4 @@ def test_episodes_that_a_run_learnt_under_another_id_are_not_held_out(tmp_path: 
     logs = write_store(tmp_path / "logs", [one, other, copy_of(one, 5, later_ns=10**12)])
     dataset = load_ope_dataset(learnt, TASK, str(logs))
     assert len(dataset.evaluation.rows) == len(other)
-    assert f"{2 * len(one['episode_id'].unique())} episodes left aside" in dataset.notes[0]
+    assert f"{2 * len(one['episode_id'].unique())} episodes left out" in dataset.notes[0]

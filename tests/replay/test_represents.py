@@ -208,7 +208,7 @@ def test_a_natural_sample_stands_for_itself(rows, data):
 @pytest.mark.parametrize(
     ("archive", "main", "message"),
     [
-        ("represents = { near_colision = 0.1 }", "", "near_colision, which is no stratum"),
+        ("represents = { near_colision = 0.1 }", "", "near_colision, which is not a stratum"),
         ('represents = "archive"', "represents = { near_collision = 0 }", "never occur"),
     ],
 )

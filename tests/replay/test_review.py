@@ -135,7 +135,7 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     assert traced["messages"]
     # Verdicts may be in it: it is not written over.
     assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 2
-    assert "may hold verdicts" in capsys.readouterr().err
+    assert "may contain verdicts" in capsys.readouterr().err
 
 
 def fill(
@@ -192,10 +192,10 @@ def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
     [
         ("perhaps", {}, "line 2: the verdict is 'perhaps', not yes, no or FIRST..LAST"),
         ("5..2", {}, "line 2: the verdict 5..2 ends before it begins"),
-        ("0..99999999", {}, "line 2: steps 0 to 99999999 are not all there"),
+        ("0..99999999", {}, "line 2: steps 0 to 99999999 do not all exist"),
         ("yes", {"condition": "wheelslip"}, "line 2: no condition 'wheelslip' labelled that"),
         ("yes", {"episode_id": "gone/3"}, "line 2: no episode or recording 'gone/3'"),
-        ("yes", {"start_s": "3600"}, "it was ingested again since"),
+        ("yes", {"start_s": "3600"}, "the recording was ingested again in the meantime"),
         ("yes", {"first_step": "x"}, "line 2: first_step and last_step must be step numbers"),
         ("yes", {"last_step": "9" * 5000}, "line 2: first_step and last_step must be"),
     ],
@@ -256,7 +256,7 @@ def test_a_review_whose_verdicts_are_empty_says_so(
     file.write_text(HEADER + f"{1:016x}/0,wheel_slip,0,3,\n")
     main(["label", str(reviewed[0]), "--corrections", str(file), "--dry-run"])
     shown = capsys.readouterr()
-    assert "has a verdict" in shown.out + shown.err
+    assert "contains no verdict" in shown.out + shown.err
 
 
 def test_wrong_usage_writes_nothing(
@@ -264,9 +264,15 @@ def test_wrong_usage_writes_nothing(
 ) -> None:
     before = sorted(reviewed[0].rglob("*"))
     for words, problem in (
-        (["--review", "3", "--corrections", "x.csv"], "--review does not go with --corrections"),
-        (["--out", "x.csv"], "--out goes with --review"),
-        (["--corrections", "x.csv", "--profile", "turtlebot3"], "does not go with --profile"),
+        (
+            ["--review", "3", "--corrections", "x.csv"],
+            "--review cannot be combined with --corrections",
+        ),
+        (["--out", "x.csv"], "--out needs --review"),
+        (
+            ["--corrections", "x.csv", "--profile", "turtlebot3"],
+            "cannot be combined with --profile",
+        ),
         (["--review", "0"], "must be 1 or more"),
         (["--corrections", "gone.csv"], "cannot be read"),
     ):

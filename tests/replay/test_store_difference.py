@@ -102,7 +102,7 @@ def test_two_versions_of_a_store_by_number_and_by_time(
     assert main(["diff", f"{tmp_path}/store@{newest - 1}", f"{tmp_path}/store", "--exit-code"]) == 1
     with Store(tmp_path / "store", version=parse_version("2999-01-01T00:00Z")) as store:
         assert store.version == newest
-    with pytest.raises(StoreError, match="its first is of"):
+    with pytest.raises(StoreError, match="the first is from"):
         Store(tmp_path / "store", version=parse_version("2001-01-01"))
     with pytest.raises(StoreError, match=f"its newest is {newest}"):
         Store(tmp_path / "store", version=99)
@@ -129,7 +129,7 @@ def test_a_signal_that_moved_is_named(tmp_path: Path) -> None:
     store = write_store(tmp_path / "store", rows)
     with Store(store, version=2) as a, Store(store) as b:
         found = diff_stores(a, b).document()["signals"]
-    assert found["compared"] == "the episodes that are new in b against those of a"
+    assert found["compared"] == "the new episodes of b, compared with those of a"
     assert found["shifts"][0]["signal"] == "wheel_speed_mps"
     assert found["shifts"][0]["p_adjusted"] < 1e-6
     assert sum(row["p_adjusted"] < 0.01 for row in found["shifts"]) == 1

@@ -181,7 +181,7 @@ def test_audited_rows_are_listed_by_their_error(places: Places) -> None:
 
 def test_rows_are_listed_of_runs_alone(places: Places, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["trace", str(places.panel)]) == 2
-    assert "name the ROW" in capsys.readouterr().err
+    assert "give ROW" in capsys.readouterr().err
 
 
 def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
@@ -194,17 +194,17 @@ def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
 
 
 def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="names no audit row"):
+    with pytest.raises(RunError, match="is not an audited row"):
         trace_row(places.run, "12")
     with pytest.raises(RunError, match="was not audited"):
         trace_row(places.run, "8/0")
     with pytest.raises(StoreError, match="no transition 5"):
         trace_row(places.store, "5")
-    with pytest.raises(StoreError, match="is no transition id"):
+    with pytest.raises(StoreError, match="is not a transition id"):
         trace_row(places.store, "seven")
-    with pytest.raises(StoreError, match="neither a run, a panel nor a store"):
+    with pytest.raises(StoreError, match="it is not a run, a panel or a store"):
         trace_row(tmp_path, "1")
-    with pytest.raises(StoreError, match="nothing is there"):
+    with pytest.raises(StoreError, match="it does not exist"):
         trace_row(tmp_path / "nowhere", "1")
 
 
@@ -250,7 +250,7 @@ def test_a_row_that_was_labelled_again_since_says_so(tmp_path: Path) -> None:
     replace_recording(tmp_path / "store", later.slice(1))
     found = trace_row(tmp_path / "panel", "0").origin
     assert found is not None
-    assert "the newest version of the store has this row no more" in found.notes
+    assert "the newest version of the store no longer has this row" in found.notes
 
 
 def replace_recording(store: Path, rows: pa.Table) -> None:

@@ -90,6 +90,6 @@ def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path
     first = writer.write(*one(1))
     writer.write(*one(1, ingest="b"))
     (tmp_path / "store/transitions").joinpath(f"{1:016x}", f"{1:016x}-a.parquet").unlink()
-    with pytest.raises(StoreError, match="cannot be read any more") as error:
+    with pytest.raises(StoreError, match="can no longer be read") as error:
         restock.open(str(tmp_path / "store"), version=first)
     assert "7 days" in str(error.value)
