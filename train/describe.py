@@ -56,10 +56,10 @@ def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
     if most is None or not config.schedule.env_steps or logs_share > 0.99 * wanted:
         return ""
     return (
-        f" (of {wanted:.0%} that the mixture wants: a row may be drawn {most:g} times,"
-        f" {config.schedule.offline_updates:,} offline updates draw first, and the rest is spread"
-        f" over {config.schedule.env_steps:,} steps; log more, lower the schedule, or raise"
-        " max_replays_per_row)"
+        f" (the mixture wants {wanted:.0%}: a row may be drawn {most:g} times, "
+        f"{config.schedule.offline_updates:,} offline updates draw first, and the rest is spread "
+        f"over {config.schedule.env_steps:,} steps; log more, shorten the schedule, or raise "
+        "max_replays_per_row)"
     )
 
 
@@ -69,12 +69,19 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
     cloned_rows = f"{rows:,} logged rows of {drivers}"
     if panel is not None and teacher.successes:
         others = int(cloned(panel, teacher).sum()) - rows
-        cloned_rows += f", and {others:,} of episodes that others brought to their goal alone,"
+        cloned_rows += (
+            f", and {others:,} rows of episodes in which other drivers alone reached the goal,"
+        )
         rows += others
     first = f"{cloned_rows} are cloned first"
     mirrored = ", half of its rows mirrored left to right" if teacher.mirror else ""
-    return f"teacher {teacher.source}: Q chooses among what is plausible to it; " + (
-        (first if rows else "no logged rows to clone, so at first everything is") + mirrored
+    return (
+        f"teacher {teacher.source}: the policy chooses by Q among the actions that it finds"
+        " plausible; "
+        + (
+            (first if rows else "there are no logged rows to clone, so at first all actions are")
+            + mirrored
+        )
     )
 
 
@@ -83,7 +90,7 @@ def _not_evaluated(document: dict[str, Any]) -> list[str]:
     return [
         f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}: "
         + (
-            "no log tells it"
+            "no log contains it"
             if LIDAR_SIGNALS.issuperset(signals)
             else "its stratum is of logs alone"
         )

@@ -28,12 +28,12 @@ from restock.train.session import Session
 STOPPED = "not_finite.json"  # in the run's directory
 _NAMED = 8  # rows in the message; the file has all of them
 _LEAVE_OUT = (
-    "`restock trace PANEL PANEL_ROW` shows where such a row is from; leave it out by the mixture's"
-    " `where`, mix again and train again"
+    "`restock trace PANEL PANEL_ROW` shows where such a row comes from; exclude it with the "
+    "mixture's `where`, mix again and train again"
 )
 _SLOWER = (
-    "train with a lower optimizer.learning_rate, or a smaller optimizer.max_grad_norm;"
-    " checkpoints and tables up to here are whole"
+    "train with a lower optimizer.learning_rate, or a smaller optimizer.max_grad_norm; "
+    "checkpoints and tables up to here are valid"
 )
 
 

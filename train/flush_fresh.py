@@ -58,7 +58,7 @@ def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 
         raise RunError(
             "kept no finished episode to flush",
             where=str(run),
-            remedy="give --flush-fresh when the run begins: episodes are kept from then on",
+            remedy="give --flush-fresh when the run starts: episodes are kept only from then on",
         )
     recording_id = _content_id(episodes)
     count = sum(episode.count for episode in episodes)

@@ -59,7 +59,7 @@ class JumpStart(Stateful):
             return None
         if logs is None:
             raise ConfigError(
-                "jump_start.env_steps is about the logs' behaviour, and this run has no logs",
+                "jump_start.env_steps needs the logs' behaviour, but this run has no logs",
                 remedy="give --panel, or leave it out",
             )
         num_envs, observation_size, actions = size

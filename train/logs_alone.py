@@ -35,13 +35,13 @@ class NoTwin:
         return {}
 
     def set_episodes(self, specs: Iterable[Any], /) -> None:
-        raise RuntimeError("a run on the logs alone drives nothing")
+        raise RuntimeError("a run on the logs alone does not drive")
 
     def reset(self, *, seed: int | None = None) -> tuple[F32, Info]:
         return self._observation, {}
 
     def step(self, actions: NDArray[Any], /) -> Step:
-        raise RuntimeError("a run on the logs alone drives nothing")
+        raise RuntimeError("a run on the logs alone does not drive")
 
     def state_dict(self) -> dict[str, Any]:
         return {}
@@ -59,13 +59,13 @@ def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     where = "env.twin"
     if panel is None:
         raise ConfigError(
-            "false leaves the logs alone to learn from, and there is no panel",
+            "false means learning from the logs alone, but there is no panel",
             where=where,
             remedy="give --panel",
         )
     if config.teacher.source not in (None, "logs", "none"):
         raise ConfigError(
-            f"false, and the teacher {config.teacher.source!r} is asked in the twin",
+            f"false, but the teacher {config.teacher.source!r} needs the twin",
             where=where,
             remedy='use teacher.source = "logs" or "none"',
         )

@@ -368,5 +368,5 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
             where=str(session.run.path),
-            remedy=f"go on with `restock train --resume {session.run.path}`",
+            remedy=f"continue with `restock train --resume {session.run.path}`",
         )

@@ -53,14 +53,14 @@ def ways_to_evaluate(
     floors = open_floors(layouts)
     why = None
     if panel is None:
-        why = "the run learns from no logs"
+        why = "the run does not learn from logs"
     elif panel.task.goal == "none":
         why = "the task has no goal"
     elif len(floors) > 1:
-        why = f"is about the floor of the logs, these are {len(floors)}"
+        why = f"needs one floor, that of the logs; got {len(floors)}"
     if panel is None or why is not None:
         raise ConfigError(
-            str(why), where="evaluation.missions", remedy='leave it out, or say "drawn"'
+            str(why), where="evaluation.missions", remedy='leave it out, or set "drawn"'
         )
     every = chosen.missions == EVERY
     specs = logged_missions(panel, floors[0], kinds, every=every).specs

@@ -227,7 +227,7 @@ def prepare_resumed(
             f"was trained on task {run.document['task_hash']}, profile {config.profile!r} now"
             f" defines {profile.task.hash}",
             where=str(path),
-            remedy="start a new run: values of one task mean nothing in another",
+            remedy="start a new run: values of one task have no meaning in another",
         )
     if config.teacher.mirror:
         mirrors(config.teacher, profile.task)
@@ -236,7 +236,7 @@ def prepare_resumed(
         panel = open_panel(Path(fed["path"]), config, profile)
         if panel.id != fed["id"]:
             raise RunError(
-                f"was fed panel {fed['id']}, at {fed['path']} there now is {panel.id}",
+                f"was fed panel {fed['id']}, but {fed['path']} is now panel {panel.id}",
                 where=str(path),
                 remedy="put the old panel back, or start a new run",
             )
@@ -257,8 +257,8 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
             f"its rows are of task {panel.task_hash}, the twin's ({profile.name}) is"
             f" {profile.task.hash}: observation, action or reward differ",
             where=str(path),
-            remedy="leave `profile` out of the config, and the panel's is taken; or ingest the logs"
-            f" again with `--profile {profile.name}` and mix again",
+            remedy="leave out `profile` in the config to use the panel's; or ingest the logs "
+            f"again with `--profile {profile.name}` and mix again",
         )
     if abs(panel.discount - config.loss.discount) > 1e-9:
         raise PanelError(

@@ -75,9 +75,9 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
     if teacher.successes and not logged:
         goals = "are found in hindsight" if profile.goal_source else "do not exist"
         raise ConfigError(
-            f"goals {goals} in these logs, so no episode of theirs shows a success",
+            f"goals {goals} in these logs, so none of their episodes shows a success",
             where="teacher.successes",
-            remedy="leave it out, or name more drivers in teacher.policies",
+            remedy="leave it out, or add drivers to teacher.policies",
         )
     # Where the twin's operator answers from the first step on, they slow it down: docs/teacher.md.
     return logged and not teacher.asks if teacher.successes is None else teacher.successes
@@ -96,6 +96,7 @@ def mirrors(teacher: TeacherConfig, task: Task) -> bool:
         raise ConfigError(
             f"rows cannot be mirrored: {error}",
             where="teacher.mirror",
-            remedy="leave it out, or give the profile's action table each turn both ways",
+            remedy="leave it out, or give each turn in both directions in the profile's action "
+            "table",
         ) from error
     return teacher.mirror is True or teacher.source == "operator"

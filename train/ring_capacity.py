@@ -36,7 +36,7 @@ def resolve_ring_capacity(
         return config, None
     if panel is None:
         raise ConfigError(
-            'replay.ring_capacity = "auto" is chosen by the rows of a panel, and there is none',
+            'replay.ring_capacity = "auto" is chosen from the rows of a panel, but there is none',
             remedy="give --panel, or a number of rows",
         )
     capacity = capacity_of_rows(panel.meta)

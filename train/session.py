@@ -173,8 +173,8 @@ class Session(Stateful):
         before, now = state["probe"], self.probe
         if before is not None and now is not None and before["hash"] != now.hash:
             raise RunError(
-                f"was taken with other logged rows: its probe is {before['hash']}, that of the"
-                f" panel is {now.hash}",
+                f"was made with other logged rows: its probe is {before['hash']}, that of the "
+                f"panel is {now.hash}",
                 where=str(self.run.latest),
                 remedy="resume with the panel that the run began with, or start another run",
             )
@@ -191,7 +191,7 @@ class Session(Stateful):
             raise RunError(
                 error.what,
                 where=error.where,
-                remedy=f"go back to an earlier one: --from-env-steps {whole}",
+                remedy=f"use an earlier one: --from-env-steps {whole}",
             ) from error
 
     @property

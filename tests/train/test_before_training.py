@@ -215,7 +215,7 @@ def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap)
     assert untrusted(list(rows.values())) == ["wheel_slip"]
     (tmp_path / "gap/gap.json").write_text("{")
     (damaged,) = gap_evidence([tmp_path])
-    assert (damaged.status, "no gap that can be read" in damaged.note) == ("not run", True)
+    assert (damaged.status, "contains no readable gap" in damaged.note) == ("not run", True)
 
 
 def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,14 +224,14 @@ def test_the_verb_names_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixt
     words = ["diagnose", "--before-training", str(store), "--no-twin"]
     profile = tmp_path / "profile.toml"
     assert main(words) == 2
-    assert "no profile that comes with Restock has it" in capsys.readouterr().err
+    assert "no shipped profile has this task" in capsys.readouterr().err
     profile.write_text(
         profile_toml(msgspec.structs.replace(load_profile("warehouse_amr"), task=TASK))
     )
     assert main([*words, "--profile", str(profile), "--check"]) == 1
     shown = capsys.readouterr().out
     assert "BUFFER" in shown
-    assert "not run: twin: it was not asked for" in shown
+    assert "not run: twin: it was not requested" in shown
     assert main([*words, "--profile", str(profile), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "BUFFER"
@@ -280,9 +280,9 @@ def test_a_run_is_judged_with_its_rows(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--before-training", "nowhere"], "no such panel or store"),
-        (["--before-training", "."], "is neither a panel nor a store"),
-        (["run", "--before-training", "."], "takes no run"),
+        (["--before-training", "nowhere"], "there is no such panel or store"),
+        (["--before-training", "."], "is not a panel or a store"),
+        (["run", "--before-training", "."], "cannot be combined with a run"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_said(

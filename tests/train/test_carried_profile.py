@@ -115,7 +115,7 @@ def test_a_trace_reads_the_messages_by_the_carried_profile(
 
 
 def test_another_task_is_refused_though_the_panel_carries_its_own(folder: Path) -> None:
-    with pytest.raises(PanelError, match="leave `profile` out of the config"):
+    with pytest.raises(PanelError, match="leave out `profile` in the config"):
         prepare_new(folder / "other", folder / "panel", None, [*TINY, "profile=warehouse_amr"])
 
 
@@ -150,7 +150,7 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(
     text = whole + text if "[[" in text else text + whole
     with pytest.raises(ConfigError, match=problem):
         read_profile_toml(text, where="a panel")
-    with pytest.raises(PanelError, match=r"that it carries cannot be read") as error:
+    with pytest.raises(PanelError, match=r"that it contains cannot be read") as error:
         profile_of_panel(carrying(folder, text))
     assert error.value.remedy is not None
     assert "--set profile=mine.toml" in error.value.remedy

@@ -118,7 +118,9 @@ def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -
     alone = cloned(panel, TeacherConfig(policies=teacher.policies, successes=False))
     assert alone.sum() < rows.sum() < len(panel)
     others = int((rows & ~alone).sum())
-    assert f"{alone.sum():,} logged rows of operator, and {others:,} of" in describe_run(prepared)
+    assert f"{alone.sum():,} logged rows of operator, and {others:,} rows of" in describe_run(
+        prepared
+    )
     # 2,000 updates of the critic; as many again for each 5,000 rows.
     assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
     fewer = prepare_new(

@@ -165,7 +165,7 @@ def test_a_run_against_itself_is_comparable_by_identity(tmp_path, capsys) -> Non
         (1, 40, "1 run an arm, at least 3 are needed"),
         (2, 40, "2 runs an arm, at least 3 are needed"),
         (3, 1, "1 episode, at least 10 are needed"),
-        (3, 40, "every run ended every episode alike: nothing varies"),
+        (3, 40, "every run ended every episode in the same way: nothing varies"),
     ],
 )
 def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, episodes, why) -> None:
@@ -207,7 +207,7 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     for words, said in (
         ([*first], "needs two runs, got 3"),
         ([first[0], other, "--against", first[1]], "differs from"),
-        ([first[0], first[0], "--against", first[1]], "is named twice"),
+        ([first[0], first[0], "--against", first[1]], "is given twice"),
         ([first[0], young], "has no record of the episodes it sampled"),
         ([first[0], str(tmp_path)], "is not a run directory"),
     ):

@@ -167,8 +167,10 @@ def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
     assert found["seeds_needed"] > 20
     assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "a study too small for its contrast: auc_wheel_slip of quotas against uniform" in said
-    assert f"{found['seeds_needed']} seeds would do" in said
+    assert (
+        "the study is too small for its contrast: auc_wheel_slip of quotas against uniform" in said
+    )
+    assert f"{found['seeds_needed']} seeds would be enough" in said
     (tmp_path / "s.toml").write_text(text.replace("effect = 0.05", "effect = 0.5"))
     assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
     assert "too small" not in capsys.readouterr().err
@@ -179,7 +181,7 @@ def test_power_needs_a_contrast_and_a_spread(
 ) -> None:
     study(tmp_path)
     assert main(["study", str(tmp_path / "s.toml"), "--power"]) == 2
-    assert "says nothing of the spread" in capsys.readouterr().err
+    assert "does not give the spread" in capsys.readouterr().err
     assert main(["study", str(tmp_path / "s.toml")]) == 2
     assert "--out" in capsys.readouterr().err
 

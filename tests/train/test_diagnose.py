@@ -208,7 +208,7 @@ def test_the_evidence_names_the_action(tmp_path: Path) -> None:
     assert line.startswith("recovery: the policy takes 'turn' in 30% of the rows looked at")
     assert "in 1.0%: 4 of 400 different rows, fresh rows in 30%" in line
     assert "'turn' in recovery" in found.experiment
-    with pytest.raises(RunError, match="no setting gives the logs the rows that they lack"):
+    with pytest.raises(RunError, match="no setting can add the rows that the logs lack"):
         confirm(run, found, tmp_path / "c")
 
 

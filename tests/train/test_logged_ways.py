@@ -91,7 +91,7 @@ def test_held_out_ways_are_missions_and_what_the_floor_lacks_is_counted(panel: P
     assert made.logged == 24
     assert made.ways == 12
     assert sum(made.left_out.values()) == 12
-    assert "12 not: the floor has no way there" in made.text
+    assert "12 not: the goal cannot be reached on this floor" in made.text
     for spec in made.specs["nominal"]:
         assert spec.way is not None
         ends = np.array(spec.way)
@@ -122,10 +122,10 @@ def test_eval_drives_the_ways_of_the_logs(
     assert main([*line, "--missions", "mine"]) == 2
     assert "choose from drawn, logged, logged:all" in capsys.readouterr().err
     assert main([*line, "--missions", "logged", "--layouts", "generated:test:2"]) == 2
-    assert "is about the floor of the logs, these are 2" in capsys.readouterr().err
+    assert "needs one floor, that of the logs; got 2" in capsys.readouterr().err
     without = kept_run(tmp_path / "without")
     assert main(["eval", str(without), "--missions", "logged"]) == 2
-    assert "learnt from no logs" in capsys.readouterr().err
+    assert "did not learn from logs" in capsys.readouterr().err
 
 
 @pytest.mark.long
@@ -143,7 +143,7 @@ def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
     ways = {spec.seed for spec in made.specs["nominal"][:2]}
     assert {row["episode_seed"] for row in driven} == ways
     (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
-    assert "chosen by such ways" in said
+    assert "chosen on such routes" in said
 
 
 def test_a_run_on_another_floor_cannot_evaluate_on_them(
@@ -151,5 +151,5 @@ def test_a_run_on_another_floor_cannot_evaluate_on_them(
 ) -> None:
     other = ["--set", "env.layouts=generated:train:3", "--out", str(tmp_path / "other")]
     assert main([*LOGGED_TRAINING, "--panel", str(panel.path), *other]) == 2
-    assert "evaluation.missions: is about the floor of the logs" in capsys.readouterr().err
+    assert "evaluation.missions: needs one floor, that of the logs" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()

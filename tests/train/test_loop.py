@@ -150,7 +150,7 @@ def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_p
     with pytest.raises(RunError, match="no earlier checkpoint was taken after 7 env"):
         go_back(live.run.latest, 7)
     live.run.latest.write_bytes(b"half a file")
-    with pytest.raises(RunError, match=f"go back to an earlier one: --from-env-steps {max(kept)}"):
+    with pytest.raises(RunError, match=f"use an earlier one: --from-env-steps {max(kept)}"):
         session(path, config(), resume=True)
     go_back(live.run.latest, min(kept))
     assert earlier(live.run.latest) == {}
@@ -216,7 +216,7 @@ def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path, quick_clone: 
 
 
 def test_a_jump_start_needs_logs(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="about the logs' behaviour, and this run has no logs"):
+    with pytest.raises(ConfigError, match="needs the logs' behaviour, but this run has no logs"):
         session(tmp_path / "run", config(**JUMP_START), logs=None)
 
 

@@ -168,7 +168,7 @@ def test_a_damaged_checkpoint_is_refused_by_name(
         assert main(argv) == 2
         said = capsys.readouterr().err
         assert f"{file}: is damaged" in said
-        assert "put back a copy of it, or train again" in said
+        assert "restore it from a copy, or train again" in said
 
 
 def test_going_back_to_a_damaged_checkpoint_changes_nothing(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_eval_takes_a_perturbation_from_a_file(run: Path, tmp_path: Path, capsys
     }
     for text, why in (
         ("[ranges]\ngain = [0.9, 1.0]\n", "is a schedule"),
-        ("timestep_s = 0.005\n", "holds for a timestep of 0.005 s"),
+        ("timestep_s = 0.005\n", "is for a timestep of 0.005 s"),
         ("grip = 1.0\n", "grip"),
     ):
         wet.write_text(text)

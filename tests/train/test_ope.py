@@ -76,7 +76,7 @@ def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> Non
     other = msgspec.structs.replace(TASK, time_limit_steps=3)
     with pytest.raises(RunError, match="its rows are of task"):
         load_ope_dataset(panel, other, str(store))
-    with pytest.raises(RunError, match="learnt from no panel"):
+    with pytest.raises(RunError, match="did not learn from a panel"):
         load_ope_dataset(None, TASK)
 
 

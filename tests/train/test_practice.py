@@ -193,13 +193,13 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rule": "shares", "shares": {"fog": 1.0}}, "'fog' is no kind of missions"),
+        ({"rule": "shares", "shares": {"fog": 1.0}}, "'fog' is not a kind of missions"),
         ({"rule": "shares", "shares": {"nominal": 0.0}}, "a share above 0"),
-        ({"rule": "even", "shares": {"nominal": 1.0}}, 'shares are of the rule "shares"'),
+        ({"rule": "even", "shares": {"nominal": 1.0}}, 'shares need the rule "shares"'),
         ({"rule": "success", "floor": 0.3}, r"floors of 4 arms sum to 1\.2, above 1"),
         ({"floors": {"nominal": 0.7, "wheel_slip": 0.4}}, "floors must sum to at most 1"),
         ({"rule": "logs"}, "this run has no logs"),
-        ({"rule": "missions"}, "there are none"),
+        ({"rule": "missions"}, "but none is given"),
     ],
 )
 def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: str) -> None:

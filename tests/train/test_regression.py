@@ -222,4 +222,4 @@ def test_the_verb_is_fit_for_a_pipeline(
     assert {row["verdict"] for row in document["regression"]} == {"worse", "no difference shown"}
     assert main(["eval", str(baseline), "--no-drive", "--baseline", str(baseline), "--check"]) == 0
     assert main(["eval", str(worse), "--no-drive", "--check"]) == 2
-    assert "says nothing without --baseline" in capsys.readouterr().err
+    assert "has no effect without --baseline" in capsys.readouterr().err

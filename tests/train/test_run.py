@@ -120,7 +120,7 @@ def test_a_directory_that_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="restock-run/999"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text('{"format": "restock-run/1"}')
-    with pytest.raises(RunError, match=r"by an earlier Restock .*\n.*make it again with"):
+    with pytest.raises(RunError, match=r"by an earlier Restock .*\n.*train again with"):
         Run.open(tmp_path)
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(RunError, match="cannot be read"):

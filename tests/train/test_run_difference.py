@@ -49,7 +49,7 @@ def test_runs_that_share_no_episode_or_have_no_evaluation_say_so(tmp_path: Path)
     second = make_run(tmp_path / "b", document(1), first_episode_seed=5)
     found = diff_runs(first, second)
     assert found["evaluation"] == []
-    assert "share no episode" in found["evaluation_note"]
+    assert "no episode in common" in found["evaluation_note"]
     young = Run.create(tmp_path / "young", document(2)).path
     found = diff_runs(first, young)
     assert "has no evaluation" in found["evaluation_note"]

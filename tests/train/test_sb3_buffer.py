@@ -112,7 +112,7 @@ def test_weights_that_the_library_cannot_use_are_refused(store: Path, tmp_path: 
     weighted = make_panel(store, tmp_path / "panel", n_step=3, post="full")
     env = sb3_envs(1)
     arguments = (100, env.observation_space, env.action_space)
-    with pytest.raises(MixtureError, match="losses take none"):
+    with pytest.raises(MixtureError, match="do not use any"):
         MixtureReplayBuffer(*arguments, panel=weighted)
     assert MixtureReplayBuffer(*arguments, panel=weighted, ignore_weights=True).size() == 0
 

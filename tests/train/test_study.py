@@ -60,7 +60,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     # The same directory, another question.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
     assert main(argv) == 2
-    assert "made for other settings" in capsys.readouterr().err
+    assert "made with other settings" in capsys.readouterr().err
 
 
 def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
@@ -164,7 +164,7 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ("arms = []", "arms must be two or more"),
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "a"', "each with its own name"),
         ('[[arms]]\nname = "../a"\n[[arms]]\nname = "b"', "must be letters"),
-        ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "and the study no store"),
+        ('[[arms]]\nname = "a"\nmixture = "u"\n[[arms]]\nname = "b"', "but the study has no store"),
         ('baseline = "c"\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "is not one of the arms"),
         (
             '[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "c"',
@@ -173,10 +173,10 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\nbaseline = "b"', "'b' is its own baseline"),
         (
             '[[arms]]\nname = "a"\ntreatment = "method"\n[[arms]]\nname = "b"',
-            "'a' is the study's baseline, and is compared with no other",
+            "'a' is the study's baseline: it cannot have a treatment",
         ),
         ('[[arms]]\nname = "a"\n[[arms]]\nname = "b"\ntreatment = "luck"', "Invalid enum value"),
-        ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "each once"),
+        ('seeds = [1, 1]\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "without repetition"),
         ('[settings]\nseed = 3\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "must not set seed"),
         ('worker = 2\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"', "unknown key `worker`"),
         (
@@ -193,13 +193,13 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
             f"primary = {{ arm = 'a', baseline = 'b', measure = 'auc_rare' }}\n{TWO}",
             "primary: 'a' is not compared with 'b'",
         ),
-        (f"power = {{ sd = 0.1, effect = 0.1 }}\n{TWO}", "power: of which contrast"),
+        (f"power = {{ sd = 0.1, effect = 0.1 }}\n{TWO}", "power needs a primary contrast"),
         (f"{PRIMARY}\npower = {{ sd = 0, effect = 0.1 }}\n{TWO}", "power.sd"),
         # A policy is the best of its own fixed episodes (seeds 90000 on): others must judge it.
-        (f"{TWO}[evaluation]\nseed = 89_990", "among them those that choose its policy"),
+        (f"{TWO}[evaluation]\nseed = 89_990", "which include those that choose its policy"),
         (
             f"{TWO}[settings]\nevaluation.seed = 10_039",
-            "judged by seeds 10000 to 10039, among them those that choose",
+            "evaluated on seeds 10000 to 10039, which include those that choose",
         ),
     ],
 )

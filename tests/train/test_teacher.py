@@ -363,14 +363,14 @@ def test_a_teacher_that_gives_no_action_is_refused(
 
 def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config(teacher={"source": "operator"}))
-    with pytest.raises(ConfigError, match="reads the warehouse twin, this is a ToyTwin"):
+    with pytest.raises(ConfigError, match="needs the warehouse twin, but this is a ToyTwin"):
         train(live)
     live.close()
     for source, message in (
         ("no_such_module:name", "cannot be imported: No module named"),
         ("restock.errors:nobody", "has no attribute 'nobody'"),
         ("restock.train.dqn.behaviour:UNKNOWN", "is a int, which has no act"),
-        ("given", "passed in by Python, and none is here"),
+        ("given", "passed in from Python, and none is given now"),
     ):
         with pytest.raises(ConfigError, match=message):
             session(tmp_path / source, config(teacher={"source": source}))
@@ -547,4 +547,7 @@ def test_the_operator_teaches_where_there_is_a_goal(tmp_path: Path) -> None:
         ['teacher.ratio={schedule = "linear", start = 0.3, end = 0.1, to_env_steps = 9}'],
     )
     assert loosened.config.teacher.ratio == Linear(0.3, 0.1, 9)
-    assert "teacher operator: Q chooses among what is plausible to it" in describe_run(loosened)
+    assert (
+        "teacher operator: the policy chooses by Q among the actions that it finds plausible"
+        in describe_run(loosened)
+    )

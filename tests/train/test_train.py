@@ -296,7 +296,10 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     [
         (["train"], "give --out RUN"),
         (["train", "--out", "{new}", "--set", "loss.gamma=1"], "unknown key `loss.gamma`"),
-        (["train", "--out", "{new}", "--set", "nonsense"], "'nonsense' is not key=value"),
+        (
+            ["train", "--out", "{new}", "--set", "nonsense"],
+            "'nonsense' is not of the form key=value",
+        ),
         (["train", "--out", "{new}", "--config", "{missing}"], "cannot be read"),
         (["train", "--out", "{new}", "--device", "cuda"], "sees no CUDA device"),
         (["train", "--out", "{new}", "--panel", "{missing}"], "no such panel"),
@@ -336,12 +339,12 @@ def test_a_panel_of_a_task_that_no_profile_has_is_refused(
     argv = ["train", "--panel", str(tmp_path / "panel"), "--out", str(tmp_path / "run")]
     assert main(argv) == 2
     said = capsys.readouterr().err
-    assert "no profile that comes with Restock has it" in said
+    assert "no shipped profile has this task" in said
     assert "--set profile=my_robot.toml" in said
     assert main([*argv, "--set", "profile=warehouse_amr"]) == 2
     said = capsys.readouterr().err
     assert "observation, action or reward differ" in said
-    assert "leave `profile` out of the config" in said
+    assert "leave out `profile` in the config" in said
     assert load_profile("warehouse_amr").task.hash in said
     assert not (tmp_path / "run").exists()
 

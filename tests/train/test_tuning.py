@@ -219,8 +219,8 @@ def test_a_trial_is_told_of_the_evaluations_of_its_training(tmp_path: Path) -> N
         ("'loss.nstep' = { low = 1, high = 4 }", "unknown key"),
         ("'loss.n_step' = 3", "must be a table"),
         ("'loss.discount' = { low = 0.0, high = 0.9, log = true }", "low above 0"),
-        ("seed = { low = 0, high = 9 }", "may set seed"),
-        ("mixture = { choices = ['uniform'] }", "and no store"),
+        ("seed = { low = 0, high = 9 }", "must not set seed"),
+        ("mixture = { choices = ['uniform'] }", "without a store"),
     ],
 )
 def test_a_space_that_cannot_be_searched_is_refused(tmp_path: Path, space: str, said: str) -> None:

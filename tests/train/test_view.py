@@ -247,7 +247,7 @@ def test_an_episode_of_the_evaluation_stands_beside_it(event: Event, tmp_path: P
     assert "/restock/evaluation/others" in layout["3D!evaluation"]["topics"]
 
     unknown = options(event, **(beside | {"beside": "wheel_slip/3"}))
-    with pytest.raises(ConfigError, match="is no episode that policy run@7 drove"):
+    with pytest.raises(ConfigError, match="is not an episode that policy run@7 drove"):
         write_view(event.trace, tmp_path / "a.mcap", unknown)
     table = read_evaluations(event.run)
     other = [{**recorded, "time_s": recorded["time_s"] + 1}]
@@ -258,13 +258,13 @@ def test_an_episode_of_the_evaluation_stands_beside_it(event: Event, tmp_path: P
 
 
 def test_what_cannot_be_shown_is_said_and_leaves_nothing(event: Event, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"neither in \.mcap"):
+    with pytest.raises(ConfigError, match=r"must end in \.mcap"):
         write_view(event.trace, tmp_path / "moment.bag")
     (tmp_path / "there.mcap").touch()
     with pytest.raises(ConfigError, match="exists already"):
         write_view(event.trace, tmp_path / "there.mcap")
     (tmp_path / "there.mcap").unlink()
-    with pytest.raises(StoreError, match="row of the twin"):
+    with pytest.raises(StoreError, match="row from the twin"):
         write_view(Trace(episode={"episode": 1}), tmp_path / "a.mcap")
     other = ROOT / "sample_logs" / "amr_monday.mcap"
     with pytest.raises(RecordingError, match="the row is of"):
@@ -285,4 +285,4 @@ def test_the_command_names_the_file_and_its_layout(
     assert made["layout"] == str(layout_of(path))
     assert Path(made["layout"]).exists()
     assert cli.main(["trace", str(event.run), "--view", str(tmp_path / "x.mcap")]) == 2
-    assert "name the ROW" in capsys.readouterr().err
+    assert "give ROW" in capsys.readouterr().err

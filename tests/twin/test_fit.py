@@ -112,7 +112,7 @@ def test_a_late_pose_or_tick_moves_segments_on_and_does_not_lose_them(known: Pat
     found = log_segments(replace(steps, now=late), 2.0)
     assert len(found) >= len(usual) - len(np.unique(usual.episode_id))
     assert not set(found.row) & set(usual.row[::2])
-    assert found.left_out["no fresh pose to begin with"] >= 1
+    assert found.left_out["no fresh pose at the start"] >= 1
     covered = found.row[:, None] + np.arange(found.horizon_steps)
     assert len(np.unique(covered)) == covered.size  # none overlap
     assert covered.size + sum(found.left_out.values()) == len(steps)
@@ -276,7 +276,7 @@ def test_points_and_perturbations_are_the_same_thing() -> None:
 
 
 def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for names, error in (("gain,grip", "'grip' cannot be fitted"), (" ,", "no parameter is named")):
+    for names, error in (("gain,grip", "'grip' cannot be fitted"), (" ,", "no parameter is given")):
         assert cli.main(["twin", "fit", str(known), "--parameters", names]) == ExitCode.USAGE
         assert error in capsys.readouterr().err
     assert cli.main(["twin", "fit", str(known), "--held-out", "1.5"]) == ExitCode.USAGE

@@ -209,7 +209,7 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
         ("image: a.pgm\nresolution: 0.05\norigin: [1.0e+300, 0, 0]\n", "origin"),
         ("image: ../a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "outside its folder"),
         ("image: /etc/hostname\nresolution: 0.05\norigin: [0, 0, 0]\n", "outside its folder"),
-        ('image: "a\\0b"\nresolution: 0.05\norigin: [0, 0, 0]\n', "no file's name"),
+        ('image: "a\\0b"\nresolution: 0.05\norigin: [0, 0, 0]\n', "not a file name"),
         ("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nmode: odd\n", "mode"),
         ("image: gone.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n", "cannot be read"),
         ("image: [\n", "YAML"),

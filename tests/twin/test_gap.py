@@ -243,7 +243,7 @@ def test_turtlebot3_sim_humble(tmp_path: Path) -> None:
         gap = measure_gap(store)
     assert {found.verdict for found in gap.verdicts} == {UNKNOWN}  # one episode of half a minute
     said = " ".join(gap.not_done)
-    for not_there in ("another floor", "no goal and no plan", "their odometry", "no fitted"):
+    for not_there in ("another floor", "no goal and no plan", "wheel odometry", "no fitted"):
         assert not_there in said, not_there
     assert position(gap, "nominal", BEFORE, 1.0)["median"] < 0.02
     assert not [row for row in gap.observations if row["component"].startswith("clearance_")]

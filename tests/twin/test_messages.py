@@ -211,7 +211,7 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, file_format: Fo
 def test_what_is_there_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "log.mcap").write_text("precious")
     with (
-        pytest.raises(RecordingError, match=r"log\.mcap: there is something here already"),
+        pytest.raises(RecordingError, match=r"log\.mcap: it already exists"),
         recording_sink(tmp_path / "log.mcap", "mcap", TOPICS),
     ):
         pass

@@ -113,7 +113,7 @@ def test_what_a_mission_met_is_in_its_truth() -> None:
 
 def test_missions_of_a_robot_are_those_of_its_tag() -> None:
     file = MissionsFile(missions=(SLIP, MissionOrder(kind="nominal", missions=1, robot="amr_7")))
-    with pytest.raises(ConfigError, match="amr_7: which robot this is"):
+    with pytest.raises(ConfigError, match="amr_7: no robot was given"):
         RecordingPlan(missions=file).orders()
     assert RecordingPlan(missions=file, tags={"robot": "amr_7"}).kinds == {
         "wheel_slip": 4,

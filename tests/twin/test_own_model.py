@@ -62,11 +62,11 @@ def test_conditions_and_perturbations_apply_to_it() -> None:
     [
         ('name="lidar"', 'name="laser"', "no site named lidar"),
         ('<velocity name="left"', '<velocity name="l"', "no actuator named left"),
-        ("<freejoint/>", "", "0 free joints, and must have one body, the base"),
+        ("<freejoint/>", "", "0 free joints, but must have one body, the base"),
         ('pos="0 0.2 0"', 'pos="0.1 0.2 0"', "wheels are 0.05 m ahead of the base"),
         ('pos="0.1 0 0.2"', 'pos="0.2 0 0.2"', "site lidar is 0.20 m ahead"),
         ('<geom type="sphere" size="0.1" mass="1.5"', '<geom size=".1" contype="0" conaffinity="0" '
-         'mass="1.5"', "wheel left wheel needs one geom that touches"),
+         'mass="1.5"', "wheel left wheel needs one geom with contacts"),
         ('joint="left hinge" kv="8"', 'joint="left hinge" gear="2" kv="8"', "with gear 1"),
         ('joint="left hinge"', 'joint="nowhere"', "MuJoCo says:"),
         ('kv="8"', 'kv="0.001"', r"it drives .* where 0.50 m/s is commanded"),
@@ -83,15 +83,15 @@ def test_what_a_model_lacks_is_said_by_name(old: str, new: str, message: str) ->
     [
         ('<mujoco><include file="/etc/passwd"/></mujoco>', "has a <include>"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "has a DOCTYPE"),
-        ("a robot", "is no XML"),
+        ("a robot", "is not XML"),
         ('<mujoco><asset><mesh file="a.stl"/></asset></mujoco>', "has a <mesh>"),
         ('<mujoco><worldbody><replicate count="1000000"/></worldbody></mujoco>', "<replicate>"),
         ('<mujoco><extension><plugin plugin="x"/></extension></mujoco>', "has a <extension>"),
-        ('<mujoco><option timestep="10"/></mujoco>', "option timestep='10', not from 0.0001"),
-        ('<mujoco><option timestep="nan"/></mujoco>', "no finite number"),
+        ('<mujoco><option timestep="10"/></mujoco>', "option timestep='10', which must be from"),
+        ('<mujoco><option timestep="nan"/></mujoco>', "not a finite number"),
         ("<mujoco>" + "<body>" * 101 + "</body>" * 101 + "</mujoco>", "101 of <body>"),
-        ("<robot/>", "is no MJCF: its root is <robot>"),
-        ("<mujoco>", "is no XML"),
+        ("<robot/>", "is not MJCF: its root is <robot>"),
+        ("<mujoco>", "is not XML"),
         ("<mujoco>" + " " * LARGEST_BYTES + "</mujoco>", "is longer than"),
     ],
 )  # fmt: skip
@@ -113,10 +113,10 @@ def test_it_travels_in_the_profile_without_its_file(tmp_path: Path) -> None:
     assert carried.hash == AMR.hash  # rows do not depend on it
     with pytest.raises(ConfigError, match=r"my_robot\.xml: .*No such file"):
         load_profile(tmp_path / "mine.toml")
-    with pytest.raises(ConfigError, match="beside that"):
+    with pytest.raises(ConfigError, match="relative to its folder"):
         read_profile_toml(text, where="a store")
     (tmp_path / "mine.toml").write_text(text.replace("my_robot", "../my_robot"))
-    with pytest.raises(ConfigError, match="leads out of the profile's folder"):
+    with pytest.raises(ConfigError, match="is outside the profile's folder"):
         load_profile(tmp_path / "mine.toml")
 
 

@@ -115,14 +115,14 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["--rates", "lidar=5"], "'lidar' is unknown"),
         (["--rates", "scan=7"], "scan must be 5 or 10, got 7"),
         (["--missions", "0"], "missions must be above 0"),
-        (["--minutes", "1", "--missions", "1"], "exclude each other"),
+        (["--minutes", "1", "--missions", "1"], "cannot be combined"),
         (["--seed", "-1"], "seed must be 0 or more"),
         (["--policy", "fred"], "unknown policy 'fred'"),
         (["--policy", "onnx:nowhere.onnx"], "nowhere.onnx: no such file"),
-        (["--policy", "random", "--epsilon", ".1"], "same probability already"),
+        (["--policy", "random", "--epsilon", ".1"], "random already takes every action"),
         (["--epsilon", "2"], "must be in [0, 1], got 2.0"),
         (["--perturbation", "fog"], "there is no perturbation 'fog'"),
-        (["--perturbation", "friction", "--exact"], "exclude each other"),
+        (["--perturbation", "friction", "--exact"], "cannot be combined"),
         (["--layouts", "moon"], "moon"),
     ],
 )
@@ -190,13 +190,13 @@ def test_flags_from_python() -> None:
     assert parse_rates("").imu == 50
     assert parse_start("2026-10-05T08:00") == parse_start("2026-10-05T10:00+02:00")
     assert parse_start("1970-01-02") == 86_400 * 10**9
-    with pytest.raises(ConfigError, match="'soon' is no time"):
+    with pytest.raises(ConfigError, match="'soon' is not a time"):
         parse_start("soon")
     with pytest.raises(ConfigError, match="between 1970 and 2200"):
         RecordingPlan(missions=1, start_ns=-1)
-    with pytest.raises(ConfigError, match="no name of a tag"):
+    with pytest.raises(ConfigError, match="not a name of a tag"):
         RecordingPlan(missions=1, tags={"": "x"})
-    with pytest.raises(ConfigError, match="give minutes or missions"):
+    with pytest.raises(ConfigError, match="give either minutes or missions"):
         RecordingPlan()
 
 

@@ -262,7 +262,7 @@ def test_without_a_map_the_floor_is_the_corridor_that_was_driven(tmp_path: Path)
 
 def test_a_bag_that_says_nothing_of_a_place_is_refused(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", poses=np.full((5, 3), np.nan))
-    with pytest.raises(RecordingError, match="neither a map nor anything"):
+    with pytest.raises(RecordingError, match="neither a map nor the robot's pose"):
         survey(bag)
 
 
@@ -325,7 +325,7 @@ def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
     store = write_store(tmp_path / "store", recordings)
     gone = survey(store)
     assert gone.by == "corridor"
-    assert "not there any more" in gone.notes[0]
+    assert "no longer exists" in gone.notes[0]
     manifests = DeltaTable(str(store / "recordings"))
     manifests.update(updates={"source_file": f"'{there}'"})
     made = survey(store)

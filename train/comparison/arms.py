@@ -107,12 +107,13 @@ class Arm:
                 raise RunError(
                     "has no record of the episodes it sampled",
                     where=str(run.path),
-                    remedy="it made no update yet, or an older Restock wrote it: train it again",
+                    remedy="it has made no update yet, or was written by an older Restock: train "
+                    "it again",
                 )
         seen: dict[Path, None] = {}
         for run in self.runs:
             if run.path.resolve() in seen:
-                raise RunError("is named twice", where=str(run.path))
+                raise RunError("is given twice", where=str(run.path))
             seen[run.path.resolve()] = None
             unlike = [
                 difference
@@ -122,10 +123,10 @@ class Arm:
             if unlike:
                 raise RunError(
                     f"differs from {self.runs[0].path} in {unlike[0].setting}"
-                    f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one arm"
-                    " differ in their seed alone",
+                    f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one arm "
+                    "may differ only in their seed",
                     where=str(run.path),
-                    remedy="name the runs of one method, then --against those of the other",
+                    remedy="give the runs of one method, then --against and those of the other",
                 )
 
     @cached_property
@@ -134,7 +135,7 @@ class Arm:
         for run in self.runs:
             if not run.table("progress").num_rows:
                 raise RunError(
-                    "is missing or has no rows, which say how far the run came",
+                    "is missing or has no rows, so the length of the run is not known",
                     where=str(run.path / "progress.parquet"),
                     remedy="restore the file from a copy, or train the run again",
                 )

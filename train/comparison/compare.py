@@ -193,7 +193,7 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
     if episodes < LEAST_EPISODES:
         return f"{episodes} episode{'s' * (episodes > 1)}, at least {LEAST_EPISODES} are needed"
     if difference.low == difference.high:
-        return "every run ended every episode alike: nothing varies"
+        return "every run ended every episode in the same way: nothing varies"
     return None
 
 

@@ -36,7 +36,7 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
         )
     if diagnosis.cause == "ACTION_COVERAGE":
         raise RunError(
-            "is ACTION_COVERAGE: no setting gives the logs the rows that they lack",
+            "is ACTION_COVERAGE: no setting can add the rows that the logs lack",
             where=str(run.path),
             remedy=diagnosis.experiment,
         )

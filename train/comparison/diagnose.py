@@ -118,8 +118,8 @@ class Window:
                     )
             elif not symptom.replay_share and (symptom.outlier or 0.0) >= limits.gap:
                 reasons.append(
-                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and"
-                    " replay has none of it"
+                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and "
+                    "the condition is not in replay"
                 )
             if reasons and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
                 reasons.append(f"got {symptom.quota_met:.0%} of its quota")
@@ -133,13 +133,13 @@ class Window:
         if symptom.supply >= limits.supply:
             return []
         share, met = symptom.replay_share, symptom.met_share
-        return [f"is {share:.2%} of replay and {met:.1%} of what driving meets"]
+        return [f"is {share:.2%} of replay and {met:.1%} of the steps when driving"]
 
     def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
         reasons = []
         if symptom.agreement is not None and symptom.agreement < limits.agreement:
             reasons.append(
-                f"of its logged rows {symptom.agreement:.0%} look like it: is the label right?"
+                f"{symptom.agreement:.0%} of its logged rows look like it: check the label"
             )
         rest = symptom.unexplained
         if (
@@ -148,8 +148,9 @@ class Window:
             and rest >= limits.unexplained_relative * least
         ):
             reasons.append(
-                f"its logged rows leave {rest:.0%} of their next observations unexplained"
-                f" (another condition's {least:.0%}): do they belong together?"
+                f"its logged rows leave {rest:.0%} of the variance of their next observations "
+                f"unexplained (another condition: {least:.0%}): check that observations, actions "
+                "and next observations match"
             )
         return reasons
 
@@ -281,11 +282,11 @@ def windows_of(run: Run) -> list[Window]:
             connection.register(f"run_{name}", run.table(name))
         rows = connection.sql(query).to_arrow_table().to_pylist()
     if not rows:
-        remedy = "let it run past an evaluation (evaluation.every_env_steps)"
+        remedy = "continue the run past its first evaluation (evaluation.every_env_steps)"
         if not run.document["config"]["env"].get("twin", True):
             remedy = (
-                "it learned on the logs alone, where nothing is evaluated:"
-                f" `restock eval {run.path} --on-logs own` judges it"
+                "it learned from the logs alone, without evaluations: use `restock eval "
+                f"{run.path} --on-logs own`"
             )
         raise RunError("has no evaluation to diagnose", where=str(run.path), remedy=remedy)
     bound = _value_bound(run)
@@ -363,19 +364,19 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits
     }
     return {
         "HEALTHY": "none needed: no figure is past its limit",
-        "BUFFER": f"train again with more or corrected rows of {which} and the same target rule:"
-        " these symptoms must be gone, and nothing else change",
+        "BUFFER": f"train again with more or corrected rows of {which} and the same target rule: "
+        "these symptoms must be gone, and nothing else change",
         "ACTION_COVERAGE": "train again with logged rows of "
         + ", ".join(lacking)
-        + " (record some, or take the twin's: `restock train --flush-fresh`): this symptom must be"
-        " gone, and the offline policy no worse there",
+        + " (record some, or use rows from the twin: `restock train --flush-fresh`): this symptom "
+        "must disappear, and the offline policy must not get worse there",
         "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
         " L and S must fall, or the median G",
-        "BOTH": f"first change the target rule alone, then the rows of {which} alone: one clock"
-        " at a time",
+        "BOTH": f"first change the target rule alone, then the rows of {which} alone",
         "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
         " target: no rows explain values above the sum of rewards, or without information",
-        "UNDETERMINED": "run longer, or more seeds: the last windows or the runs do not agree",
+        "UNDETERMINED": "train longer, or with more seeds: the last windows or the runs do not "
+        "agree",
     }[cause]
 
 

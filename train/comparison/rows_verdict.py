@@ -55,7 +55,7 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
         experiment = f"first correct the rows ({rows.findings[0].remedy}), mix and train again"
     said = [f"rows: {one.cause}: {one.text}" for one in rows.findings]
     if rows.untrusted:
-        said.append(f"rows: the twin strays from these logs: {', '.join(rows.untrusted)}")
+        said.append(f"rows: the twin is far from these logs in {', '.join(rows.untrusted)}")
     return replace(
         diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
     )

@@ -39,8 +39,8 @@ def diff_runs(first: Path, second: Path, *, seed: int = 0) -> dict[str, Any]:
     tasks = [str(run.document.get("task_hash")) for run in (a, b)]
     if tasks[0] != tasks[1]:
         raise RunError(
-            f"was trained on task {tasks[1]}, {first} on {tasks[0]}: their returns and episodes do"
-            " not mean the same",
+            f"was trained on task {tasks[1]}, {first} on {tasks[0]}: their returns and episodes "
+            "have different meanings",
             where=str(second),
             remedy="compare runs of one profile (`profile` in their configs)",
         )
@@ -85,7 +85,7 @@ def _panels(a: Run, b: Run) -> dict[str, Any] | None:
         panels = [Panel.open(one["path"]) for one in fed]
         for panel, one in zip(panels, fed, strict=True):
             if panel.id != one["id"]:
-                return {"note": f"at {one['path']} there now is another panel, {panel.id}"}
+                return {"note": f"{one['path']} is now another panel, {panel.id}"}
         return diff_panels(*panels)
     except RestockError as error:
         return {"note": str(error)}
@@ -135,7 +135,11 @@ def _evaluations(a: Run, b: Run, rng: np.random.Generator) -> tuple[str | None, 
         if shared := sorted(of_a.keys() & of_b.keys()):
             pairs = np.array([[of_a[key], of_b[key]] for key in shared])  # (n, 2, 2)
             rows.append(_evaluation(cell, pairs, rng))
-    return source, rows, None if rows else "they share no episode: evaluate both with one --seed"
+    return (
+        source,
+        rows,
+        None if rows else ("they have no episode in common: evaluate both with the same --seed"),
+    )
 
 
 def _evaluation(

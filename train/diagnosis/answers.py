@@ -101,7 +101,7 @@ def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
     """Without a twin: a speed is a speed, and commands come before what they cause."""
     name = relation.name
     if relation.gain is None:
-        row = not_run(f"gain: {name}", what, "no twin to say what it should be")
+        row = not_run(f"gain: {name}", what, "no twin to compare with")
         return Answer(relation, (row,), float("nan"), 0.0)
     gain = ConfidenceInterval(found.gain / relation.gain, *percentiles(found.gains / relation.gain))
     delay = ConfidenceInterval(found.delay, *percentiles(found.delays))

@@ -96,14 +96,14 @@ def diagnose_before_training(
         run: the run that was fed these rows, whose measured gap counts first.
 
     Raises:
-        RunError: there is neither a panel nor a store.
+        RunError: there is not a panel or a store.
         PanelError, StoreError: it is damaged, has no rows, or its profile is not at hand.
         ConfigError: the profile's task is not that of the rows.
     """
     begun = time.perf_counter()
     opened = open_rows(Path(path), profile, task_hash)
     own = opened.profile
-    fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not asked for")
+    fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not requested")
     diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
     places = [*([run] if run is not None else []), *opened.folders]
     diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
@@ -154,7 +154,7 @@ def open_rows(
         raise ConfigError(
             f"profile {own.name!r} defines task {own.task.hash}, the rows are of {of_rows}",
             where=str(path),
-            remedy="name the profile that they were ingested with",
+            remedy="give the profile with which they were ingested",
         )
     return opened
 
@@ -165,7 +165,7 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
         rows, own = of_panel(panel), profile or profile_of_panel(panel)
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
-            reason = f"the panel's store is not at {store_path} any more"
+            reason = f"the panel's store is no longer at {store_path}"
             missing = [not_run("labels", "labels by stored signals", reason)]
             return OpenedRows(rows, own, missing, [path])
         with Store(store_path, version=version) as store:
@@ -176,7 +176,7 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
             rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
             return OpenedRows(rows, own, _of_store(store, rows, own), [path])
     raise RunError(
-        "is neither a panel nor a store" if path.exists() else "no such panel or store",
+        "is not a panel or a store" if path.exists() else "there is no such panel or store",
         where=str(path),
         remedy="`restock mix STORE --mixture coverage --out PANEL` makes a panel",
     )

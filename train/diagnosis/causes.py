@@ -164,17 +164,18 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         share = (1 - gain) / 2
         return Finding(
             "ACTIONS_MIXED",
-            f"the logs' {end} explains only {max(gain, 0):.0%} of the motion that it should, as if"
-            f" it were the opposite in {share:.0%} of the rows, or another's in {1 - gain:.0%}",
-            f"look at some of the recordings one by one: {key} may be right in some and wrong in"
-            " others (robots, firmware), or actions may belong to other rows",
+            f"the logs' {end} explains only {max(gain, 0):.0%} of the expected motion, as if it "
+            f"had the opposite sign in {share:.0%} of the rows, or belonged to other rows in "
+            f"{1 - gain:.0%}",
+            f"check some recordings one by one: {key} may be right in some and wrong in others "
+            "(robots, firmware), or actions may belong to other rows",
             evidence,
         )
     if not 1 / GAIN <= scale <= GAIN and scale < 0:
         return Finding(
             "SENSOR_MIRRORED",
-            f"the logs' {end} has the opposite sign ({scale:+.2f} of what the others say)",
-            f"turn the sign of {key} in the profile (or its frame of reference)",
+            f"the logs' {end} has the opposite sign ({scale:+.2f} of the other signals)",
+            f"change the sign of {key} in the profile (or its frame of reference)",
             evidence,
         )
     if not 1 / GAIN <= scale <= GAIN:
@@ -185,7 +186,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         )
         return Finding(
             "SENSOR_SCALED" if not is_action else "COMMAND_SCALED",
-            f"the logs' {end} is {scale:.3g} times what the others say"
+            f"the logs' {end} is {scale:.3g} times the other signals"
             + (f": {unit}?" if unit else ""),
             f"scale {key} in the profile by {1 / scale:.3g}, or calibrate the sensor",
             evidence,
@@ -195,21 +196,21 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         slower = (
             ""
             if late or not is_action
-            else " (a robot that answers so much later than the twin looks the same: `restock twin"
-            " fit` tells its latency)"
+            else " (a robot with a much longer latency than the twin looks the same: `restock "
+            "twin fit` estimates its latency)"
         )
         return Finding(
             "ACTIONS_SHIFTED" if is_action else "SENSOR_SHIFTED",
-            f"the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps)"
-            f" {'late' if late else 'early'} against what it is compared with{slower}",
-            f"look at the stamps of {key}: `restock info` shows each topic's clock; use the time"
-            " of measurement, or correct the offset",
+            f"the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps) "
+            f"{'late' if late else 'early'} compared with the other signal{slower}",
+            f"check the stamps of {key}: `restock info --clocks` shows each topic's clock; use "
+            "the time of measurement, or correct the offset",
             evidence,
         )
     return Finding(
         "UNLIKE_TWIN",
-        f"the logs' {end} does not go with the rest as it does in the twin",
-        f"look at {key}: values of other rows, outliers or heavy noise",
+        f"the logs' {end} does not match the other signals as it does in the twin",
+        f"check {key} for values of other rows, outliers or heavy noise",
         evidence,
     )
 
@@ -240,8 +241,8 @@ def _permuted(moved: Sequence[tuple[Comparison, int, int]], task: Task) -> Findi
     return Finding(
         "ACTIONS_PERMUTED",
         f"the logs' actions are other actions of the twin: {pairs}",
-        "the logs were made with another table of actions, or other units: take [task] actions from"
-        " where they were made, check [inputs.command], and ingest them again",
+        "the logs were made with another table of actions, or other units: use the [task] actions "
+        "of their robot, check [inputs.command], and ingest them again",
         evidence,
     )
 
@@ -260,7 +261,10 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
                 del left[check]
     if labels := [row for name, row in left.items() if name.startswith("labels: ")]:
         shares = ", ".join(f"{row.check.removeprefix('labels: ')} {row.logs:.0%}" for row in labels)
-        text = f"labels are not what their conditions give on the stored signals: wrong in {shares}"
+        text = (
+            f"labels differ from what their conditions give on the stored signals: wrong in "
+            f"{shares}"
+        )
         remedy = "`restock label STORE` computes them again; corrections by people are kept"
         used = tuple(row.check for row in labels)
         found.append(Finding("LABELS_WRONG", text, remedy, used))
@@ -269,7 +273,7 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
         Finding(
             VALUES,
             f"{row.what}: {row.logs:.3g} in the logs" + (f" ({row.note})" if row.note else ""),
-            "look at the unit and the source of this value in the profile",
+            "check the unit and the source of this value in the profile",
             (name,),
         )
         for name, row in left.items()
@@ -292,16 +296,16 @@ KINDS = (
     Kind(
         "FUTURE_IN_OBSERVATION",
         ("foresight", "chain", "unchanged", "previous action", "own action", "closing"),
-        "in {foresight.logs:.0%} of the rows where the action changes the observation holds the"
-        " action that is only taken at it: observations are of the step after",
-        "observations must be made of what was known before acting: ingest the logs again",
+        "in {foresight.logs:.0%} of the rows where the action changes, the observation already "
+        "contains the new action: observations are from one step later",
+        "observations must contain only what was known before acting: ingest the logs again",
         beside=("chain", "unchanged"),
     ),
     Kind(
         "ROWS_APART",
         ("chain", "unchanged", "closing", "previous action", "own action"),
-        "in {chain.logs:.0%} of the rows the next observation is not the observation of the next"
-        " row: next observations are stale, or of other rows",
+        "in {chain.logs:.0%} of the rows the next observation is not the observation of the next "
+        "row: next observations are stale, or belong to other rows",
         "ingest the logs again; look for software that rewrites rows after ingest",
     ),
     Kind(
@@ -309,34 +313,35 @@ KINDS = (
         ("unchanged", "closing"),
         "in {unchanged.logs:.0%} of the rows in which the robot moves the next observation is the"
         " observation itself",
-        "are topics slower than the control clock? Take a longer control_period_s, or record them"
-        " faster",
+        "topics may be slower than the control clock: use a longer control_period_s, or record "
+        "them faster",
     ),
     Kind(
         "REWARD_DIFFERENT",
         ("reward rows", "goal reward", "reward scale"),
-        "{reward_rows.logs:.0%} of the logs' rewards are not what the task makes of their rows: are"
-        " they of other rows, or of another definition?",
+        "{reward_rows.logs:.0%} of the logs' rewards differ from the task's rewards for their "
+        "rows: they may belong to other rows, or to another definition",
         "ingest the logs again with this profile",
     ),
     Kind(
         "REWARD_SCALED",
         ("reward scale", "goal reward"),
-        "the logs' rewards are {reward_scale.effect:.3g} times what the task makes of their rows",
+        "the logs' rewards are {reward_scale.effect:.3g} times the task's rewards for their rows",
         "ingest the logs again with this profile, and scale rewards nowhere else",
     ),
     Kind(
         "REWARD_DIFFERENT",
         ("goal reward",),
-        "arriving earns {goal_reward.logs:.3g} in the logs and {goal_reward.twin:.3g} in the twin",
+        "reaching the goal earns {goal_reward.logs:.3g} in the logs and {goal_reward.twin:.3g} in "
+        "the twin",
         "ingest the logs again with this profile",
     ),
     Kind(
         "TERMINATIONS_LOST",
         ("terminated at the goal", "terminations"),
-        "of the logs' episodes that end at their goal {terminated_at_the_goal.logs:.0%} are"
-        " terminated there: beyond the others' ends the critic bootstraps",
-        "has the profile's [task] the robot's goal radius? Ingest the logs again",
+        "of the logs' episodes that end at their goal {terminated_at_the_goal.logs:.0%} are "
+        "terminated there: in the others the critic bootstraps beyond the end",
+        "check that the profile's [task] has the robot's goal radius, and ingest the logs again",
     ),
     Kind(
         "TERMINATIONS_WRONG",
@@ -347,36 +352,36 @@ KINDS = (
     Kind(
         "ACTIONS_CHANGED",
         ("own action", "previous action", "foresight"),
-        "in {own_action.logs:.0%} of the rows the next observation does not hold the row's own"
-        " action: the `action` column is not what the observations were made with",
+        "in {own_action.logs:.0%} of the rows the next observation does not contain the row's own "
+        "action: the `action` column does not match the observations",
         "something changed actions after ingest: ingest the logs again",
     ),
     Kind(
         COARSE,
         ("far commands",),
-        "{far_commands.logs:.0%} of the commands are more than .25 (of the fastest action) from the"
-        " action that stands for them",
-        "give [task] actions that are nearer to what the robot is commanded, or look at the unit of"
-        " [inputs.command]; the audit `far_actions` shows them",
+        "{far_commands.logs:.0%} of the commands are more than .25 (of the fastest action) from "
+        "the action that represents them",
+        "give [task] actions that are nearer to the robot's commands, or check the unit of "
+        "[inputs.command]; the audit `far_actions` lists the rows",
     ),
     Kind(
         "LIDAR_TURNED",
         ("lidar bearing",),
-        "the logs' lidar is turned by {lidar_bearing.effect:+.0f} degrees against the twin's: what"
-        " comes nearer when driving on does not lie ahead",
-        "look at the lidar's mounting: [task.body] lidar_yaw_rad, the scan's frame, [inputs.scan]",
+        "the logs' lidar is rotated by {lidar_bearing.effect:+.0f} degrees against the twin's: "
+        "what comes nearer when driving forward is not ahead",
+        "check the lidar's mounting: [task.body] lidar_yaw_rad, the scan's frame, [inputs.scan]",
     ),
     Kind(
         "TERMINATIONS_WRONG",
         ("terminations",),
-        "{terminations.logs:.0%} of the logs' terminations are not what their signals say",
+        "{terminations.logs:.0%} of the logs' terminations do not agree with their signals",
         "ingest the logs again with this profile",
     ),
     Kind(
         "EPISODES_REPEATED",
         ("repeated episodes",),
-        "{repeated_episodes.logs:.0%} of the rows are of episodes that are there twice",
-        "`restock audit` names the recordings (repeated_steps): take one of them out",
+        "{repeated_episodes.logs:.0%} of the rows belong to episodes that are stored twice",
+        "`restock audit` lists the recordings (repeated_steps): remove one of them",
     ),
 )
 

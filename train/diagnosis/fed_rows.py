@@ -190,7 +190,7 @@ def _by_step(table: pa.Table) -> Ints:
 
 
 def _not_looked_at(rows: int) -> dict[str, int]:
-    return {"more than are looked at, in whole episodes": rows} if rows else {}
+    return {"more than are checked, in whole episodes": rows} if rows else {}
 
 
 def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:

@@ -71,8 +71,8 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
     chosen = chosen or [name for name, _ in same[:1]]
     others = len(found) - len(same)
     note = (
-        f"{others} of {len(found)} recordings were labelled by other rules than the profile's, or"
-        " corrected by people: `restock label STORE` brings them up to date"
+        f"{others} of {len(found)} recordings were labelled with other rules than the profile's, "
+        "or corrected by people: `restock label STORE` updates them"
         if others
         else ""
     )

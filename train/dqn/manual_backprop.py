@@ -72,7 +72,7 @@ class ManualBackprop:
 
     def __init__(self, network: Network) -> None:
         if not isinstance(network, QNetwork) or network.value is not None or network.quantiles:
-            raise TypeError("manual backpropagation is for a plain QNetwork alone")
+            raise TypeError("manual backpropagation supports only a plain QNetwork")
         self._head = _Affine(network.advantage)
         self._layers: list[_Layer] = []
         for module in network.body:

@@ -32,7 +32,7 @@ class NativeBackprop:
         self, network: Network, values: Tensor, gradient: Tensor | None = None, *, wide: bool = True
     ) -> None:
         if not isinstance(network, QNetwork) or network.value is not None or network.quantiles:
-            raise TypeError("the compiled update is for a plain QNetwork alone")
+            raise TypeError("the compiled update supports only a plain QNetwork")
         modules = list(network.body)
         widths = [module.out_features for module in modules if isinstance(module, nn.Linear)]
         norms = [module.eps for module in modules if isinstance(module, nn.LayerNorm)]

@@ -63,17 +63,18 @@ def cloned_panel(run: Run, name: str) -> Panel:
     panel = run_panel(run.document)
     if panel is None:
         raise ConfigError(
-            "learnt from no logs: nobody is there to clone",
+            "did not learn from logs: there is no driver to clone",
             where=f"{run.path}, {name}",
-            remedy="leave it out of --policies, or train with --panel",
+            remedy="leave out `cloned` in --policies, or train with --panel",
         )
     driver = name.partition(":")[2]
     known = _drivers(panel)
     if driver and driver not in known:
         raise ConfigError(
-            f"nobody of the name {driver!r} drove in its logs",
+            f"its logs have no driver named {driver!r}",
             where=f"{run.path}, {name}",
-            remedy=f"they name {', '.join(known) or 'nobody: use cloned, which is of all rows'}",
+            remedy=f"its drivers are "
+            f"{', '.join(known) or 'nobody: use cloned, which is of all rows'}",
         )
     return panel
 

@@ -87,15 +87,16 @@ class EvaluationPlan:
         chosen = self.config.evaluation
         last = self.first_seed + max(self.episodes.values())
         if self.missions is not None:
-            flattered = "its policy was chosen by such ways: its success is flattered"
+            flattered = "its policy was chosen on such routes: its success is overestimated"
             return [self.missions.text, *([flattered] if chosen.missions != DRAWN else [])]
         if "agent" not in self.policies or not (
             chosen.seed < last and self.first_seed < chosen.seed + chosen.episodes
         ):
             return []
         return [
-            f"seeds {self.first_seed} to {last - 1} are among those that chose the run's policy"
-            f" ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is flattered"
+            f"seeds {self.first_seed} to {last - 1} are among those by which the run's policy was "
+            f"chosen ({chosen.seed} to {chosen.seed + chosen.episodes - 1}): its success is "
+            "overestimated"
         ]
 
     @property
@@ -230,14 +231,14 @@ def _missions(
         remedy = f"choose from {DRAWN}, {HELD_OUT}, {EVERY}"
         raise ConfigError("there are no such missions", where=where, remedy=remedy)
     if (panel := run_panel(run.document)) is None:
-        raise ConfigError("the run learnt from no logs", where=where, remedy="leave it out")
+        raise ConfigError("the run did not learn from logs", where=where, remedy="leave it out")
     if panel.task.goal == "none":
         raise ConfigError("the task has no goal", where=where, remedy="leave it out")
     if len(floors) > 1:
         raise ConfigError(
-            f"is about the floor of the logs, these are {len(floors)}",
+            f"needs one floor, that of the logs; got {len(floors)}",
             where=where,
-            remedy="name one with --layouts",
+            remedy="give one with --layouts",
         )
     return logged_missions(panel, floors[0], kinds, every=named == EVERY)
 
@@ -275,10 +276,10 @@ def _perturb(name: str) -> Perturbation | None:
         )
     if perturbation.timestep_s != Perturbation().timestep_s:
         raise ConfigError(
-            f"holds for a timestep of {perturbation.timestep_s:g} s, the evaluation runs at"
-            f" {Perturbation().timestep_s:g} s",
+            f"is for a timestep of {perturbation.timestep_s:g} s, but the evaluation runs at "
+            f"{Perturbation().timestep_s:g} s",
             where=name,
-            remedy="effective parameters are those of a timestep: fit them at this one",
+            remedy="effective parameters depend on the timestep: fit them at this one",
         )
     return perturbation
 

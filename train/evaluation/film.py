@@ -104,7 +104,7 @@ def film_evaluation(
         raise RunError(
             f"has no episode on floors {plan.layouts} to film",
             where=str(plan.run.path),
-            remedy=f"`restock eval {plan.run.path}` drives some",
+            remedy=f"run `restock eval {plan.run.path}` first",
         )
     folder = plan.run.path / FOLDER
     folder.mkdir(parents=True, exist_ok=True)

@@ -32,8 +32,8 @@ HELD_OUT, EVERY = "logged", "logged:all"
 AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says
 RESIDUAL_M = 0.1  # of a goal by distances
 ASIDE_M = 0.3  # that the way must leave a straight line by, for distances to tell a goal
-NO_GOAL = "the rows do not tell the goal's place"
-NO_WAY = "the floor has no way there: inside a wall, outside, or shut off"
+NO_GOAL = "the rows do not contain the goal's position"
+NO_WAY = "the goal cannot be reached on this floor: it is inside a wall, outside, or enclosed"
 AT_GOAL = "it starts at its goal"
 
 
@@ -114,8 +114,8 @@ def logged_missions(
         raise ConfigError(
             made.text,
             where=f"--missions, {floor.name}",
-            remedy=f"give --missions {EVERY}, a floor of the logs' own frame (`restock twin layout"
-            " --from STORE`), or leave --missions out",
+            remedy=f"give --missions {EVERY}, a floor in the frame of the logs (`restock twin "
+            "layout --from STORE`), or leave out --missions",
         )
     return made
 

@@ -114,7 +114,7 @@ def evaluate_run_off_policy(
 
 
 def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
-    """What can be measured on logs: without a goal, or with goals by hindsight, no success."""
+    """What can be measured on logs: without a goal, or with goals in hindsight, no success."""
     logged = task.goal == "route" and not dataset.hindsight
     return ("return", "success") if logged else ("return",)
 

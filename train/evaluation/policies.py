@@ -58,7 +58,7 @@ def load_policy(name: str, task: Task) -> Policy | None:
         raise ConfigError(
             f"was trained on task {trained.hash}, this is {task.hash}",
             where=path,
-            remedy="name a run of this task",
+            remedy="give a run of this task",
         )
     return agent
 
@@ -71,9 +71,9 @@ def load_agent(run: Run) -> GreedyPolicy:
     """
     if not run.best.exists():
         raise RunError(
-            "has kept no policy yet: its first evaluation is still to come",
+            "has not kept a policy yet: it stopped before its first evaluation",
             where=str(run.path),
-            remedy=f"go on with `restock train --resume {run.path}`",
+            remedy=f"continue it with `restock train --resume {run.path}`",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     state = checkpoint.load(run.best)
@@ -83,7 +83,7 @@ def load_agent(run: Run) -> GreedyPolicy:
             f"its policy was trained on task {state['task_hash']}, profile"
             f" {config.profile!r} now defines {task.hash}",
             where=str(run.best),
-            remedy="train again: observations or actions have changed their meaning",
+            remedy="train again: the meaning of observations or actions has changed",
         )
     network = make_policy(config, state["observation_size"], state["actions"])
     network.load_state_dict(state["network"])

@@ -29,7 +29,9 @@ def reference(name: str, seed: int = 0) -> Policy:
     if name == "random":
         return RandomPolicy(seed=seed)
     raise ConfigError(
-        f"there is no {name!r}", where="drivers", remedy=f"choose from {', '.join(REFERENCES)}"
+        f"there is no policy named {name!r}",
+        where="drivers",
+        remedy=f"choose from {', '.join(REFERENCES)}",
     )
 
 

@@ -72,7 +72,7 @@ def of_baseline(name: str) -> Evaluated:
         raise RunError(
             f"is neither a run nor a baseline; there are {known or 'none'} in {FOLDER}/",
             where=name,
-            remedy="`restock eval RUN --save-as-baseline NAME` keeps one",
+            remedy="`restock eval RUN --save-as-baseline NAME` saves one",
         )
     remedy = "save it again with --save-as-baseline"
     try:

@@ -100,12 +100,12 @@ class Batches(Stateful):
             MixtureError: every row was drawn as often as it may be.
         """
         if self._draws is None:
-            raise RuntimeError("there are no logs to draw from")
+            raise RuntimeError("there are no logs to sample from")
         drawn = self._draws.draw(self.batch_size)
         if len(drawn.rows) < self.batch_size:
             raise MixtureError(
                 f"every row of the panel was drawn {self._draws.controller.max_replays} times",
-                remedy="train on with fewer offline updates, or mix with more draws a row",
+                remedy="train with fewer offline updates, or mix with more draws per row",
             )
         return self._gather(drawn, _NO_ROWS)
 
@@ -135,7 +135,7 @@ class Batches(Stateful):
         if not len(young):
             raise MixtureError(
                 f"no fresh row is younger than max_age_env_steps = {self._max_age}",
-                remedy="mix with a larger one",
+                remedy="mix with a larger value",
             )
         return young[self._rng.integers(len(young), size=count)]
 
@@ -160,7 +160,7 @@ class Batches(Stateful):
         if self._logs_on_device is not None:
             return gather_rows(self._logs_on_device, torch.from_numpy(rows).to(self.device))
         if self._draws is None:
-            raise RuntimeError("there are no logs to draw from")
+            raise RuntimeError("there are no logs to sample from")
         packed = torch.empty((len(rows), self._fresh.shape[1]))
         self._draws.gather(rows, packed.numpy())
         return packed.to(self.device)

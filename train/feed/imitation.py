@@ -177,10 +177,10 @@ def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None)
         return
     have = "this run has no logs" if logged is None else f"the logs have {', '.join(logged)}"
     raise ConfigError(
-        f'teacher.source = "logs" clones the rows of {", ".join(config.policies) or "nobody"}, and'
-        f" {have}",
+        f'teacher.source = "logs" clones the rows of {", ".join(config.policies) or "nobody"}'
+        f", but {have}",
         where="teacher.policies",
-        remedy="give --panel one with rows of those policies, or name others",
+        remedy="give a --panel with rows of those policies, or choose other policies",
     )
 
 

@@ -167,7 +167,8 @@ class LogTerms:
         if logs is None:
             if loss.margin or loss.calibrated:
                 raise ConfigError(
-                    "loss.margin and loss.calibrated are for logged rows, and this run has no logs",
+                    "loss.margin and loss.calibrated apply to logged rows, but this run has no "
+                    "logs",
                     remedy="give --panel, or leave them out",
                 )
             return cls(None, None)

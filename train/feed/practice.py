@@ -76,7 +76,7 @@ class Practice(Stateful):
         self.floors = self._resolved_floors()
         if config.rule in MOVING and not goal:
             raise ConfigError(
-                f'the rule "{config.rule}" needs success, and the task has no goal',
+                f'the rule "{config.rule}" needs success, but the task has no goal',
                 where=f"{WHERE}.rule",
                 remedy='use "even" or "shares"',
             )
@@ -279,7 +279,7 @@ class Practice(Stateful):
             weights = np.where([arm.order >= 0 for arm in self.arms], self.natural, 0.0)
             if not weights.any():
                 raise ConfigError(
-                    'the rule "missions" practises ordered missions, and there are none',
+                    'the rule "missions" practises the missions of a file, but none is given',
                     where=f"{WHERE}.rule",
                     remedy="give env.missions a missions file (`restock gaps --missions-out`)",
                 )
@@ -287,8 +287,9 @@ class Practice(Stateful):
         if config.rule == "logs":
             if not logged:
                 raise ConfigError(
-                    'the rule "logs" practises as the logs are, and this run has no logs of the'
-                    " kinds that the twin has",
+                    'the rule "logs" practises with the shares of the logs, but this run has no '
+                    "logs"
+                    " of the kinds that the twin has",
                     where=f"{WHERE}.rule",
                     remedy="give --panel, or use another rule",
                 )
@@ -305,9 +306,9 @@ class Practice(Stateful):
             of_kind = np.array([arm.kind == name and arm.order < 0 for arm in self.arms])
             if not of_kind.any():
                 raise ConfigError(
-                    f"{name!r} is no kind of missions that this run can practise",
+                    f"{name!r} is not a kind of missions that this run can practise",
                     where=f"{WHERE}.{key}",
-                    remedy=f"there are {', '.join(self._known())}",
+                    remedy=f"choose from {', '.join(self._known())}",
                 )
             parts = np.where(of_kind, self.natural, 0.0)
             found += value * parts / parts.sum()

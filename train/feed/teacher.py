@@ -52,10 +52,10 @@ class OperatorTeacher(Stateful):
         """
         if not (hasattr(env, "simulation") and hasattr(env, "navigation")):  # what it looks at
             raise ConfigError(
-                f'teacher.source = "operator" reads the warehouse twin, this is a'
+                f'teacher.source = "operator" needs the warehouse twin, but this is a'
                 f" {type(env).__name__}",
-                remedy="pass a teacher of its own, restock.train.train(teacher=…), or name one as"
-                " module:name",
+                remedy="pass another teacher, restock.train.train(teacher=…), or give one as "
+                "module:name",
             )
         return self._operator.choose(env)
 
@@ -144,7 +144,7 @@ def open_teacher(
             raise ConfigError(
                 f"{name} is a {type(given).__name__}, which has no act and cannot be called",
                 where="teacher.source",
-                remedy="name an object with act(env, observation), or a function like it",
+                remedy="give an object with act(env, observation), or such a function",
             )
         given = _Called(given)
     return AskedTeacher(given, task, name)
@@ -154,9 +154,9 @@ def _imported(source: str) -> Any:
     """What `module:name` names; modules of the working directory are found too."""
     if source == GIVEN:
         raise ConfigError(
-            "the run's teacher was passed in by Python, and none is here",
+            "the run's teacher was passed in from Python, and none is given now",
             where="teacher.source",
-            remedy="begin a run that names it as module:name, to be able to go on with it",
+            remedy="to be able to continue a run, start it with a teacher given as module:name",
         )
     module, _, name = source.partition(":")
     here = str(Path.cwd())
@@ -167,8 +167,8 @@ def _imported(source: str) -> Any:
         raise ConfigError(
             f"{source} cannot be imported: {error}",
             where="teacher.source",
-            remedy="name a module that Python finds, or a file of the working directory, and what"
-            " in it is the teacher",
+            remedy="give a module that Python can import, or a file in the working directory, and "
+            "the name of the teacher in it",
         ) from error
     finally:
         sys.path.remove(here)

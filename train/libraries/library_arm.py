@@ -92,8 +92,8 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
     ]
     if refused:
         raise ConfigError(
-            f"{library} has no {', '.join(refused)} as the settings ask for",
-            remedy="give those to the other arms, not to the whole study",
+            f"{library} does not have {', '.join(refused)}, which the settings ask for",
+            remedy="give these settings to the other arms, not to the whole study",
         )
     loss = msgspec.structs.replace(config.loss, double=False)
     return resolve_config(msgspec.structs.replace(config, network=plain, loss=loss), None)

@@ -185,7 +185,7 @@ class MixedFeed:
         if not len(self.fresh) and len(drawing.rows) < batch_size:
             raise MixtureError(
                 f"every row of the panel was drawn {self._sampler.controller.max_replays} times",
-                remedy="collect steps, or mix with more draws a row",
+                remedy="collect steps, or mix with more draws per row",
             )
         return drawing
 
@@ -317,8 +317,8 @@ def _check(panel: Panel, profile: Profile, observation_size: int) -> None:
     task_hash = profile.task.hash
     if panel.task_hash != task_hash or panel.observation_size != observation_size:
         raise PanelError(
-            f"its rows are of task {panel.task_hash} ({panel.observation_size} entries an"
-            f" observation), the environment's ({profile.name}) is {task_hash}"
+            f"its rows are of task {panel.task_hash} ({panel.observation_size} entries per "
+            f"observation), the environment's ({profile.name}) is {task_hash}"
             f" ({observation_size})",
             where=str(panel.path),
             remedy=f"ingest the logs with `--profile {profile.name}` and mix again",

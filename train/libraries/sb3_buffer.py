@@ -87,7 +87,8 @@ class MixtureReplayBuffer(ReplayBuffer):
         panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
         if panel is not None and not ignore_weights and weighted(panel):
             raise MixtureError(
-                "its rows have importance weights, and Stable-Baselines3's losses take none",
+                "its rows have importance weights, but the losses of Stable-Baselines3 do not use "
+                "any",
                 where=str(panel.path),
                 remedy='mix with `correction = {pre = "none", post = "none"}` and without'
                 ' `within = "per"`, or say ignore_weights=True',
@@ -270,9 +271,9 @@ def logged_commands(panel: Panel | str | Path, store: str | Path) -> F32:
     wanted = panel.meta["transition_id"].to_numpy()
     if (missing := ~np.isin(wanted, ids)).any():
         raise MixtureError(
-            f"{missing.sum()} rows of the panel are not in it",
+            f"{missing.sum()} rows of the panel are not in this store",
             where=str(store),
-            remedy="give the store that the panel was made from",
+            remedy="give the store from which the panel was made",
         )
     row = np.searchsorted(ids, wanted)
     names = ("command_speed_mps", "command_yaw_rate_radps")

@@ -58,9 +58,10 @@ def _made(kind: Any, config: TrainConfig, arguments: dict[str, Any], **ours: Any
         return kind("MlpPolicy", env, seed=config.seed, device=config.device, **ours, **arguments)
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(
-            f"Stable-Baselines3's {kind.__name__} did not take its arguments: {error}",
+            f"Stable-Baselines3's {kind.__name__} refused its arguments: {error}",
             where="arguments",
-            remedy="see its documentation for what it takes, and docs/study.md for what is set",
+            remedy="see its documentation for its arguments, and docs/study.md for those that "
+            "Restock sets",
         ) from error
 
 

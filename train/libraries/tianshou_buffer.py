@@ -60,7 +60,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
         if panel is not None and panel.n_step != 1:
             raise MixtureError(
-                f"its rows span {panel.n_step} steps, and Tianshou makes its own returns",
+                f"its rows span {panel.n_step} steps, but Tianshou computes its own returns",
                 where=str(panel.path),
                 remedy="mix with `n_step = 1`",
             )

@@ -27,7 +27,7 @@ from restock.files import temporary_name
 FORMAT = "restock-checkpoint/5"
 _EARLIER = tuple(f"restock-checkpoint/{number}" for number in (1, 2, 3, 4))
 _ARRAY, _STRINGS, _NUMPY = "__array__", "__strings__", "numpy"
-_RESTORE = "put back a copy of it, or train again"
+_RESTORE = "restore it from a copy, or train again"
 _PREFIX, _SUFFIX = "env_steps_", ".safetensors"
 
 
@@ -61,7 +61,7 @@ def load(path: Path) -> dict[str, Any]:
         raise RunError(
             "there is no checkpoint",
             where=str(path),
-            remedy="was the run stopped before its first?",
+            remedy="the run may have stopped before its first one",
         )
     try:
         with safe_open(path, framework="pt") as opened:
@@ -71,7 +71,7 @@ def load(path: Path) -> dict[str, Any]:
                 raise RunError(
                     f"was written by an earlier Restock ({form}, this one reads {FORMAT})",
                     where=str(path),
-                    remedy="make it again with `restock train`",
+                    remedy="train again with `restock train`",
                 )
             if form != FORMAT:
                 raise RunError("is not a checkpoint of Restock", where=str(path))
@@ -87,7 +87,7 @@ def load(path: Path) -> dict[str, Any]:
     except (SafetensorError, OSError, ValueError, LookupError) as error:
         raise RunError(f"is damaged: {error}", where=str(path), remedy=_RESTORE) from error
     if not isinstance(restored, dict):
-        raise RunError("holds no state", where=str(path))
+        raise RunError("contains no state", where=str(path))
     return restored
 
 

@@ -36,9 +36,12 @@ class CloneQuality:
     def poor(self) -> str | None:
         """Why it is no good stand-in for the drivers; None where nothing says so."""
         if self.log_likelihood is None or self.agreement is None:
-            return "nothing says how good a clone it is: no row of its drivers is held out"
+            return "the quality of the clone is not known: no row of its drivers is held out"
         if self.log_likelihood <= (self.frequencies_log_likelihood or 0.0):
-            return "a poor clone: held-out actions are no likelier by it than by how often each is"
+            return (
+                "a poor clone: held-out actions are not more likely under it than under the "
+                "frequency of each action"
+            )
         if self.agreement <= (self.repeating or 0.0):
             return "a poor clone: repeating the last action agrees as often with held-out rows"
         return None

@@ -65,7 +65,7 @@ def replay_audit(run: Path | str) -> ReplayAudit:
     path = Path(run)
     Run.open(path)
     if not (path / "audit.parquet").is_file():
-        raise RunError("it has no audit.parquet", where=str(path), remedy="was it trained at all?")
+        raise RunError("it has no audit.parquet", where=str(path), remedy="train the run first")
     fields = ", ".join(ReplayAuditRecord.__struct_fields__)
     with open_place(path) as connection:
         return ReplayAudit(connection.sql(f"SELECT {fields} FROM replay_audit").to_arrow_table())

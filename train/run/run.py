@@ -41,7 +41,7 @@ class _Document(dict[str, Any]):
         self._path = path
 
     def __missing__(self, key: str) -> Any:
-        raise RunError(f"says nothing of {key!r}", where=str(self._path), remedy=_AGAIN)
+        raise RunError(f"does not contain {key!r}", where=str(self._path), remedy=_AGAIN)
 
 
 class Run:
@@ -91,7 +91,7 @@ class Run:
             raise RunError(
                 f"was written by an earlier Restock ({form}, this one reads {FORMAT})",
                 where=str(path),
-                remedy="make it again with `restock train`",
+                remedy="train again with `restock train`",
             )
         if form != FORMAT:
             raise RunError(f"has format {form!r}, this Restock reads {FORMAT!r}", where=str(config))

@@ -38,7 +38,8 @@ def profile_of_run(run: Run) -> Profile:
         raise RunError(
             f"the profile in it cannot be read: {error.what}",
             where=str(run.path / "config.json"),
-            remedy="a newer Restock wrote it (use that one), or restore the file from a copy",
+            remedy="it may be written by a newer Restock (use that version); else restore the "
+            "file from a copy",
         ) from error
 
 
@@ -71,25 +72,28 @@ def carried_profile(
     Raises:
         error: neither has this task.
     """
-    problem, remedy = "", f"give the file of the profile that its logs were ingested with: {option}"
+    problem, remedy = (
+        "",
+        (f"give the file of the profile with which its logs were ingested: {option}"),
+    )
     if text:
         try:
             own = read_profile_toml(text, where=where)
             if own.task.hash == task_hash:
                 return own
-            problem = f"; by this Restock the profile that it carries defines {own.task.hash}"
+            problem = f"; with this Restock, the profile that it contains defines {own.task.hash}"
             remedy = (
-                "observation or reward have another meaning since: ingest its recordings again"
-                " (`restock ingest RECORDINGS --store STORE`), and mix again"
+                "the meaning of observation or reward has changed since: ingest its recordings "
+                "again (`restock ingest RECORDINGS --store STORE`), and mix again"
             )
         except ConfigError as refused:
-            problem = f"; the profile that it carries cannot be read: {refused.what}"
+            problem = f"; the profile that it contains cannot be read: {refused.what}"
     fitting = [p for p in map(load_profile, shipped_profiles()) if p.task.hash == task_hash]
     if not fitting:
         raise error(
             f"its rows are of task {task_hash}"
             + (f", of profile {name!r}" if name else "")
-            + f": no profile that comes with Restock has it{problem}",
+            + f": no shipped profile has this task{problem}",
             where=where,
             remedy=remedy,
         )

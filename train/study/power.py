@@ -94,12 +94,16 @@ def seeds_needed(effect: float, sd: float) -> int | None:
 
 def warning(power: Power) -> str:
     """That a study is too small for its contrast, by name."""
-    more = f"{power.seeds_needed} seeds would do" if power.seeds_needed else "no number would do"
+    more = (
+        f"{power.seeds_needed} seeds would be enough"
+        if power.seeds_needed
+        else ("no number of seeds would be enough")
+    )
     return (
-        f"a study too small for its contrast: {power.measure} of {power.arm} against"
+        f"the study is too small for its contrast: {power.measure} of {power.arm} against"
         f" {power.baseline}, a difference of {power.effect:g} is found with a probability of"
-        f" {power.power:.2f} by {power.seeds} seeds; the least that they find with {ENOUGH:g} is"
-        f" {power.least_effect:.3f}; {more}"
+        f" {power.power:.2f} with {power.seeds} seeds; the least effect that they find with a "
+        f"probability of {ENOUGH:g} is {power.least_effect:.3f}; {more}"
     )
 
 

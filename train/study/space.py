@@ -70,18 +70,20 @@ class Search(Checked, frozen=True):
 
     def check(self) -> None:
         if not self.parameters:
-            raise ValueError("space must have a key or more")
+            raise ValueError("space must have at least one key")
         if self.mixture is not None and self.panel is not None:
             raise ValueError("panel must not be given beside mixture: choose one")
         mixed = self.mixture is not None or MIXTURE in self.parameters
         if mixed and self.store is None:
-            raise ValueError("a mixture is named, and no store")
+            raise ValueError("a mixture is given without a store")
         if MIXTURE in self.parameters and (self.panel is not None or self.mixture is not None):
-            raise ValueError("space has mixture: give neither mixture nor panel beside it")
+            raise ValueError("space contains mixture: do not give mixture or panel as well")
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(f"seeds must be one or more, each once, got {list(self.seeds)}")
+            raise ValueError(
+                f"seeds must be at least one, without repetition; got {list(self.seeds)}"
+            )
         if "seed" in self.settings or "seed" in self.parameters:
-            raise ValueError("seeds are the search's: neither settings nor space may set seed")
+            raise ValueError("the search sets the seeds: settings and space must not set seed")
 
     @property
     def parameters(self) -> dict[str, Parameter]:

@@ -43,9 +43,9 @@ class ArmConfig(Checked, frozen=True):
         if self.mixture is not None and self.panel is not None:
             raise ValueError("panel must not be given beside mixture: choose one")
         if self.library is None and self.arguments:
-            raise ValueError("arguments: there is no library to take them")
+            raise ValueError("arguments need a library")
         if self.library is not None and (self.mixture is not None or self.panel is not None):
-            raise ValueError("library: it learns from no logs here, give no mixture or panel")
+            raise ValueError("library: without logs here, so do not give mixture or panel")
 
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -61,7 +61,9 @@ class StudyEvaluation(Checked, frozen=True):
     def check(self) -> None:
         kinds = list(self.episodes) if isinstance(self.episodes, dict) else []
         if unknown := [kind for kind in kinds if kind not in KINDS]:
-            raise ValueError(f"episodes: there is no {unknown[0]!r}, of {', '.join(KINDS)}")
+            raise ValueError(
+                f"episodes: there is no {unknown[0]!r}; choose from {', '.join(KINDS)}"
+            )
 
     @property
     def of_kind(self) -> Mapping[str, int]:
@@ -125,17 +127,19 @@ class Study(Checked, frozen=True):
                 raise ValueError(f"arm {arm.name!r} is its own baseline")
         if self.base.treatment is not None or self.base.baseline is not None:
             raise ValueError(
-                f"arm {self.base.name!r} is the study's baseline, and is compared with no other:"
-                " it takes neither treatment nor baseline"
+                f"arm {self.base.name!r} is the study's baseline: it cannot have a treatment or a "
+                "baseline"
             )
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(f"seeds must be one or more, each once, got {list(self.seeds)}")
+            raise ValueError(
+                f"seeds must be at least one, without repetition; got {list(self.seeds)}"
+            )
         if self.store is None and any(arm.mixture for arm in self.arms):
-            raise ValueError("an arm names a mixture, and the study no store")
+            raise ValueError("an arm gives a mixture, but the study has no store")
         if any(
             "seed" in settings for settings in (self.settings, *(a.settings for a in self.arms))
         ):
-            raise ValueError("seeds are the study's: `settings` must not set seed")
+            raise ValueError("the study sets the seeds: `settings` must not set seed")
         self._check_contrasts(names)
 
     def _check_contrasts(self, names: list[str]) -> None:
@@ -143,17 +147,17 @@ class Study(Checked, frozen=True):
         for wrong in filter(None, map(unknown_measure, measures)):
             raise ValueError(wrong)
         if unknown := [name for name in self.rare if name not in CELLS]:
-            raise ValueError(f"rare: there is no {unknown[0]!r}, of {', '.join(CELLS)}")
+            raise ValueError(f"rare: there is no {unknown[0]!r}; choose from {', '.join(CELLS)}")
         if self.primary is not None:
             if missing := [name for name in self.primary.pair if name not in names]:
                 raise ValueError(f"primary: {missing[0]!r} is not one of the arms {names}")
             if self.primary.pair not in [(p.arm.name, p.baseline.name) for p in self.pairs]:
                 raise ValueError(
-                    f"primary: {self.primary.arm!r} is not compared with {self.primary.baseline!r}:"
-                    " name that as the arm's `baseline`"
+                    f"primary: {self.primary.arm!r} is not compared with "
+                    f"{self.primary.baseline!r}: set that as the arm's `baseline`"
                 )
         if self.power is not None and self.primary is None:
-            raise ValueError("power: of which contrast? name the primary one")
+            raise ValueError("power needs a primary contrast: set `primary`")
 
     @property
     def base(self) -> ArmConfig:
@@ -203,10 +207,11 @@ def refuse_judging_by_the_choice(
     judged = evaluation.seed, evaluation.seed + max(evaluation.of_kind.values())
     if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
         raise ConfigError(
-            f"{what} would be judged by seeds {judged[0]} to {judged[1] - 1}, among"
-            f" them those that choose its policy ({chosen.seed} on)",
+            f"{what} would be evaluated on seeds {judged[0]} to {judged[1] - 1}, which include "
+            f"those that choose its policy (from {chosen.seed})",
             where=where,
-            remedy="set evaluation.seed of the study apart from settings' evaluation.seed",
+            remedy="set evaluation.seed of the study to another range than the evaluation.seed of "
+            "the settings",
         )
 
 

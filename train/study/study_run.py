@@ -51,7 +51,7 @@ def run_study(
     for job in plan.jobs:
         if job.done.exists() and job.done.read_text(encoding="utf-8") != plan.fingerprint(job):
             raise RunError(
-                "was made for other settings than the study now has",
+                "was made with other settings than those of the study now",
                 where=str(job.path),
                 remedy="remove it, or give the study another --out",
             )
@@ -100,7 +100,7 @@ def _run_on_ray(plan: StudyPlan, jobs: Sequence[StudyJob], workers: int, say: Sa
                 error = RunError(
                     f"the process that made it died ({type(died).__name__})",
                     where=str(job.path),
-                    remedy="run the study again: what is done is kept",
+                    remedy="run the study again: finished runs are kept",
                 )
             if error is None:
                 say(f"{job.path.name}: trained and evaluated")
@@ -116,9 +116,9 @@ def _ray_task(plan: StudyPlan, job: StudyJob, folder: str) -> RestockError | Non
         os.chdir(folder)
     except OSError:
         return RunError(
-            f"the machine that was to make it has no folder {folder}",
+            f"the worker machine has no folder {folder}",
             where=str(job.path),
-            remedy="put the study where every machine of the cluster sees it",
+            remedy="put the study in a folder that all machines of the cluster can read",
         )
     try:
         run_job(plan, job, lambda line: None)
@@ -259,7 +259,7 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
         raise RestockError(
             f"`{what}` failed with exit code {process.returncode}: " + " / ".join(last),
             where=str(log),
-            remedy="mend it and run the study again: what is done is kept",
+            remedy="correct it and run the study again: finished runs are kept",
         )
 
 

@@ -96,7 +96,7 @@ def run_search(plan: SearchPlan, *, say: Say = lambda line: None) -> dict[str, A
         raise RunError(
             "is of another search: its space, settings, seeds or evaluation were different",
             where=str(plan.out),
-            remedy="name another --out; only `trials` and `doc` may change",
+            remedy="choose another --out; only `trials` and `doc` may change",
         )
     plan.out.mkdir(parents=True, exist_ok=True)
     write_text(asked, plan.fingerprint)
@@ -126,7 +126,7 @@ def run_search(plan: SearchPlan, *, say: Say = lambda line: None) -> dict[str, A
             raise
         if worst is None:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-            say("stopped: behind the median of the trials before it")
+            say("stopped: worse than the median of earlier trials")
             continue
         trial.set_user_attr("condition", worst[1])
         study.tell(trial, worst[0])
@@ -169,7 +169,7 @@ def worst_condition(tables: Iterable[pa.Table]) -> tuple[float, str]:
                 )
             counts.setdefault(condition, []).append(success)
     if not counts:
-        raise RunError("no episode was driven: there is nothing to judge by", where="[space]")
+        raise RunError("no episode was driven: there is nothing to compare", where="[space]")
     bounds = {name: wilson(sum(met), len(met))[0] for name, met in counts.items()}
     condition = min(sorted(bounds), key=lambda name: bounds[name])
     return bounds[condition], condition
@@ -246,7 +246,7 @@ def _train(
         raise RestockError(
             f"`restock train` failed with exit code {process.returncode}: " + " / ".join(last),
             where=str(log),
-            remedy="mend it and run the same command again: what is done is kept",
+            remedy="correct it and run the same command again: finished trials are kept",
         )
     if trial is not None and not stopped:  # what it evaluated since it was last looked at
         _falls_behind(trial, path, told, index)
@@ -325,7 +325,7 @@ def search_page(found: Mapping[str, Any]) -> str:
         lines.append(f"| {trial['trial']} | {trial['state']} | {name} | {reached} | {words} |")
     if found["best"] is not None:
         lines += ["", "`best.toml` has the settings of the best; it was chosen among several by"]
-        lines += ["these episodes, so judge it on others: `restock eval RUN --seed N`."]
+        lines += ["these episodes, so evaluate it on others: `restock eval RUN --seed N`."]
     return "\n".join(lines) + "\n"
 
 

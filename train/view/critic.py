@@ -47,8 +47,8 @@ def critic_along(path: str | Path, moment: Moment) -> Critic:
         raise RunError(
             f"was trained on task {task.hash}, these steps are of {moment.task.hash}",
             where=str(run.path),
-            remedy="give a run of the same task with --critic, or leave the critic out:"
-            " --critic none",
+            remedy="give a run of the same task with --critic, or leave out the critic: --critic "
+            "none",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     rows = _packed(moment, config.loss.discount)
@@ -74,9 +74,9 @@ def _of_checkpoint(run: Run, config: TrainConfig, rows: F32, moment: Moment) -> 
         learner.load_state_dict(checkpoint.load(run.latest)["learner"])
     except (KeyError, ValueError) as error:
         raise RunError(
-            f"holds no learner of this Restock: {error}",
+            f"contains no learner that this Restock can read: {error}",
             where=str(run.latest),
-            remedy="name another run with --critic, or --critic none",
+            remedy="choose another run with --critic, or --critic none",
         ) from error
     td, q, _ = learner.td_error(torch.from_numpy(rows).to(learner.device))
     named = f"its last checkpoint, after {learner.gradient_steps:,} updates"
@@ -93,7 +93,7 @@ def _of_policy(run: Run, rows: F32, moment: Moment) -> Critic:
     action = torch.from_numpy(rows[:, -3]).long()
     td = q.gather(1, action[:, None])[:, 0] - (reward + discount * after)
     steps = int(agent.version.rpartition("@")[2] or 0)
-    named = f"the policy that it kept, of update {steps:,}, as its own target"
+    named = f"the policy that it kept, from update {steps:,}, used as its own target"
     return _critic(run, named, steps, q, td, moment)
 
 

@@ -141,11 +141,12 @@ def _recorded(plan: EvaluationPlan, name: str) -> dict[str, Any]:
         for condition, seeds in of.items()
     )
     raise ConfigError(
-        f"{name!r} is no episode that policy {version} drove in the evaluation of {plan.run.path}",
+        f"{name!r} is not an episode that policy {version} drove in the evaluation of "
+        f"{plan.run.path}",
         where="--beside",
         remedy=f"give CONDITION/SEED of one: {known}"
         if known
-        else f"`restock eval {plan.run.path}` drives some",
+        else f"run `restock eval {plan.run.path}` first",
     )
 
 

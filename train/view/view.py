@@ -52,7 +52,7 @@ def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> 
     check_view(path)
     if trace.origin is None:
         raise StoreError(
-            "is a row of the twin: no recording has its moment",
+            "is a row from the twin, so there is no recording of it",
             where="--view",
             remedy="`restock record --policy run:RUN --missions FILE` drives its mission again",
         )
@@ -90,12 +90,14 @@ def check_view(path: Path) -> None:
     """Raises ConfigError where nothing can be written to `path`: before anything is looked up."""
     if path.suffix not in ENDINGS:
         raise ConfigError(
-            f"{path.name!r} ends neither in .mcap (Foxglove) nor in .rrd (Rerun)",
+            f"{path.name!r} must end in .mcap (Foxglove) or .rrd (Rerun)",
             where="--view",
-            remedy="give the file such a name",
+            remedy="choose another name",
         )
     if path.exists():
-        raise ConfigError("exists already", where=str(path), remedy="remove it, or name another")
+        raise ConfigError(
+            "exists already", where=str(path), remedy="remove it, or choose another name"
+        )
     if path.suffix == ".rrd":
         require_rerun()
 
@@ -111,9 +113,9 @@ def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
         return None
     if options.beside_run is None:
         raise ConfigError(
-            "is an episode of an evaluation: which run's?",
+            "is an episode of an evaluation, so its run is needed",
             where="--beside",
-            remedy="name the run with --critic RUN",
+            remedy="give the run with --critic RUN",
         )
     from restock.train.view.evaluated import Beside, evaluated_moment
 

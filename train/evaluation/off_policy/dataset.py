@@ -77,7 +77,7 @@ class OpeDataset:
     training: OpeSteps  # that the policy learnt from: the models are fitted on them
     evaluation: OpeSteps  # of other episodes
     notes: tuple[str, ...]  # what is worth saying
-    hindsight: bool = False  # goals by hindsight: to arrive is no success
+    hindsight: bool = False  # goals in hindsight: to arrive is no success
 
 
 def load_ope_dataset(
@@ -97,7 +97,7 @@ def load_ope_dataset(
         StoreError, PanelError: no store or panel there, or it is no longer what it was.
     """
     if logs is None and trained is None:
-        raise RunError("learnt from no panel", remedy="name logs with --on-logs STORE")
+        raise RunError("did not learn from a panel", remedy="give logs with --on-logs STORE")
     notes: list[str] = []
     with ExitStack() as opened:
         store, ids = _open(logs, trained, task)
@@ -105,7 +105,7 @@ def load_ope_dataset(
         if trained is None:
             ids, training_ids = _halves(store, ids)
             training_store = store
-            notes.append("the run had no panel: the models are of one half of the episodes")
+            notes.append("the run had no panel: the models are fitted on one half of the episodes")
         elif logs is None and trained.header.split_by == "within_episode":
             notes.append(f"held out: {trained.header.split_note}, not whole episodes")
             training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
@@ -113,12 +113,12 @@ def load_ope_dataset(
         else:
             ids, left_out = _unseen(store, trained, ids)
             if left_out:
-                notes.append(f"{left_out:,} episodes left aside: rows of them were trained on")
+                notes.append(f"{left_out:,} episodes left out: some of their rows were trained on")
             training_ids = np.asarray(trained.meta_column("transition_id"), np.int64)
             training_store = store if logs is None else opened.enter_context(panel_store(trained))
         if not len(ids) or not len(training_ids):
             raise RunError(
-                "holds no episode that the run did not learn from"
+                "contains no episode that the run did not learn from"
                 + (
                     f" (held out: {trained.header.split_note})"
                     if trained is not None and _unsplit(trained)
@@ -129,19 +129,21 @@ def load_ope_dataset(
                 " --on-logs",
             )
         if (count := len(training_ids)) > MODEL_ROWS:
-            notes.append(f"models are of {MODEL_ROWS:,} of {count:,} rows, chosen at random")
+            notes.append(
+                f"the models are fitted on {MODEL_ROWS:,} of {count:,} rows, chosen at random"
+            )
             rng = np.random.default_rng([seed, 11])
             training_ids = rng.choice(training_ids, MODEL_ROWS, replace=False)
         evaluation = read_steps(store.connection, ids)
         if hindsight := _by_hindsight(store.connection, ids):
-            notes.append("goals by hindsight are always reached: success is not estimated")
+            notes.append("goals in hindsight are always reached: success is not estimated")
         training = read_steps(training_store.connection, training_ids)
     for name, steps, asked_for in (
         ("held-out", evaluation, ids),
         ("panel's", training, training_ids),
     ):
         if missing := len(asked_for) - len(steps.rows):
-            notes.append(f"{missing:,} {name} rows are of other stores, and not looked at")
+            notes.append(f"{missing:,} {name} rows are in other stores, and not used")
         if not len(steps.rows):
             raise StoreError(f"has none of the {name} rows", where=str(training_store.path))
     return OpeDataset(training, evaluation, tuple(notes), hindsight)
@@ -256,9 +258,9 @@ def panel_store(panel: Panel) -> Store:
     """The store of a panel, at its version. Raises StoreError where it was kept nowhere."""
     if panel.store_version < 0:
         raise StoreError(
-            "was mixed from a table in memory: its held-out rows are kept nowhere",
+            "was mixed from a table in memory: its held-out rows were not stored",
             where=str(panel.path),
-            remedy="name the logs with --on-logs STORE",
+            remedy="give the logs with --on-logs STORE",
         )
     return Store(panel.header.store, version=panel.store_version)
 

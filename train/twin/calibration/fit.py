@@ -93,10 +93,10 @@ class FitConfig(Checked, frozen=True):
     def check(self) -> None:
         """Raises ValueError where a parameter cannot be fitted."""
         if not self.parameters:
-            raise ValueError(f"no parameter is named: name some of {', '.join(PARAMETERS)}")
+            raise ValueError(f"no parameter is given: choose from {', '.join(PARAMETERS)}")
         for name in self.parameters:
             if name not in PARAMETERS:
-                raise ValueError(f"{name!r} cannot be fitted: name some of {', '.join(PARAMETERS)}")
+                raise ValueError(f"{name!r} cannot be fitted: choose from {', '.join(PARAMETERS)}")
 
     @property
     def step_s(self) -> float:
@@ -264,7 +264,7 @@ def _held_out_gaps(
     """The gap of position on what the fit has not seen, at 1, 3 and 6 s."""
     if "position" not in scope.channels or not config.held_out:
         return ()
-    report("replaying what was held out")
+    report("driving the held-out segments again")
     gaps, period_s = [], data.steps.task.control_period_s
     for wanted_s in HELD_OUT_HORIZONS_S:
         horizon_s = max(round(wanted_s / period_s), 1) * period_s

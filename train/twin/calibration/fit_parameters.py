@@ -159,26 +159,25 @@ def fit_scope(
         guessed = [name for name in MEASURED if robot.origin_of(name) == "default"]
         if "payload_kg" in names:
             refused["payload_kg"] = (
-                "how strong the motors of the profile's robot are is not known, so wheels that lag"
-                " do not tell how heavy it is"
+                "the motor strength of the profile's robot is not known, so the payload cannot be "
+                "identified from the lag of the wheels"
             )
         if robot.drive == "ackermann" and "track_scale" in names:
             refused["track_scale"] = (
-                "a robot that steers turns by its steering angle: how far its wheels are apart does"
-                " not show"
+                "a robot that steers turns by its steering angle, so its track cannot be identified"
             )
         if guessed:
             notes.append(
-                f"nothing says {', '.join(guessed)} of the robot: what is fitted is relative to"
-                " a guess by its outline"
+                f"{', '.join(guessed)} of the robot are not known: fitted values are relative to "
+                "a guess from its outline"
             )
         if "wheel_radius_m" not in guessed or "track_m" not in guessed:
             told = "wheel_radius_scale and track_scale are"
             if robot.drive == "ackermann":
                 told = "wheel_radius_scale is"
             notes.append(
-                f"{told} relative to the profile's robot; its"
-                " odometry keeps believing those values, as the log's does"
+                f"{told} relative to the profile's robot; its odometry still uses the profile's "
+                "values, as in the log"
             )
     elif (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
         body = f"{task.body.length_m:g} x {task.body.width_m:g} m"
@@ -186,8 +185,8 @@ def fit_scope(
         refused |= {name: why for name in names if PARAMETERS[name].own_body}
         notes.append(
             f"the log's robot is {body}, the twin's {twin.length_m:g} x {twin.width_m:g} m with"
-            " other wheels, mass and ramps: fitted values are ratios of commanded, wheel and ground"
-            " motion, no dimensions of that robot"
+            " other wheels, mass and ramps: fitted values are ratios of commanded, wheel and "
+            "ground motion, not dimensions of that robot"
         )
     wanted = _recording_filter(recordings)
     fallbacks = {row[0] for row in store.sql(
@@ -195,7 +194,7 @@ def fit_scope(
     ).fetchall()}  # fmt: skip
     if "imu" in fallbacks:
         channels.remove("gyro")
-        notes.append("no IMU: yaw rate is known from headings alone")
+        notes.append("no IMU: yaw rate is known only from headings")
         if "gyro_bias_radps" in names:
             refused["gyro_bias_radps"] = "the log has no gyroscope"
     if _pose_is_odometry(store, wanted):
@@ -213,7 +212,7 @@ def fit_scope(
             "this log can identify none of these parameters: "
             + "; ".join(f"{name}: {reason}" for name, reason in refused.items()),
             where=str(store.path),
-            remedy="name others with --parameters, or use another log",
+            remedy="choose others with --parameters, or use another log",
         )
     return FitScope(kept, tuple(channels), refused, tuple(notes))
 

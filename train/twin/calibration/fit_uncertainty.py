@@ -161,7 +161,7 @@ def _kept_as_in_base(
     unit = f" {parameter.unit}" if parameter.unit else ""
     reason = f"{ends[0]:.3g} to {ends[1]:.3g}{unit} explain the log as well"
     if not base_fits:
-        reason = "at the end of its range the log does not change with it"
+        reason = "at the end of its range, where it has no effect on the log"
     if parameter.name in ("friction_scale", "left_friction_scale"):
         fitted = coordinates.perturbation(solution.z)
         sliding = replay_segments(

@@ -121,7 +121,9 @@ def write_fit(path: Path, fits: Sequence[FittedTwin]) -> None:
     try:
         write_text(path, text, exclusive=True)
     except FileExistsError as error:
-        raise ConfigError("already exists", where=str(path), remedy="name another --out") from error
+        raise ConfigError(
+            "already exists", where=str(path), remedy="choose another --out"
+        ) from error
     except OSError as error:
         raise StoreError(
             f"cannot be written: {error.strerror}", where=str(path), remedy="check the folder"

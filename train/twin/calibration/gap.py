@@ -288,20 +288,20 @@ def _not_done(
         yield "No gap after calibration: no fitted perturbation was given."
     if not steps.task.lidar:
         yield (
-            "Steps were driven on an empty floor, where nothing is bumped into: the robot has no"
-            " lidar, so nothing says on which floor it was."
+            "Steps were driven on an empty floor, without obstacles: the robot has no lidar, so "
+            "its floor is not known."
         )
     elif difference > AGREES:
         yield (
             "What the lidar sees was not compared: the log was driven on another floor than the"
             f" twin's (their clearances differ by {difference:.2f} in the median, {AGREES:g} is the"
-            " most). Steps were driven on an empty floor: clearances in their rewards are the log's"
-            " own, and nothing is bumped into."
+            " most). Steps were driven on an empty floor: clearances in their rewards are the "
+            "log's own, and there are no obstacles."
         )
     if steps.robot is None and steps.task.body != load_profile("warehouse_amr").task.body:
         yield (
-            "The robot driven is the twin's stand-in in the log's outline: the profile has none"
-            " (docs/robot.md)."
+            "The robot driven is the twin's own, with the outline of the log's robot: the profile "
+            "has no [robot] (docs/robot.md)."
         )
     if steps.task.goal != "route":
         yield (
@@ -310,8 +310,8 @@ def _not_done(
         )
     if not drift_m and any(twin.localisation_drift_m for twin in twins.values()):
         yield (
-            "The pose never disagrees with the wheels, so it is their odometry: the gap is to"
-            " that, slip cannot show in it, and there is no floor of localisation noise."
+            "The pose always agrees with the wheels, so it is wheel odometry: the gap is measured "
+            "against that, slip is not visible, and localisation noise cannot be estimated."
         )
     for path in paths:
         if not len(path.episode_id):
@@ -327,6 +327,6 @@ def _not_done(
     if not stepped.valid.all():
         yield f"{int((~stepped.valid).sum())} steps were left out: the physics broke."
     yield (
-        "Pallets, people and slippery patches of the log are not known to the replay: it drives on"
-        " the floor alone, dry."
+        "Pallets, people and slippery patches of the log are not in the replay: it drives on an "
+        "empty, dry floor."
     )

@@ -164,7 +164,7 @@ def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
     return Counter(
         {
             "ticks not a control period apart": int((~even).sum()),
-            "no fresh pose to begin with": int(even.sum()),
+            "no fresh pose at the start": int(even.sum()),
         }
     )
 

@@ -78,8 +78,8 @@ class GapConfig(Checked, frozen=True):
         """Raises ValueError where trust is judged at a horizon that is not driven."""
         if self.limits.horizon_s not in self.horizons_s:
             raise ValueError(
-                f"the horizon that trust is judged at, {self.limits.horizon_s:g} s, is not driven:"
-                " make it one of the horizons"
+                f"the horizon of the verdict, {self.limits.horizon_s:g} s, is not driven: add it "
+                "to the horizons"
             )
 
 
@@ -178,7 +178,7 @@ def check_place(folder: Path) -> None:
     if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
         if folder.is_dir() and not any(folder.iterdir()):
             return
-        raise RunError("already exists", where=str(folder), remedy="name another --out")
+        raise RunError("already exists", where=str(folder), remedy="choose another --out")
 
 
 def write_gap(gap: TwinGap, folder: Path) -> None:
@@ -219,7 +219,7 @@ def read_gap(folder: Path) -> TwinGap:
         )
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise RunError(
-            f"no gap that can be read: {error}",
+            f"it contains no readable gap: {error}",
             where=str(folder),
             remedy=f"`restock twin gap STORE --out {folder}` measures one",
         ) from error

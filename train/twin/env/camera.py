@@ -223,8 +223,8 @@ def _egl_context(width: int, height: int) -> Any:
         raise ConfigError(
             f"EGL is unavailable: {reason}",
             where="camera",
-            remedy="install libegl1 libegl-mesa0 libgl1-mesa-dri libgbm1 (Debian's names), or leave"
-            " `camera` out: the drawn map needs no GL",
+            remedy="install libegl1 libegl-mesa0 libgl1-mesa-dri libgbm1 (Debian's names), or "
+            "leave out `camera`: the drawn map needs no GL",
         ) from error
     return context
 

@@ -84,7 +84,7 @@ def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehou
             f"the saved state is of other floors: {', '.join(changed) or 'fewer'} of"
             f" {len(saved)} floors, not among this one's {len(here)}",
             where="state of the twin",
-            remedy="make the environment with the layouts of then; a file may have changed",
+            remedy="make the environment with the same layouts as then; a file may have changed",
         )
 
 

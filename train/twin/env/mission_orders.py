@@ -73,9 +73,9 @@ class MissionOrders:
             if floor.zone is None or self._comes_through(spec, floor):
                 return spec
         raise ConfigError(
-            f"none of {TRIES} ways of a {kind} mission comes through {order.zone}",
+            f"none of {TRIES} routes of a {kind} mission passes through {order.zone}",
             where=f"{self._where}, missions[{number}]",
-            remedy="leave `zone` out, or name one that lies on a robot's way",
+            remedy="leave out `zone`, or choose one on a robot's route",
         )
 
     def _comes_through(self, spec: EpisodeSpec, floor: _Floor) -> bool:
@@ -89,7 +89,7 @@ class MissionOrders:
         where = f"{self._where}, missions[{number}]"
         if order.kind is None or order.missions is None:
             raise ConfigError(
-                "asks for hours of logging: the twin drives so many missions of a kind",
+                "asks for hours of logging, but the twin drives a number of missions",
                 where=where,
                 remedy=f"give `kind` ({', '.join(KINDS)}) and `missions`",
             )
@@ -102,9 +102,10 @@ class MissionOrders:
         names = [floor.name for floor in self._floors]
         if order.layout is not None and order.layout not in names:
             raise ConfigError(
-                f"the floor {order.layout!r} is not among those that are driven on",
+                f"the floor {order.layout!r} is not among the floors of this run",
                 where=where,
-                remedy=f"those are {_some(names)}: name another, or drive on that one (`layouts`)",
+                remedy=f"they are {_some(names)}: choose one of these, or add that floor "
+                "(`layouts`)",
             )
         chosen = [
             (place, floor)
@@ -117,9 +118,9 @@ class MissionOrders:
             if not fitting:
                 zones = dict.fromkeys(zone for _, floor in chosen for zone in floor.zones)
                 raise ConfigError(
-                    f"no floor that is driven on has a zone {order.zone!r}",
+                    f"no floor of this run has a zone {order.zone!r}",
                     where=where,
-                    remedy=f"there are {_some(list(zones))}",
+                    remedy=f"the zones are {_some(list(zones))}",
                 )
         else:
             fitting = [_Floor(place, None) for place, _ in chosen]

@@ -179,7 +179,7 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     names = [floor.name for floor in floors]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
-        raise ConfigError(f"{', '.join(repeated)} is named twice", where=f"layouts {text!r}")
+        raise ConfigError(f"{', '.join(repeated)} is given twice", where=f"layouts {text!r}")
     return tuple(floors)
 
 
@@ -211,9 +211,9 @@ def open_floor(text: str) -> Warehouse:
     floors = open_floors(text)
     if len(floors) > 1:
         raise ConfigError(
-            f"{text!r} names {len(floors)} floors",
+            f"{text!r} means {len(floors)} floors",
             where="layout",
-            remedy=f"name one of them, such as {floors[0].name}",
+            remedy=f"give one of them, such as {floors[0].name}",
         )
     return floors[0]
 
@@ -255,7 +255,7 @@ def _seeds(text: str, rest: str) -> list[int]:
         return list(islice(seeds_of(split), size))
     if not (first.isdecimal() and not last and len(first) <= 16):
         raise ConfigError(
-            f"{rest!r} is neither a seed nor a split",
+            f"{rest!r} is not a seed or a split",
             where=f"layouts {text!r}",
             remedy=f"such as generated:17, or generated:{'|'.join(SPLITS)}",
         )

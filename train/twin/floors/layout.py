@@ -184,9 +184,7 @@ class Warehouse:
                     remedy="give goals and starts in the floor's own frame, in metres",
                 )
         if not len(self.goals):
-            raise ConfigError(
-                "has no place that a robot could be sent to", where=where, remedy="give docks"
-            )
+            raise ConfigError("has no place for a goal", where=where, remedy="give docks")
 
     @cached_property
     def goals(self) -> F64:

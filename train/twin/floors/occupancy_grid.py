@@ -169,8 +169,8 @@ def floor_of_grid(
     elsewhere += tuple(bay for bay in bays(segments) if _holds(reachable, cell_m, bay))
     if not places and not elsewhere:
         raise ConfigError(
-            f"a robot that needs {turn_m:.2f} m around its middle to turn finds no place that it"
-            " could be sent to",
+            f"there is no place for a goal for a robot that needs {turn_m:.2f} m around its "
+            "middle to turn",
             where=where,
             remedy="check the body in the profile (--footprint LxW), or give a larger map",
         )

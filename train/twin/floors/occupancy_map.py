@@ -61,7 +61,7 @@ class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
                 f" {self.free_thresh} and {self.occupied_thresh}"
             )
         if not self.image or "\0" in self.image:
-            raise ValueError(f"image is no file's name: {self.image!r}")
+            raise ValueError(f"image is not a file name: {self.image!r}")
         if not (np.abs(self.origin) <= FURTHEST_M).all():  # False for NaN
             raise ValueError(
                 f"origin must be three numbers within {FURTHEST_M:g}, got {list(self.origin)}"
@@ -90,7 +90,7 @@ def read_grid(path: Path) -> OccupancyGrid:
         raise ConfigError(
             f"its image {description.image!r} lies outside its folder",
             where=str(path),
-            remedy="copy the image beside it, and write `image:` with the file's name alone",
+            remedy="copy the image into its folder, and give only the file's name in `image:`",
         )
     pixels, seen = read_image(image)
     occupancy = occupancy_of(pixels, description)

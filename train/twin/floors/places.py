@@ -50,9 +50,9 @@ def find_places(
     if len(visited_m) and fits.sum() < 0.9 * len(visited_m):
         notes.append(
             f"{1 - fits.sum() / len(visited_m):.0%} of the poses are nearer to obstacles than the"
-            f" {room_m:.2f} m that this robot needs, or in another part of the floor: no mission"
-            " goes there. Where it does drive there, it is smaller than the profile has it: give"
-            " --footprint LxW"
+            f" {room_m:.2f} m that this robot needs, or in another part of the floor: no mission "
+            "goes there. If the robot did drive there, it is smaller than in the profile: give "
+            "--footprint LxW"
         )
     best: dict[tuple[int, int], tuple[float, tuple[float, float]]] = {}
     for i, j in np.unique(cells[wide], axis=0).tolist():
@@ -65,8 +65,8 @@ def find_places(
         places = [places[k] for k in np.linspace(0, len(places) - 1, PLACES).astype(int)]
     if len(places) < 2:
         notes.append(
-            f"the robot was at {len(places) or 'no'} place{'s'[: not places]} with room to turn:"
-            " missions start and end wherever there is room"
+            f"the robot was at {len(places) or 'no'} place{'s'[: not places]} with room to turn: "
+            "missions start and end wherever there is room"
         )
         return Places((), notes)
     return Places(tuple(places), notes)

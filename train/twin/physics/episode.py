@@ -102,7 +102,7 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
                 return Episode(spec, start, goal, plan, walks=walks, noise=noise)
     low, high = warehouse.way_m
     raise ConfigError(
-        f"no way of {low:g} to {high:g} m suits a {spec.condition} episode",
+        f"no route of {low:g} to {high:g} m suits a {spec.condition} episode",
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
@@ -133,7 +133,7 @@ def _draw_way(
         yaw = anywhere if free else np.arctan2(along[1], along[0]) + turn
         return (float(x), float(y), float(yaw)), (float(goal[0]), float(goal[1])), plan
     raise ConfigError(
-        f"no way of {low:g} to {high:g} m between aisles and goals",
+        f"there is no route of {low:g} to {high:g} m between aisles and goals",
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )

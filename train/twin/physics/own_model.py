@@ -26,7 +26,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "skid_steer": ("front_left", "front_right", "rear_left", "rear_right"),
     "ackermann": ("left", "right", "steer_left", "steer_right"),
 }
-REMEDY = "docs/robot.md says what the model must hold, with one that drives"
+REMEDY = "docs/robot.md says what the model must contain, and has an example"
 ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 PLACE_M = 0.02  # how far parts may be from where the profile says
 
@@ -131,19 +131,19 @@ def _problems(
     bases = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
     if len(bases) != 1 or len(free) != 1 or model.jnt_bodyid[free[0]] != bases[0]:
         return [
-            f"it has {len(bases)} bodies in <worldbody> and {len(free)} free joints, and must have"
-            " one body, the base, with a <freejoint/>"
+            f"it has {len(bases)} bodies in <worldbody> and {len(free)} free joints, but must "
+            "have one body, the base, with a <freejoint/>"
         ], []
     base, problems = bases[0], []
     if abs(model.body_pos[base][:2]).max() > 1e-6 or abs(model.body_quat[base][0] - 1) > 1e-6:
-        problems.append("its base must stand at x = 0, y = 0, and look along x")
+        problems.append("its base must be at x = 0, y = 0, and face along x")
     if not model.body(base).name:
         problems.append("its base has no name")
     problems += _lidar_problems(model, body, built)
     names = {model.actuator(i).name for i in range(model.nu)}
     missing = [name for name in ROLES[robot.drive] if name not in names]
     if missing:
-        problems.append(f"no actuator named {', '.join(missing)}, of {robot.drive} drive")
+        problems.append(f"no actuator named {', '.join(missing)}, which {robot.drive} drive needs")
         return problems, []
     for name in ROLES[robot.drive]:
         at = model.actuator(name).id
@@ -158,15 +158,15 @@ def _problems(
     joints = wheel_joints(model, robot.drive, "")
     wheels = [int(model.jnt_bodyid[joint]) if joint >= 0 else -1 for joint in joints]
     if -1 in wheels:
-        return ["a steered wheel has no hinge to roll on, after the one that steers it"], []
+        return ["a steered wheel has no hinge to roll, after the hinge that steers it"], []
     for wheel in wheels:
         name = model.body(wheel).name or f"number {wheel}"
         if model.body_parentid[wheel] != base:
-            problems.append(f"wheel {name} is not on the base itself")
+            problems.append(f"wheel {name} is not attached to the base")
         geom = wheel_geom(model, wheel)
         round_ = geom is not None and int(model.geom_type[geom]) in ROUND
         if not round_:
-            problems.append(f"wheel {name} needs one geom that touches: a sphere or a cylinder")
+            problems.append(f"wheel {name} needs one geom with contacts: a sphere or a cylinder")
     if not problems:
         problems += _place_problems(model, wheels, built.steers)
     return problems, wheels

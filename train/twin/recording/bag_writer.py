@@ -110,7 +110,7 @@ def refuse_existing(path: Path) -> None:
     """Raises RecordingError where something stands at `path` already."""
     if path.exists() or path.is_symlink():
         raise RecordingError(
-            "there is something here already, and recordings are never overwritten",
+            "it already exists, and recordings are never overwritten",
             where=str(path),
             remedy="choose another --out, or remove it",
         )

@@ -54,8 +54,8 @@ class ExternalPolicy:
         if self.epsilon:
             if (probability < 1).any():
                 raise ConfigError(
-                    f"{self.name} is stochastic itself: the probability that it would have given"
-                    " to an action that epsilon chooses is not known",
+                    f"{self.name} is stochastic itself: the probability of an action that epsilon "
+                    "chooses is not known",
                     where="--epsilon",
                     remedy="leave it out",
                 )

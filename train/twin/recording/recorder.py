@@ -104,7 +104,7 @@ class RecordingPlan:
     def __post_init__(self) -> None:
         """Raises ConfigError where the recording would have no end, or nothing in it."""
         if (self.minutes is None) == (self.missions is None):
-            raise ConfigError("give minutes or missions, one of them", where="recording")
+            raise ConfigError("give either minutes or missions", where="recording")
         for name in ("minutes", "missions"):
             value = getattr(self, name)
             if isinstance(value, int | float) and not 0 < value < float("inf"):
@@ -123,7 +123,7 @@ class RecordingPlan:
             raise ConfigError(f"must be in [0, 1], got {self.epsilon}", where="--epsilon")
         if self.epsilon is not None and self.policy == "random":
             raise ConfigError(
-                "random takes every action with the same probability already",
+                "random already takes every action with the same probability",
                 where="--epsilon",
                 remedy="leave it out",
             )
@@ -152,9 +152,9 @@ class RecordingPlan:
         if not chosen or (robots and mine is None):
             raise ConfigError(
                 f"asks for missions of {', '.join(robots)}"
-                + (f", none of {mine}" if mine else ": which robot this is was not said"),
+                + (f", none of {mine}" if mine else ": no robot was given"),
                 where="the missions file",
-                remedy=f"`--tag robot={robots[0]}` drives those of that robot",
+                remedy=f"`--tag robot={robots[0]}` drives the missions of that robot",
             )
         return chosen
 
@@ -343,7 +343,7 @@ def parse_start(text: str) -> int:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
         raise ConfigError(
-            f"{text!r} is no time", where="--start", remedy="such as 2026-10-05T08:00"
+            f"{text!r} is not a time", where="--start", remedy="such as 2026-10-05T08:00"
         ) from error
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000

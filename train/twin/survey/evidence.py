@@ -94,7 +94,7 @@ def _map(
     except RestockError as error:
         if needed:
             raise
-        notes.append(f"{error.what}: left aside")
+        notes.append(f"{error.what}: not used")
         return None
 
 

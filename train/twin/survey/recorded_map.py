@@ -72,11 +72,11 @@ def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
     if width < 1 or height < 1:
         wrong = f"an empty map of {width:.0f} x {height:.0f} cells"
     elif width * height > MAX_CELLS:
-        wrong = f"{width:,.0f} x {height:,.0f} cells, and {MAX_CELLS:,} at most can be read"
+        wrong = f"{width:,.0f} x {height:,.0f} cells, more than the {MAX_CELLS:,} that can be read"
     elif len(cells) != width * height:
         wrong = f"{len(cells):,} cells of data for {width:.0f} x {height:.0f}"
     elif not 0.001 <= cell_m <= 1:
-        wrong = f"a resolution of {cell_m:g} m, and cells are .001 to 1 m"
+        wrong = f"a resolution of {cell_m:g} m, which must be from .001 to 1 m"
     elif not (np.abs([x, y, yaw]) <= FURTHEST_M).all():
         wrong = f"an origin at {x:g}, {y:g}, turned by {yaw:g} rad"
     if wrong:

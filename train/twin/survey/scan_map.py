@@ -124,5 +124,5 @@ def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
     alone &= surrounded >= 7
     if alone.any():
         occupancy[alone] = FREE
-        notes.append(f"{int(alone.sum()):,} cells of wall that stand alone on free floor: left out")
+        notes.append(f"{int(alone.sum()):,} single cells of wall on free floor: left out")
     return np.asarray(alone, np.bool_)

@@ -156,7 +156,8 @@ def _mount(
         ahead, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     if ahead is None or yaw is None:
         notes.append(
-            "nothing says where the lidar sits: taken to be in the robot's middle, looking ahead"
+            "the position of the lidar is not known: it is assumed to be in the robot's middle, "
+            "facing ahead"
         )
     cos, sin = np.cos(yaw or 0.0), np.sin(yaw or 0.0)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

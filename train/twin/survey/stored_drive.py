@@ -54,7 +54,7 @@ def stored_drive(path: Path) -> StoredDrive:
         everywhere = _poses(store, alike, f"poses of the rows of {len(alike)} recordings")
     notes = []
     if not there:
-        notes.append(f"{source} is not there any more: neither its map nor its scans can be read")
+        notes.append(f"{source} no longer exists: its map and its scans cannot be read")
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
     return StoredDrive(

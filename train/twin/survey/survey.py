@@ -37,7 +37,7 @@ from restock.train.twin.survey.zones import with_zones
 Source = Literal["map", "scans", "corridor"]
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
 TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
-STAND_IN = Footprint(0.7, 0.5, "the stand-in's: nothing says how large this robot is")
+STAND_IN = Footprint(0.7, 0.5, "the twin's default robot: the size of this robot is not known")
 NEAREST_SHARE = 0.05  # of the poses: as near as these it came, to walls that may be blurred
 LEAST_BODY_M = 0.15
 FEWEST_SCANS = 8
@@ -154,16 +154,16 @@ def _grid(
         return "map", grid, source
     if by == "map":
         raise RecordingError(
-            "holds no map: no nav_msgs/OccupancyGrid but costmaps",
+            "contains no map: no nav_msgs/OccupancyGrid except costmaps",
             where=where,
             remedy="give it as --map map.yaml, or leave out --by",
         )
     if poses is None:
         raise RecordingError(
-            "holds neither a map nor anything that says where the robot was",
+            "contains neither a map nor the robot's pose",
             where=where,
-            remedy="record /map, a localisation, odometry, or /tf and /tf_static; or give a"
-            " map.yaml as the floor itself: `restock twin layout map.yaml`",
+            remedy="record /map, localisation, odometry, or /tf and /tf_static; or give a "
+            "map.yaml as the floor: `restock twin layout map.yaml`",
         )
     usable = [scans for scans in evidence.scans if len(scans) >= FEWEST_SCANS]
     if usable:
@@ -172,17 +172,17 @@ def _grid(
         if made.agree >= AGREEING or by == "scans":
             notes += made.notes
             return "scans", made.grid, f"{made.source}, by {poses.source}"
-        notes.append(f"{made.notes[-1]}: no map was made of them")
+        notes.append(f"{made.notes[-1]}: no map was made from them")
     elif by == "scans":
         raise RecordingError(
-            "holds no scans that can be placed: no LaserScan, or no poses at their times",
+            "contains no scans that can be used: no LaserScan, or no poses at their times",
             where=where,
-            remedy="leave out --by, or name the topics of pose and scan in a --profile",
+            remedy="leave out --by, or give the topics of pose and scan in a --profile",
         )
     elif evidence.scans:
-        notes.append(f"only {len(evidence.scans[0])} scans could be placed, too few for a map")
+        notes.append(f"only {len(evidence.scans[0])} scans have a pose, too few for a map")
     turn_m = _turn_m(body or STAND_IN)
-    return "corridor", driven_corridor(poses, turn_m), f"the way driven, by {poses.source}"
+    return "corridor", driven_corridor(poses, turn_m), f"the path driven, by {poses.source}"
 
 
 @dataclass(frozen=True)
@@ -202,8 +202,8 @@ def _scanned(usable: list[PlacedScans], poses: Poses, room_m: float) -> _Scanned
         said = list(scans.notes)
         grid, agree = scan_map(scans, poses.places_m, room_m, poses.frame, said)
         said.append(
-            f"{len(scans):,} {scans.source} were traced, and {agree:.0%} of their ends lie within a"
-            " cell of a wall that they made together"
+            f"{len(scans):,} {scans.source} were used, and {agree:.0%} of their ends are within a "
+            "cell of a wall of the combined map"
             + ("" if agree >= AGREEING else ": poses or clocks are off, do not trust it")
         )
         if best is None or agree > best.agree + CLOCKS_APART:
@@ -229,7 +229,7 @@ def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
     if side >= STAND_IN.width_m:
         return STAND_IN
     return Footprint(
-        side, side, f"nothing says how large it is, but it came within {near:.2f} m of obstacles"
+        side, side, f"its size is not known, but it came within {near:.2f} m of obstacles"
     )
 
 
@@ -257,9 +257,7 @@ def _check_frames(
         ConfigError: most do not.
     """
     if poses is None:
-        notes.append(
-            "nothing says where the robot was: missions start and end wherever there is room"
-        )
+        notes.append("the robot's pose is not known: missions start and end wherever there is room")
         return
     found = grid.at(poses.places_m)
     on = grid.cells_at(poses.places_m)[1]
