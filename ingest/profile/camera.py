@@ -14,8 +14,8 @@ class Camera(Checked, frozen=True):
     """One `[cameras.NAME]` of a profile: a topic of sensor_msgs Image or CompressedImage."""
 
     topic: str
-    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # of the last frame received, at the step
-    max_hz: Annotated[float, Meta(gt=0)] | None = None  # keep so many a second; None: all
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # age of the last frame at the step, at most
+    max_hz: Annotated[float, Meta(gt=0)] | None = None  # frames kept per second; None: all
     doc: str = ""
 
 

@@ -47,11 +47,11 @@ class CustomSignal(Checked, frozen=True):
     max_age_s: Annotated[float, Meta(gt=0)] | None = (
         None  # None: latched, held until the next message
     )
-    reduce: Reduce | None = None  # a list to one number; a quaternion to its yaw
-    values: dict[str, float] | None = None  # what a text, bool or number stands for
-    scale: float = 1.0  # stored = found * scale + offset
+    reduce: Reduce | None = None  # how a list becomes one number, or a quaternion its yaw
+    values: dict[str, float] | None = None  # the number for each text, bool or number
+    scale: float = 1.0  # stored value = value * scale + offset
     offset: float = 0.0
-    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # of a list that is a vector
+    length: Annotated[int, Meta(ge=1, le=65536)] | None = None  # length of a vector
     doc: str = ""
 
     def check(self) -> None:

@@ -74,14 +74,14 @@ class Input(Checked, frozen=True):
     topic: str
     type: str
     fields: dict[str, str]
-    max_age_s: float | None = None  # None: latched, held until the next message
+    max_age_s: float | None = None  # largest age; None: latched until the next message
     optional: bool = False
-    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # of a command that steers
-    stop_holds: bool = False  # of the command: one to stop holds until the next, however old
+    wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
+    stop_holds: bool = False  # a command to stop holds until the next one
     # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
-    origin_deg: tuple[float, float] | None = None  # of the map; None: each recording's first fix
-    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # beyond it a fix is none; 5 m
-    track_m: Annotated[float, Meta(gt=0)] | None = None  # that its yaw is the direction of; 1 m
+    origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
+    max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
+    track_m: Annotated[float, Meta(gt=0)] | None = None  # distance that gives the yaw; None: 1
 
     @property
     def by_fix(self) -> bool:
@@ -95,13 +95,13 @@ class Inputs(Checked, frozen=True):
     command: Input
     wheels: Input | None = None  # None: speeds from poses, by [motion]
     pose: Input | None = None
-    heading: Input | None = None  # of a pose by fix; None: the direction that it drove
+    heading: Input | None = None  # for fixes; None: the direction of driving
     scan: Input | None = None
     imu: Input | None = None
     goal: Input | None = None
     plan: Input | None = None
     bumper: Input | None = None
-    nav_command: Input | None = None  # what navigation proposes, before whoever drives decides
+    nav_command: Input | None = None  # the navigation stack's proposal, before the choice
     behaviour_policy: Input | None = None
     true_condition: Input | None = None
     true_exposure: Input | None = None

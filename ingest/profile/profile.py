@@ -69,7 +69,7 @@ class Profile(Checked, frozen=True):
     shipped_conditions: list[str] = msgspec.field(default_factory=list, name="conditions")
     shipped_exposures: list[str] = msgspec.field(default_factory=list, name="exposures")
     own_conditions: list[Condition] = msgspec.field(default_factory=list, name="condition")
-    behaviour_policy: str = "unknown"  # who drove, where no topic says
+    behaviour_policy: str = "unknown"  # the driver, if no topic tells
     # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
     # What was chosen among them, where the command is that smoothed or limited: it is by whose
@@ -84,8 +84,8 @@ class Profile(Checked, frozen=True):
     cameras: dict[str, Camera] = msgspec.field(default_factory=dict)
     tags: TagRules = TagRules()
     noise: Noise = Noise()
-    robot: Robot | None = None  # None: the twin's own
-    limiter: Limiter | None = None  # in front of a policy; None: by outline and actions
+    robot: Robot | None = None  # None: the twin's default robot
+    limiter: Limiter | None = None  # limits a policy's commands; None: by outline and actions
 
     @property
     def conditions(self) -> list[Condition]:

@@ -16,16 +16,16 @@ class Clock(Checked, frozen=True):
 
     alignment: Literal["header.stamp", "log_time"] = "header.stamp"
     steps: Literal["rate", "command"] = "rate"
-    max_gap_s: float = 0.5  # between two steps of an episode
-    jump_s: float = 1.0  # a change of (log time - stamp) that means the clock was set
+    max_gap_s: float = 0.5  # longest gap between two steps of an episode
+    jump_s: float = 1.0  # change of (log time - stamp) that means the clock was set
 
 
 class Episodes(Checked, frozen=True):
     """The `[episodes]` of a profile: what ends one, beside goals, gaps and clock jumps."""
 
-    max_pose_jump_m: float = 1.0  # between two steps: the robot was carried, or relocalised
-    goal_moved_m: float = 0.01  # a goal further than this from the last one is a new one
-    plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another
+    max_pose_jump_m: float = 1.0  # larger: the robot was carried, or relocalised
+    goal_moved_m: float = 0.01  # distance from the last goal that means a new one
+    plan_goal_tolerance_m: float = 0.5  # a plan that ends further from the goal is for another one
 
 
 class Frames(Checked, frozen=True):
@@ -33,7 +33,7 @@ class Frames(Checked, frozen=True):
 
     fixed: str = "map"
     base: str = "base_link"
-    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # of a transform of `topic`, at the step
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # age of a transform at the step, at most
     topic: str = "/tf"
     static_topic: str = "/tf_static"
 
@@ -45,7 +45,7 @@ class Frames(Checked, frozen=True):
 class Motion(Checked, frozen=True):
     """The `[motion]` of a profile: how its speeds are known where there is no odometry."""
 
-    window_s: Annotated[float, Meta(gt=0, le=5)]  # of the poses that a speed is the slope of
+    window_s: Annotated[float, Meta(gt=0, le=5)]  # length of the window of poses for a speed
 
 
 class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given

@@ -63,11 +63,11 @@ class Condition(Checked, frozen=True):
     sql: str
     priority: int = 50
     doc: str = ""
-    let: dict[str, str] = msgspec.field(default_factory=dict)  # name -> SQL, of those before it
-    probability: str = ""  # SQL, 0 to 1; "": none
-    uncertain: tuple[float, float] = (0.2, 0.8)  # within it a step is too near to call
-    constants: dict[str, float] = msgspec.field(default_factory=dict)  # that its SQL may name
-    kind: Kind = "outcome"  # or the situation, whatever comes of it
+    let: dict[str, str] = msgspec.field(default_factory=dict)  # name -> SQL; may use earlier names
+    probability: str = ""  # SQL that gives 0 to 1; "": none
+    uncertain: tuple[float, float] = (0.2, 0.8)  # probabilities that count as uncertain
+    constants: dict[str, float] = msgspec.field(default_factory=dict)  # for use in its SQL
+    kind: Kind = "outcome"  # "exposure": a situation, whatever the outcome
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition with those of the constants that its SQL names; its own win."""
@@ -106,10 +106,10 @@ class Noise(Checked, frozen=True):
     Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
     """
 
-    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # of a range
-    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the way between two poses, each axis
-    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the speed by the wheels
-    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # its bias too
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # standard deviation of a range
+    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the distance between two poses, per axis
+    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the wheel speed
+    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # of the yaw rate, including bias
 
     @property
     def constants(self) -> dict[str, float]:

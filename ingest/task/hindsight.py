@@ -39,10 +39,10 @@ class GoalRules(Checked, frozen=True):
     """The `[goal]` of a profile: where a route's goals come from."""
 
     source: GoalSource = "logged"  # from inputs.goal and inputs.plan; or in hindsight
-    still_s: Annotated[float, Meta(gt=0)] = 3.0  # that a robot stands for, to have arrived
-    wait_s: Annotated[float, Meta(ge=0)] = 10.0  # of standing before it sets off: in its mission
-    shortest_m: Annotated[float, Meta(gt=0)] | None = None  # start to goal; None: 3 goal radii
-    longest_m: Annotated[float, Meta(gt=0)] = 10.0  # start to goal
+    still_s: Annotated[float, Meta(gt=0)] = 3.0  # how long a robot stands when it has arrived
+    wait_s: Annotated[float, Meta(ge=0)] = 10.0  # standing before the start, in the mission
+    shortest_m: Annotated[float, Meta(gt=0)] | None = None  # from start to goal; None: 3 goal radii
+    longest_m: Annotated[float, Meta(gt=0)] = 10.0  # from start to goal
 
     def at_least_m(self, task: Task) -> float:
         """How far a goal must be from where its mission starts."""

@@ -43,13 +43,13 @@ _TOUCH_M = 1e-6
 class Limiter(Checked, frozen=True):
     """The `[limiter]` of a profile. None: by its outline, its actions and its control period."""
 
-    stop_m: Annotated[float, Meta(ge=0, le=10)] | None = None  # room that is kept: .2 of the width
-    reaction_s: Annotated[float, Meta(ge=0, le=5)] | None = None  # two control periods
-    brake_mps2: Limit | None = None  # half of robot.max_accel_mps2, or fastest to 0 in a second
-    brake_radps2: Limit | None = None  # the same of turning
-    max_speed_mps: Limit | None = None  # robot.max_speed_mps, or the fastest action
+    stop_m: Annotated[float, Meta(ge=0, le=10)] | None = None  # to keep; None: .2 of the width
+    reaction_s: Annotated[float, Meta(ge=0, le=5)] | None = None  # None: two control periods
+    brake_mps2: Limit | None = None  # None: half of robot.max_accel_mps2, or max. to 0 in 1 s
+    brake_radps2: Limit | None = None  # None: likewise for the yaw rate
+    max_speed_mps: Limit | None = None  # None: robot.max_speed_mps, or the fastest action
     max_yaw_rate_radps: Limit | None = None
-    max_accel_mps2: Limit | None = None  # robot.max_accel_mps2, or no limit
+    max_accel_mps2: Limit | None = None  # None: robot.max_accel_mps2, or no limit
     max_yaw_accel_radps2: Limit | None = None
 
 

@@ -32,10 +32,10 @@ class Lidar(Checked, frozen=True):
     Where it is ahead of the outline's middle, and how it is turned, stand in `[task.body]`.
     """
 
-    z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # above the floor
-    beams: Annotated[int, Meta(ge=4, le=720)] | None = None  # evenly, the first at angle_min_rad
+    z_m: Annotated[float, Meta(gt=0, le=5)] | None = None  # height above the floor
+    beams: Annotated[int, Meta(ge=4, le=720)] | None = None  # evenly spaced, from angle_min_rad on
     angle_min_rad: Annotated[float, Meta(ge=-7, le=7)] = -math.pi
-    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # all around: a beam short of it
+    angle_max_rad: Annotated[float, Meta(ge=-7, le=7)] = math.pi  # full circle: less by one beam
 
     def check(self) -> None:
         if not 0 < self.angle_max_rad - self.angle_min_rad <= 2 * math.pi + 1e-3:
@@ -50,11 +50,11 @@ class Robot(Checked, frozen=True):
 
     drive: Drive = "differential"
     wheel_radius_m: Metres | None = None
-    track_m: Metres | None = None  # between the wheels' contact points, left to right
-    wheelbase_m: Metres | None = None  # between the axles, where there are two
-    axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # of the axle (of two: the point halfway)
+    track_m: Metres | None = None  # distance of left and right wheels' contact points
+    wheelbase_m: Metres | None = None  # distance of the axles, if there are two
+    axle_x_m: Annotated[float, Meta(ge=-10, le=10)] = 0.0  # x of the axle (of two: their middle)
     # ahead of the outline's middle: poses are the axle's
-    mass_kg: Annotated[float, Meta(gt=0, le=5000)] | None = None  # of all of it, wheels too
+    mass_kg: Annotated[float, Meta(gt=0, le=5000)] | None = None  # total, with wheels
     height_m: Metres | None = None
     casters_m: tuple[tuple[float, float], ...] | None = None  # x ahead of the axle, y to the left
     max_speed_mps: Limit | None = None

@@ -16,8 +16,8 @@ class Body(Checked, frozen=True):
 
     length_m: float
     width_m: float
-    lidar_x_m: float = 0.0  # of the lidar, ahead of the centre of the outline
-    lidar_yaw_rad: float = 0.0  # of the scan's zero bearing, against the robot's forward axis
+    lidar_x_m: float = 0.0  # of the lidar, ahead of the outline's centre
+    lidar_yaw_rad: float = 0.0  # angle of the scan's zero to the robot's forward axis
 
 
 @dataclass(frozen=True)

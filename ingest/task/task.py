@@ -30,16 +30,16 @@ TASK_CODE_VERSION = 2
 class Rewards(Checked, frozen=True):
     """What each event of a step is worth."""
 
-    progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m a step
+    progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m per step
     step: float = -0.02
     action_change: float = -0.01
-    tight: float = -0.05  # clearance at t + 1 below tight_clearance_m
+    tight: float = -0.05  # if the clearance at t + 1 is below tight_clearance_m
     tight_clearance_m: float = 0.15
-    harsh: float = -0.05  # wheels changed speed faster than harsh_mps2 over the step
+    harsh: float = -0.05  # if wheel speed changed faster than harsh_mps2
     harsh_mps2: float = 3.0
-    slip_per_mps: float = -0.1  # times |wheel speed - localised speed| beyond 0.2 m/s
+    slip_per_mps: float = -0.1  # times |wheel speed - localised speed| above 0.2 m/s
     goal: float = 5.0
-    bump: float = -6.0  # a contact began: once, however long the bumper stays pressed
+    bump: float = -6.0  # if a contact began; once per contact
 
 
 class Task(Checked, frozen=True):
@@ -49,14 +49,14 @@ class Task(Checked, frozen=True):
     actions: tuple[tuple[float, float], ...]  # (speed m/s, yaw rate rad/s); action 0 must be stop
     goal: Literal["route", "none"] = "route"
     control_period_s: Annotated[float, Meta(gt=0)] = 0.2
-    sectors: Annotated[int, Meta(ge=0)] = 36  # even, 4 or more; 0: the robot has no lidar
+    sectors: Annotated[int, Meta(ge=0)] = 36  # even, at least 4; 0: the robot has no lidar
     range_min_m: float = 0.05
     range_max_m: float = 4.0
-    near_m: float = 1.0  # along the plan, of the near waypoint
+    near_m: float = 1.0  # distance of the near waypoint along the plan
     far_m: float = 2.2
     goal_radius_m: float = 0.4
     time_limit_steps: int = 240
-    bump_terminates: bool = False  # a protective stop: what follows a bump is another episode
+    bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
 
     def check(self) -> None:

@@ -28,13 +28,13 @@ _REMEDY = "docs/diff.md lists the keys of a missions file"
 class MissionOrder(Checked, frozen=True, kw_only=True):
     """So many missions of one kind, or so many hours of logging."""
 
-    kind: str | None = None  # what a mission is to meet; None: whatever comes
+    kind: str | None = None  # condition that a mission should meet; None: any
     missions: Annotated[int, Meta(ge=1)] | None = None
-    hours: Annotated[float, Meta(gt=0)] | None = None  # of driving; beside missions what they take
+    hours: Annotated[float, Meta(gt=0)] | None = None  # of driving; with `missions`: their duration
     zone: str | None = None
     robot: str | None = None
     layout: str | None = None
-    fills: tuple[str, ...] = ()  # the gaps that it is for
+    fills: tuple[str, ...] = ()  # the gaps that it fills
 
     def check(self) -> None:
         if self.missions is None and self.hours is None:
@@ -47,7 +47,7 @@ class MissionsFile(Checked, frozen=True, kw_only=True):
     missions: tuple[MissionOrder, ...]
     format: str = FORMAT
     store: str = ""
-    store_version: int = -1  # -1: of no store
+    store_version: int = -1  # -1: there is no store
     mixture: str = ""
 
     def check(self) -> None:

@@ -43,10 +43,10 @@ Represents = Literal["natural", "archive"] | dict[str, Fraction]  # rates of row
 class OtherStore(Checked, frozen=True):
     """One more store that batches are drawn from, with the same strata and shares of its own."""
 
-    name: str  # its strata are called `name/stratum`
-    path: str  # as it is, or from the folder of the mixture's file
-    share: Portion  # of a batch
-    version: int | None = None  # of the store; the newest, which the panel then pins
+    name: str  # its strata are named `name/stratum`
+    path: str  # absolute, or relative to the mixture's file
+    share: Portion  # share of a batch
+    version: int | None = None  # version of the store; None: the newest
     # What its rows stand for: how often things occur, the main store's rates, or these.
     represents: Represents | None = None
 
@@ -64,9 +64,9 @@ class SourceShares(Checked, frozen=True):
     """Shares of an online batch by source, numbers or schedules; what is left is fresh."""
 
     logs: Portion = 0.5
-    fresh: Fraction | None = None  # default: what logs and stores leave, at every step
+    fresh: Fraction | None = None  # None: the rest
     stores: tuple[OtherStore, ...] = ()
-    represents: Represents | None = None  # what the main store's rows stand for: rates, if chosen
+    represents: Represents | None = None  # rates of the main store, if its rows are a selection
 
     def check(self) -> None:
         _check_rates(self.represents)
@@ -149,8 +149,8 @@ class EvaluationSplit(Checked, frozen=True):
         "episode"
     )
     share: Annotated[float, Meta(ge=0, lt=1)] = 0.1
-    gap_s: Annotated[float, Meta(ge=0)] = 2.0  # left out before the end of an episode
-    robots: tuple[str, ...] = ()  # these, by their tags, in place of a share of all
+    gap_s: Annotated[float, Meta(ge=0)] = 2.0  # gap before the end of an episode that is left out
+    robots: tuple[str, ...] = ()  # hold out these robots, instead of a share
 
     def check(self) -> None:
         _require(
@@ -163,15 +163,15 @@ class Safety(Checked, frozen=True):
     """Rows that must not be learned from."""
 
     unsafe: str  # SQL predicate over `transitions`
-    leave_out: Literal["rows", "episodes"] = "rows"  # those alone, or all of their episode
+    leave_out: Literal["rows", "episodes"] = "rows"  # only these rows, or all of their episodes
 
 
 class CorrectionRule(Checked, frozen=True):
     """Importance weights against the boost of strata, by what their condition may look at."""
 
-    pre: Correction = "none"  # chosen on the state: the fixed point stays where it is
-    post: Correction = "density_ratio"  # chosen on the outcome: uncorrected, Q is biased
-    beta: Fraction = 0.5  # exponent of the weights where the rule is "beta"
+    pre: Correction = "none"  # chosen on the state: does not bias Q
+    post: Correction = "density_ratio"  # chosen on the outcome: biases Q if uncorrected
+    beta: Fraction = 0.5  # exponent of the weights for the rule "beta"
     clip: FromOne = 4.0  # largest weight of "clipped" (and smallest inverse) and "density_ratio"
     # Of weights that take a stratum's share of the gradient below its share of the rows.
     below_natural: Literal["refuse", "allow"] = "refuse"
@@ -181,8 +181,8 @@ class Prioritised(Checked, frozen=True):
     """The numbers of `within = "per"` (arXiv:1511.05952) and `"lap"` (arXiv:2007.06049)."""
 
     per_alpha: Fraction = 0.6  # exponent of |TD|
-    per_beta: Fraction = 0.4  # exponent of the importance weights, to begin with
-    per_beta_batches: AtLeastOne = 100_000  # after which it is 1
+    per_beta: Fraction = 0.4  # exponent of the importance weights at the start
+    per_beta_batches: AtLeastOne = 100_000  # batches after which per_beta is 1
     per_epsilon: Positive = 1e-3  # added to |TD|
     lap_alpha: Fraction = 0.4  # exponent of max(|TD|, 1)
 
@@ -190,11 +190,11 @@ class Prioritised(Checked, frozen=True):
 class Adaptive(Checked, frozen=True):
     """Shares that follow the TD error: group DRO (arXiv:1911.08731) over the strata of the logs."""
 
-    step_size: Positive = 0.05  # of the exponent, a step; |TD| is taken in units of its mean
-    floor: Fraction = 0.01  # the least share of a stratum that has rows
-    ceiling: Fraction = 0.6  # the largest
-    every_updates: AtLeastOne = 100  # one step
-    after_updates: Count = 1_000  # none before: first errors say more of the network than of rows
+    step_size: Positive = 0.05  # of the exponent, per step; |TD| in units of its mean
+    floor: Fraction = 0.01  # smallest share of a stratum with rows
+    ceiling: Fraction = 0.6  # largest share of a stratum
+    every_updates: AtLeastOne = 100  # updates per step
+    after_updates: Count = 1_000  # no step before: first errors depend on the network
 
     def check(self) -> None:
         _require(self.floor < self.ceiling, "adaptive needs floor < ceiling")
@@ -203,8 +203,8 @@ class Adaptive(Checked, frozen=True):
 class StratumLimits(Checked, frozen=True, kw_only=True):
     """Keys of one stratum and of all at once."""
 
-    unit: Unit = "step"  # or all rows of the episodes that it holds in; nominal: what is left
-    min_steps: AtLeastOne = 1  # of an episode in which it must hold
+    unit: Unit = "step"  # "episode": all rows of its episodes; nominal: the rest
+    min_steps: AtLeastOne = 1  # number of steps of an episode in which it must hold
     floor: Fraction = 0.0
     cap: Fraction = 1.0
     correction: Correction | None = None  # default: the mixture's rule for its timing
@@ -226,9 +226,9 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
 class StratumRule(StratumLimits, frozen=True, kw_only=True):
     """What one stratum gets. A row goes to the matching stratum of the lowest priority number."""
 
-    name: str  # a condition's or an exposure's name or "nominal", unless `where` says otherwise
+    name: str  # name of a condition or exposure, "nominal", or any name with `where`
     where: str | None = None  # SQL predicate over `transitions`
-    share: Share = "natural"  # of its source's part of a batch
+    share: Share = "natural"  # share of its source's part of a batch
     priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
     timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
 
@@ -248,32 +248,32 @@ class Mixture(Checked, frozen=True):
     doc: str = ""
     seed: int = 0
     # How rows are packed.
-    discount: Fraction = 0.99  # gamma of one step
-    n_step: AtLeastOne = 1  # steps of a log row's return, cut at episode ends
-    cut_at_off_policy: bool = True  # and where the behaviour policy or its version changes
+    discount: Fraction = 0.99  # discount (gamma) per step
+    n_step: AtLeastOne = 1  # steps of a logged row's return; ends with the episode
+    cut_at_off_policy: bool = True  # also ends where the behaviour policy or version changes
     return_to_go: bool = False  # pack each row's discounted return to the end of its episode
     sampling: Literal["memory", "chunked"] = "memory"  # chunked: for panels larger than memory
     evaluation_split: EvaluationSplit = EvaluationSplit()
     # Which rows may be drawn.
     where: str | None = None  # SQL predicate: only these transitions
     safety: Safety | None = None
-    odometry_as_command: bool = False  # also rows whose action is measured motion, not a command
-    max_age_days: Annotated[float, Meta(ge=0)] | None = None  # of a logged row, at `as_of`
-    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # ages count to it; None: to the mixing
-    max_versions_behind: Count | None = None  # of its behaviour policy's newest; 0: only that one
-    max_age_env_steps: Count | None = None  # of fresh rows
-    max_rows_per_episode: AtLeastOne | None = None  # of one stratum
+    odometry_as_command: bool = False  # use rows whose action is measured motion
+    max_age_days: Annotated[float, Meta(ge=0)] | None = None  # age of a logged row at `as_of`
+    as_of: Annotated[datetime, Meta(tz=True)] | None = None  # date for ages; None: now
+    max_versions_behind: Count | None = None  # behind its policy's newest version; 0: only that
+    max_age_env_steps: Count | None = None  # largest age of fresh rows
+    max_rows_per_episode: AtLeastOne | None = None  # per stratum
     max_rows_per_recording: AtLeastOne | None = None
     unlabelled: Literal["refuse", "drop", "nominal"] = "refuse"  # rows without a condition
-    uncertain: Uncertain = "nominal"  # conditions too near to call: not held; keep: as labelled
+    uncertain: Uncertain = "nominal"  # uncertain conditions: not held; keep: as labelled
     unlisted: Literal["refuse", "drop"] = "refuse"  # rows that belong to no stratum
     # In which shares.
     sources: SourceShares = SourceShares()
     planned: PlannedUse = PlannedUse()
     strata: tuple[StratumRule, ...] = ()
     each_condition: EachCondition | None = None
-    prefer: Prefer = "rarest"  # which of its strata of episodes gets one; priority: the lowest
-    max_replays_per_row: FromOne | None = None  # a run's learner holds it
+    prefer: Prefer = "rarest"  # which stratum gets an episode; priority: the lowest
+    max_replays_per_row: FromOne | None = None  # enforced by the run's learner
     shortfall: Shortfall = "redistribute"
     adaptive: Adaptive | None = None
     # And how, within a stratum.

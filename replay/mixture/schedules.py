@@ -24,8 +24,8 @@ class Linear(Checked, frozen=True, tag_field="schedule", tag="linear"):
 
     start: Fraction
     end: Fraction
-    to_env_steps: EnvSteps  # where it ends
-    from_env_steps: EnvSteps = 0  # where it begins
+    to_env_steps: EnvSteps  # step at which it ends
+    from_env_steps: EnvSteps = 0  # step at which it begins
 
     def check(self) -> None:
         _check_span(self)

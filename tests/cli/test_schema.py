@@ -119,7 +119,7 @@ def test_a_condition_has_its_rule_or_names_its_file() -> None:
 
 def test_keys_have_the_comments_beside_them_as_descriptions() -> None:
     record = SCHEMAS["train"]["$defs"]["RecordConfig"]["properties"]
-    assert record["every_updates"]["description"] == "one logging interval"
+    assert record["every_updates"]["description"] == "length of a logging interval"
     assert json.loads(shipped_schema()) == SCHEMAS["mixture"]
 
 
@@ -133,4 +133,4 @@ def test_the_command_prints_lists_and_writes(
     assert cli.main(["schema", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {f"{n}.schema.json" for n in CONFIGS}
     assert cli.main(["schema", "robot"]) == 2
-    assert "there are train" in capsys.readouterr().err
+    assert "choose one of train" in capsys.readouterr().err

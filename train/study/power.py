@@ -27,7 +27,7 @@ class PowerConfig(Checked, frozen=True):
 
     # Between seeds, of the primary measure of one arm.
     sd: Annotated[float, msgspec.Meta(gt=0)]
-    effect: Annotated[float, msgspec.Meta(gt=0)]  # the difference that is to be seen
+    effect: Annotated[float, msgspec.Meta(gt=0)]  # difference that the study should detect
     # Of the two arms' values at the same seed: pairing helps by it.
     correlation: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     # Of a kind, that the pilots were judged on; None: as many as the study's.

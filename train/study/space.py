@@ -27,7 +27,7 @@ class Parameter(Checked, frozen=True):
     """One key of a space: a range, or choices."""
 
     low: float | int | None = None
-    high: float | int | None = None  # itself included
+    high: float | int | None = None  # included
     log: bool = False
     step: float | int | None = None
     choices: tuple[Any, ...] = ()
@@ -54,18 +54,18 @@ class Parameter(Checked, frozen=True):
 class Search(Checked, frozen=True):
     """The whole file."""
 
-    space: dict[str, Any]  # of `Parameter`s, by the keys of `restock train --set`
+    space: dict[str, Any]  # `Parameter`s by key of `restock train --set`
     doc: str = ""
-    store: str | None = None  # that mixtures are of
-    mixture: str | None = None  # of the store: a shipped name or a TOML file
-    panel: str | None = None  # one that already exists
-    seeds: tuple[int, ...] = (0,)  # each trial is trained with every one
+    store: str | None = None  # store from which mixtures are made
+    mixture: str | None = None  # name of a shipped mixture, or a TOML file
+    panel: str | None = None  # an existing panel
+    seeds: tuple[int, ...] = (0,)  # each trial is trained with all of them
     trials: Count = 30
     sampler: Literal["tpe", "random"] = "tpe"
     sampler_seed: int = 0
-    prune: bool = True  # by the evaluations that training makes anyway
-    startup_trials: Count = 5  # that are drawn at random and never pruned
-    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every trial
+    prune: bool = True  # stop bad trials early, by their periodic evaluations
+    startup_trials: Count = 5  # first trials: random, never pruned
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all trials
     evaluation: StudyEvaluation = StudyEvaluation()
 
     def check(self) -> None:

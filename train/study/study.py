@@ -29,13 +29,13 @@ class ArmConfig(Checked, frozen=True):
     """One method: a panel (or a mixture of the study's store, or none) and settings."""
 
     name: str
-    mixture: str | None = None  # of the study's store: a shipped name or a TOML file
-    panel: str | None = None  # one that already exists
-    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of `restock train --set`
-    library: Library | None = None  # whose algorithm learns, in the same twin; None: Restock's
-    arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # that algorithm's own
-    treatment: Treatment | None = None  # of its comparison; None: the study's
-    baseline: str | None = None  # the arm it is compared with; None: the study's
+    mixture: str | None = None  # name of a shipped mixture, or a TOML file
+    panel: str | None = None  # an existing panel
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # keys of `restock train --set`
+    library: Library | None = None  # library whose algorithm learns; None: Restock
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)  # arguments of that algorithm
+    treatment: Treatment | None = None  # None: the study's treatment
+    baseline: str | None = None  # arm to compare with; None: the study's
 
     def check(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
@@ -56,7 +56,7 @@ class StudyEvaluation(Checked, frozen=True):
     episodes: Count | dict[str, Count] = 40
     perturbations: tuple[str, ...] = ("none",)
     seed: int = 10_000
-    references: tuple[str, ...] = ("planner", "operator")  # who drives the same episodes, once
+    references: tuple[str, ...] = ("planner", "operator")  # that drive the same episodes once
 
     def check(self) -> None:
         kinds = list(self.episodes) if isinstance(self.episodes, dict) else []
@@ -103,17 +103,17 @@ class Study(Checked, frozen=True):
 
     arms: tuple[ArmConfig, ...]
     doc: str = ""
-    store: str | None = None  # that mixtures are of
+    store: str | None = None  # store from which mixtures are made
     seeds: tuple[int, ...] = (0, 1, 2)
     treatment: Treatment = "mixture"  # where an arm names none
     baseline: str | None = None  # where an arm names none; None: the first arm
-    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # of every arm
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all arms
     evaluation: StudyEvaluation = StudyEvaluation()
     primary: Primary | None = None
     power: PowerConfig | None = None  # what pilots found, for the primary contrast
     # Of the other contrasts, whose p values are adjusted for their number.
     measures: tuple[str, ...] = ("auc_rare", "success_rare", "success_nominal")
-    rare: tuple[str, ...] = RARE  # whose mean is `rare`
+    rare: tuple[str, ...] = RARE  # conditions whose mean is `rare`
 
     def check(self) -> None:
         names = [arm.name for arm in self.arms]

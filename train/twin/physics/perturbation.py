@@ -30,31 +30,31 @@ class Perturbation(Checked, frozen=True):
     """One set of effective parameters. `Perturbation()` is the nominal twin."""
 
     name: str = "nominal"
-    friction_scale: Annotated[float, Meta(ge=0.05, le=2)] = 1.0  # times the floor's of .8
-    patch_friction_scale: Scale = 1.0  # times the friction of each slippery patch
-    left_friction_scale: Scale = 1.0  # times the friction under the left wheel (a worn tyre)
-    payload_kg: Annotated[float, Meta(ge=0, le=150)] = 0.0  # on top of the chassis
-    wheel_radius_scale: NearOne = 1.0  # the controller and the odometry do not know it
-    track_scale: NearOne = 1.0  # times the distance between the wheels, unknown likewise
-    latency_s: UpToHalf = 0.05  # from a command to the wheels' set point
-    gain: Gain = 1.0  # of the wheel set points
-    left_gain: Gain = 1.0  # of the left wheel's, on top
-    slope_x: Slope = 0.0  # rise of the whole floor eastward, metres a metre
-    slope_y: Slope = 0.0  # and northward
+    friction_scale: Annotated[float, Meta(ge=0.05, le=2)] = 1.0  # factor of the floor's .8
+    patch_friction_scale: Scale = 1.0  # factor of the friction of slippery patches
+    left_friction_scale: Scale = 1.0  # factor under the left wheel (a worn tyre)
+    payload_kg: Annotated[float, Meta(ge=0, le=150)] = 0.0  # mass on top of the chassis
+    wheel_radius_scale: NearOne = 1.0  # factor, unknown to controller and odometry
+    track_scale: NearOne = 1.0  # factor of the track, likewise unknown
+    latency_s: UpToHalf = 0.05  # delay from a command to the wheels' set points
+    gain: Gain = 1.0  # factor of the wheels' set points
+    left_gain: Gain = 1.0  # additional factor of the left wheel's
+    slope_x: Slope = 0.0  # rise of the floor to the east, metres per metre
+    slope_y: Slope = 0.0  # rise of the floor to the north
     lidar_noise_m: UpToFifth = 0.01  # standard deviation of a range
     lidar_dropout: Annotated[float, Meta(ge=0, le=0.9)] = 0.005  # share of beams without a return
-    lidar_period_s: UpToTwo = 0.0  # between scans, in whole control steps; 0: one every step
-    localisation_period_s: UpToTwo = 0.0  # between poses, likewise
+    lidar_period_s: UpToTwo = 0.0  # whole control steps; 0: a scan every step
+    localisation_period_s: UpToTwo = 0.0  # likewise, for poses
     localisation_noise_m: UpToFifth = 0.004  # standard deviation, drawn at every step
-    localisation_drift_m: UpToHalf = 0.02  # standard deviation of an error that wanders over 3 s
+    localisation_drift_m: UpToHalf = 0.02  # standard deviation of an error that varies over 3 s
     localisation_yaw_noise_rad: UpToFifth = 0.004
-    encoder_noise_radps: UpToTwo = 0.03  # of a wheel's speed
-    encoder_bias_radps: Annotated[float, Meta(ge=-1, le=1)] = 0.0  # of both wheels' speeds
+    encoder_noise_radps: UpToTwo = 0.03  # standard deviation of a wheel's speed
+    encoder_bias_radps: Annotated[float, Meta(ge=-1, le=1)] = 0.0  # bias of both wheels' speeds
     gyro_noise_radps: UpToHalf = 0.005
     gyro_bias_radps: Annotated[float, Meta(ge=-0.5, le=0.5)] = 0.0
     accel_noise_mps2: UpToTwo = 0.05
     accel_bias_mps2: Annotated[float, Meta(ge=-2, le=2)] = 0.0
-    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # of the physics, one a vector
+    timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one per vector environment
 
     def changed(self) -> dict[str, float]:
         """The fields that are not the nominal twin's: what every transition keeps."""
