@@ -71,7 +71,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
         raise RecordingError(
             f"cannot be played: {error}",
             where=str(recording),
-            remedy="give a whole rosbag2 or MCAP file; `restock info` says what is damaged",
+            remedy="give a whole rosbag2 or MCAP file; `restock info` shows what is damaged",
         ) from error
 
 

@@ -44,7 +44,7 @@ def check_license(identifier: str | None) -> None:
     """Raises StoreError where it is no identifier as hubs of data sets write them."""
     if identifier is not None and not _IDENTIFIER.fullmatch(identifier):
         raise StoreError(
-            f"{identifier!r} is no identifier of a licence",
+            f"{identifier!r} is not an identifier of a licence",
             where="--license",
             remedy="write it as hubs do, in small letters: cc-by-4.0, apache-2.0, other",
         )
@@ -109,7 +109,7 @@ def card(
         "",
         f"Licence: {identifier}."
         if identifier
-        else "No licence was given: without one nobody else may use it.",
+        else "No licence was given: without one, nobody else may use it.",
     ]
     return "\n".join(lines) + "\n"
 

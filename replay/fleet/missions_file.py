@@ -38,7 +38,7 @@ class MissionOrder(Checked, frozen=True, kw_only=True):
 
     def check(self) -> None:
         if self.missions is None and self.hours is None:
-            raise ValueError("`missions` or `hours` must say how much")
+            raise ValueError("one of `missions` and `hours` must be given")
 
 
 class MissionsFile(Checked, frozen=True, kw_only=True):

@@ -130,7 +130,7 @@ def diff_stores(first: Store, second: Store, *, seed: int = 0) -> StoreDifferenc
             raise StoreError(
                 f"cannot be read: {str(error).splitlines()[0]}",
                 where=f"{first.path} or {second.path}",
-                remedy="`restock audit` says which; restore its files, or ingest again",
+                remedy="`restock audit` shows which; restore its files, or ingest again",
             ) from error
 
 

@@ -104,8 +104,8 @@ def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: 
         raise MixtureError(
             f"source {source!r} has rows of {', '.join(untold)}, but by its `represents`"
             " they never occur",
-            remedy=f"give their rates: represents = {{ {untold[0]} = 0.001 }}; or weigh no"
-            ' stratum: [correction] pre and post = "none"',
+            remedy=f"give their rates: represents = {{ {untold[0]} = 0.001 }}; or do not weight"
+            ' strata: [correction] pre and post = "none"',
         )
 
 
@@ -139,7 +139,7 @@ def refuse_archives(
             raise MixtureError(
                 f"the source {source.name!r} looks like an archive: {mine} of its {all_mine}"
                 f" episodes are of {name}, {theirs[0]} of {theirs[1]} of the other sources",
-                remedy=f"say in {place_of} what its rows represent: "
+                remedy=f"set in {place_of} what its rows represent: "
                 + ('represents = "archive" (the rates of the main store), ' if number else "")
                 + f'represents = {{ {natural} }} (rates), or "natural" (it is as it occurs)',
             )

@@ -504,6 +504,6 @@ def test_a_card_without_a_licence_says_so(store_path: Path, tmp_path: Path) -> N
     text = (tmp_path / "set" / "README.md").read_text()
     assert "license:" not in text
     assert "No licence was given" in text
-    with pytest.raises(StoreError, match="no identifier of a licence"):
+    with pytest.raises(StoreError, match="not an identifier of a licence"):
         export_dataset(store_path, "lerobot", tmp_path / "b", license="CC BY 4.0")
     assert not (tmp_path / "b").exists()

@@ -219,7 +219,7 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
     (tmp_path / "good.toml").write_text(as_toml(whole))
     assert read_missions(tmp_path / "good.toml") == whole
     for text, message in (
-        ("[[missions]]\nkind = 'x'\n", "must say how much"),
+        ("[[missions]]\nkind = 'x'\n", "must be given"),
         ("[[missions]]\nkind = 'x'\nmissions = 0\n", "missions"),
         ("[[missions]]\nmission = 3\n", "unknown key"),
         ("missions = []\n", "contains no missions"),

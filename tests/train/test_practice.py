@@ -212,7 +212,7 @@ def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: st
     [
         ("practice={rule='shares', shares={fog=1}}", "'fog' is no kind"),
         ("practice={rule='shares', shares={near_collision=1}}", "'near_collision' is no kind"),
-        ("practice.by=['friction_scale']", "cannot be told apart by 'friction_scale'"),
+        ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
         ("practice.rule='missions'", "env.missions a missions file"),
         ("practice={rule='success', floor=0.5}", "above 1"),
     ],

@@ -85,7 +85,9 @@ def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> I
     implied = implied_reward(logs)
     telling = np.abs(implied) > _TELLING  # False for NaN
     if len(np.unique(logs.cluster[telling])) < FEWEST_CLUSTERS:
-        yield not_run("reward scale", what, "too few rows whose observations say their reward")
+        yield not_run(
+            "reward scale", what, "too few rows whose reward follows from their observations"
+        )
         return
     ratio = logs.reward[telling] / implied[telling]
     (scale,) = clustered_quantiles(

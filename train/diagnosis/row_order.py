@@ -46,7 +46,7 @@ def row_order(rows: FedRows) -> Iterator[Comparison]:
     closing = rows.observation[:, first : first + rows.task.sectors]
     unlike = (np.abs(change - closing) > 10 * _EQUAL).any(axis=1) & joined
     yield share_judged(
-        "closing", "clearances did not change as the observation says they did", int(unlike.sum()),
+        "closing", "clearances did not change as in the observation", int(unlike.sum()),
         count, MOST,
     )  # fmt: skip
     yield _still(rows)
@@ -59,7 +59,8 @@ def _foresight(rows: FedRows, joined: Bools) -> Comparison:
     changed = joined & (rows.action != rows.action[before])
     knows = changed & (rows.previous_action() == rows.action)
     return share_judged(
-        "foresight", "observation holds the action that is only taken at it", int(knows.sum()),
+        "foresight", "observation contains the action that is only taken "
+            "afterwards", int(knows.sum()),
         int(changed.sum()), MOST,
     )  # fmt: skip
 
@@ -76,7 +77,7 @@ def _still(rows: FedRows) -> Comparison:
 
 def _repeated(rows: FedRows) -> Comparison:
     """Rows of episodes that are another's, byte for byte, or steps that are there twice."""
-    what = "row is of an episode that is in it under another name too"
+    what = "row belongs to an episode that is stored twice"
     if not len(rows):
         return not_run("repeated episodes", what, "no rows")
     starts = np.append(np.flatnonzero(np.append(True, rows.last[:-1])), len(rows))

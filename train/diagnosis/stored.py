@@ -25,8 +25,8 @@ from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_step
 FAR = 0.25  # from a command to its action, in units of the fastest action
 COARSE = 0.1  # of the commands, those so far
 DIFFERENT = 0.02  # of the rows that have a label, or should
-_LABELS = "row's label is not what its conditions give on the stored signals"
-_ENDS = "row is terminated and its signals do not say so, or they do and it is not"
+_LABELS = "row's label differs from what its conditions give on the stored signals"
+_ENDS = "termination of the row does not agree with its signals"
 
 
 def stored(
@@ -54,7 +54,7 @@ def _far_commands(store: Store, task_hash: str) -> Comparison:
         " WHERE task_hash = ?",
         params=[FAR, task_hash],
     ).fetchall()
-    what = "command is far from the action that stands for it"
+    what = "command is far from the action that represents it"
     return share_judged("far commands", what, far, count, COARSE)
 
 

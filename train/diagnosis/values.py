@@ -42,7 +42,7 @@ _FAR = 0.97  # of the lidar's range
 def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
     """Ranges and spreads of what is measured, then the lidar's bearing."""
     if twin is None:
-        yield not_run("range", "values against the twin's", "no twin to say where they should be")
+        yield not_run("range", "values against the twin's", "no twin to compare with")
     else:
         few = len(np.unique(logs.episode)) < FEWEST_CLUSTERS
         for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:

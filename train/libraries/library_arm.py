@@ -185,7 +185,7 @@ def train_library(arm: LibraryArm) -> None:
     arguments = (ppo_arguments if on_policy else dqn_arguments)(config) | arm.arguments
     known = {"name": DISTRIBUTION, "algorithm": arm.library}
     if on_policy:  # what its settings say of these is not in force
-        known |= {"replay": "none: each rollout is learnt from, then forgotten", "target": "none"}
+        known |= {"replay": "none: each rollout is used once, then discarded", "target": "none"}
     elif arm.arguments:  # its own words may have changed replay, exploration or target
         known |= {"replay": f"changed by {arm.arguments}", "target": f"changed by {arm.arguments}"}
     run = create_run(

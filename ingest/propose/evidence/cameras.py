@@ -42,7 +42,7 @@ class CameraTopic:
             lines[0] += f", {self.size_bytes / 1000:,.0f} kB: {hourly:.2g} GB an hour as below"
         lines.append(f"topic = {json.dumps(self.topic.name)}")
         if self.rate_hz is not None and self.rate_hz > ENOUGH_HZ:
-            lines.append(f"max_hz = {ENOUGH_HZ:g}  # keep so many a second")
+            lines.append(f"max_hz = {ENOUGH_HZ:g}  # frames kept per second")
         elif self.rate_hz and 2 / self.rate_hz > _MAX_AGE_S:
             lines.append(f"max_age_s = {2 / self.rate_hz:.2g}  # two of its periods")
         return ["# " + line for line in lines]

@@ -162,9 +162,10 @@ def _through_lines(through: _Told, command: _Told) -> list[str]:
     topic, kind = through.fit
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     return [
-        f"# {through.followed_by(command):.0%} of the commands of {command.fit[0].name} lie towards"
-        " what it said last, or are a part of it:",
-        "[command_through]  # who drove is by whose command it repeats; unknown where it is silent",
+        f"# {through.followed_by(command):.0%} of the commands of {command.fit[0].name} move "
+        "towards its last message, or are a part of it:",
+        "[command_through]  # the driver is the source whose command it repeats; unknown while it "
+        "is silent",
         f"topic = {json.dumps(topic.name)}",
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
@@ -201,8 +202,8 @@ def _lines(name: str, one: _Told, output: _Told) -> list[str]:
     topic, kind = one.fit
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     return [
-        f"# {one.passed_on(output):,} of {output.changes:,} changes of {output.fit[0].name} are"
-        " to what it said last:",
+        f"# {one.passed_on(output):,} of {output.changes:,} changes of {output.fit[0].name} "
+        "follow its last message:",
         f"[command_sources.{json.dumps(name)}]  # the behaviour policy of rows with its command",
         f"topic = {json.dumps(topic.name)}",
         f'type = "{topic.type}"',
@@ -224,9 +225,9 @@ def _joystick_lines(
         button = _held(command, fields.log_time_ns, fields.fields["axes"], fields.fields["buttons"])
         mark = "" if button is not None else "# "
         why = (
-            "commands while it is held are the stick's"
+            "while it is held, the commands are those of the stick"
             if button is not None
-            else "no button tells by these commands: say which is held while it drives"
+            else "no button follows from these commands: set the one that is held while it drives"
         )
         return [
             f"{mark}[command_sources.teleop]  # a joystick: {why}",

@@ -133,7 +133,7 @@ def write_fit(path: Path, fits: Sequence[FittedTwin]) -> None:
 def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
     made = fleet_schedule(fits)
     lines = [
-        f"# Fitted to {len(fits)} recordings, each by itself, at {fits[0].timestep_s:g} s.",
+        f"# Fitted to {len(fits)} recordings, each separately, at {fits[0].timestep_s:g} s.",
         f"name = {toml_value(made.name)}",
         "",
         "[ranges]",

@@ -52,7 +52,7 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
                 f"{floor.name} has no room for episodes of {', '.join(unfit)}",
                 where="layouts",
                 remedy="train and record without these conditions, or give it more aisles or room;"
-                " `restock twin layout` says what fits on a floor",
+                " `restock twin layout` shows what fits on a floor",
             )
 
 

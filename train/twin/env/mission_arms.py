@@ -78,7 +78,7 @@ class MissionArms:
         unknown = [name for name in by if name not in (BLOCK, LAYOUT, *ranges)]
         if unknown:
             raise ConfigError(
-                f"missions cannot be told apart by {', '.join(map(repr, unknown))}",
+                f"missions cannot be distinguished by {', '.join(map(repr, unknown))}",
                 where="practice.by",
                 remedy=f"give {', '.join((BLOCK, LAYOUT, *ranges))}"
                 + ("" if ranges else "; fields of env.perturbation, where it is a schedule"),

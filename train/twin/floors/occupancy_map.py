@@ -88,7 +88,7 @@ def read_grid(path: Path) -> OccupancyGrid:
     image = path.parent / description.image
     if not image.resolve().is_relative_to(path.parent.resolve()):
         raise ConfigError(
-            f"its image {description.image!r} lies outside its folder",
+            f"its image {description.image!r} is outside its folder",
             where=str(path),
             remedy="copy the image into its folder, and give only the file's name in `image:`",
         )

@@ -274,8 +274,8 @@ def _check_frames(
             f"{said}, and {int((found == FREE).sum()):,} on its free floor{_apart(grid, poses)}"
             f"{frames}: it is not a map of these poses",
             where=f"{where}, {source}",
-            remedy="give the map that they were localised in (--map map.yaml), a --profile whose"
-            " pose is in the map's frame, or make the floor --by scans or --by corridor",
+            remedy="give the map in which they were localised (--map map.yaml), or a --profile "
+            "with a pose in the map's frame, or make the floor --by scans or --by corridor",
         )
     if off + walls + unknown >= 0.01 or frames:
         notes.append(said + frames)
