@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import textwrap
 
+import msgspec
 import numpy as np
 
 from restock.errors import visible
@@ -31,8 +33,11 @@ from restock.ingest.propose.trial import Trial
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import unseen
 from restock.ingest.task.robot import Robot
+from restock.ingest.task.task import Task
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
+ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
+LONGEST_TIME_LIMIT_STEPS = 1000
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
 
 
@@ -162,19 +167,34 @@ def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
         if reached is not None
     ]
     origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
+    actions = _actions(commands, seen.robot)
     return [
         "[task]",
         *_bump_lines(seen.recording, roles),
         *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
         f"control_period_s = {seen.clock.period_s:g}",
+        *_time_limit_lines(seen, max(speed for speed, _ in actions)),
         *_range_lines(seen),
         *held_back,
         f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
-        *(f"  [{v:.3g}, {w:.3g}]," for v, w in _actions(commands, seen.robot)),
+        *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
         "]",
         "",
         *_body_lines(seen, trial),
     ]
+
+
+def _time_limit_lines(seen: Evidence, speed_mps: float) -> list[str]:
+    """The time limit of a robot that is too slow for the one that a task has otherwise."""
+    if seen.goal.source is None or speed_mps <= 0.0:
+        return []
+    steps = 10 * math.ceil(ROUTE_M / (speed_mps * seen.clock.period_s) / 10)
+    (default,) = (f.default for f in msgspec.structs.fields(Task) if f.name == "time_limit_steps")
+    if steps <= default:
+        return []
+    steps = min(steps, LONGEST_TIME_LIMIT_STEPS)
+    reach_m = steps * seen.clock.period_s * speed_mps
+    return [f"time_limit_steps = {steps}  # {reach_m:.0f} m at {speed_mps:.3g} m/s"]
 
 
 def _actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:

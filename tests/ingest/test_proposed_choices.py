@@ -234,3 +234,18 @@ def test_uneven_commands_get_a_tick_every_period(tmp_path, capsys):
     for times, steps in ((uneven, "rate"), (np.arange(0, 20, 0.1), "command")):
         drive = Commanded(float(times[-1]), times_s=tuple(times))
         assert f'steps = "{steps}"' in propose(drive, tmp_path / steps, capsys)[1]["toml"]
+
+
+def test_a_slow_robot_gets_time_to_arrive(tmp_path, capsys):
+    """A Neato at .28 m/s got 48 s: less than the missions on its own floor take."""
+    even = tuple(0.2 * np.arange(150))
+    _, said, file = propose(Commanded(30.0, times_s=even), tmp_path, capsys)
+    assert "time_limit_steps = 250  # 20 m at 0.4 m/s" in said["toml"]
+    task = load_profile(file).task
+    fastest_mps = max(speed for speed, _ in task.actions)
+    assert task.time_limit_steps * task.control_period_s * fastest_mps >= 20.0
+
+
+def test_a_fast_robot_keeps_the_default_time_limit(tmp_path, capsys):
+    _, said, _ = propose(Commanded(30.0, times_s=tuple(0.5 * np.arange(60))), tmp_path, capsys)
+    assert "time_limit_steps" not in said["toml"]
