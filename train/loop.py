@@ -89,6 +89,8 @@ def train(
             _choose_start(session)
         _evaluate(session, notify)
 
+    if progress.driving_from_s is None:
+        progress.driving_from_s = session.wall_s
     while progress.env_steps < schedule.env_steps and _time_left(session) and not progress.stopped:
         _interrupt(session, stop)
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
@@ -353,11 +355,17 @@ def _save(session: Session) -> None:
 
 
 def _time_left(session: Session) -> bool:
-    """Whether the time is not up; a first interval of updates is made whatever it is, so that
-    there is something to keep and to report."""
-    config = session.config
-    seconds, least = config.schedule.seconds, config.record.every_updates
-    return seconds is None or session.wall_s < seconds or session.learner.gradient_steps < least
+    """Whether the time is not up.
+
+    Whatever it is, a first interval of updates is made, so that there is something to keep and to
+    report; and half of it is spent in the twin, however long the logs took before that.
+    """
+    seconds = session.config.schedule.seconds
+    if seconds is None or session.learner.gradient_steps < session.config.record.every_updates:
+        return True
+    driving_from_s = session.progress.driving_from_s
+    in_twin = 0.0 if driving_from_s is None else driving_from_s + seconds / 2
+    return session.wall_s < max(seconds, in_twin)
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:

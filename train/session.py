@@ -57,6 +57,7 @@ class Progress:
     evaluated_at: int = -1  # environment steps of the last evaluation
     checkpointed_at: int = 0
     wall_s: float = 0.0  # of training, before this process
+    driving_from_s: float | None = None  # of training, when it began to drive in the twin
     rollbacks: int = 0
     stopped: bool = False  # by the guard
 

@@ -53,7 +53,7 @@ def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
     tmp_path: Path, with_logs: bool
 ) -> None:
     """There is a policy to keep and something to report, however slow the machine."""
-    settings = config(schedule={"seconds": 1e-6, "offline_updates": 1000, "env_steps": 6000})
+    settings = config(schedule={"seconds": 1e-9, "offline_updates": 1000, "env_steps": 6000})
     live = run_to_end(tmp_path / "a", settings, **({} if with_logs else {"logs": None}))
     least = settings.record.every_updates
     assert least <= live.learner.gradient_steps <= least + 20
@@ -61,6 +61,17 @@ def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
     (row, *_) = [row for row in live.run.table("progress").to_pylist() if row["updates"]]
     assert row["loss"] is not None
     assert (live.progress.env_steps == 0) == with_logs
+
+
+def test_a_run_drives_for_half_of_its_time_however_long_the_logs_take(tmp_path: Path) -> None:
+    """Else a robot of few logs and a slow twin ends with a policy that never drove in it."""
+    settings = config(schedule={"seconds": 1.0, "offline_updates": 10**6, "env_steps": 10**6})
+    live = run_to_end(tmp_path / "a", settings)
+    assert live.progress.driving_from_s is not None
+    assert live.progress.driving_from_s >= 1.0
+    assert live.wall_s >= live.progress.driving_from_s + 0.5
+    assert live.progress.env_steps > 0
+    assert live.learner.gradient_steps < 10**6
 
 
 @pytest.mark.long  # test_algorithms has the shorter ones

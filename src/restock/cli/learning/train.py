@@ -44,7 +44,8 @@ class TrainCommand:
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
-    """Stop after this training time, even if the step budget is not used up (schedule.seconds)."""
+    """Stop after this training time, even if the step budget is not used up (schedule.seconds). At
+    least half of it is spent in the twin, however long the updates on the logs take."""
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
