@@ -157,7 +157,7 @@ def test_a_carried_text_may_do_no_more_than_a_profile_file(
 
 
 def test_a_panel_without_the_text_needs_the_file_as_before(folder: Path) -> None:
-    with pytest.raises(PanelError, match=r"comes with Restock has it\n"):
+    with pytest.raises(PanelError, match=r"no shipped profile has this task\n"):
         profile_of_panel(carrying(folder, ""))
 
 
