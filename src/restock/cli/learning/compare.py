@@ -185,7 +185,7 @@ def _sentence(comparison: Comparison) -> str:
             "method": "environment, environment steps and evaluation",
         }.get(comparison.treatment, "settings, steps and feed")
         return (
-            f"COMPARABLE: {what} are the same within the limits, but for the {comparison.treatment}"
+            f"COMPARABLE: {what} are the same within the limits, except the {comparison.treatment}"
         )
     if comparison.refused:
         names = ", ".join(difference.setting for difference in comparison.refused)

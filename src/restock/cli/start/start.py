@@ -208,7 +208,7 @@ def _way(asked: StartCommand, work: Work) -> Stop | None:
     )
     found = work.do(stages.info(to))
     readable = found.document.get("recordings", ())
-    salvaging = "add --salvage to this command: it reads what is intact of damaged recordings"
+    salvaging = "add --salvage to this command: it reads what is intact in damaged recordings"
     if not (found.good or readable):
         known = "give a file, a bag's folder, or a folder of bags"
         if any("cannot be read" in why for why in found.errors):
