@@ -628,7 +628,7 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")
     page = _on_floors(run, tmp_path / "a", str(hall), "hall.toml")
     assert 'rect width="800" height="200"' in page
-    assert "run's floor, hall.toml" in page
+    assert "floor, hall.toml" in page
     assert "18 failed clean episodes there" in page
     page = _on_floors(run, tmp_path / "b", str(hall), "default")
     assert "0 failed clean episodes there" in page
