@@ -146,8 +146,8 @@ def test_what_an_option_says_is_one_paragraph(
     monkeypatch.setenv("COLUMNS", "120")
     assert cli.main(["ingest", "--help"]) == 0
     text = capsys.readouterr().out
-    lines = text[text.index("--repeated") : text.index("--tag KEY")].split("│")[:-1]
-    paragraph = [line.strip() for line in lines if line.strip()]
+    lines = text[text.index("--repeated") : text.index("--tag KEY")].splitlines()
+    paragraph = [told for line in lines if (told := line.strip("│ "))]
     assert len(paragraph) > 2
     assert all(len(line) > 70 for line in paragraph[1:-1]), paragraph
     assert cli.main(["eval", "--help"]) == 0

@@ -11,6 +11,7 @@ from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import (
     Motion,
     StateLattice,
+    Window,
     lattice_around,
     rectangle,
 )
@@ -30,7 +31,8 @@ def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GO
     planner = Planner(FLOOR)
     start = (AISLE.x_min + 0.2, AISLE.center[1])
     graph = planner.graph_around(*start, goal, box, (half[0, 0], half[0, 1]))
-    return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, 2.3)
+    window = Window.around(box[:, :2], 2.3, planner.shape)
+    return lattice_around(FLOOR, graph, box[:, :2], half, goal, 0.4, motion, window)
 
 
 def test_outlines_are_about_the_axle() -> None:

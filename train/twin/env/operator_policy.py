@@ -4,8 +4,8 @@ At every step each action is simulated for the next 1.2 s: where the robot would
 racks, pallets and people that comes (who are assumed to keep walking as they do), and how far
 along a plan that knows the pallets. Near pallets it is pairs of actions, and what counts is the
 time that is left to the goal by a state lattice, which knows how the robot must turn to fit
-through a gap. On and before slippery floor only gentle actions count. A few percent of the
-actions are mistakes.
+through a gap; so it is where the robot was stuck. On and before slippery floor only gentle
+actions count. A few percent of the actions are mistakes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.floors.state_lattice import (
     Motion,
     StateLattice,
+    Window,
     box_gap,
     floor_gap,
     lattice_around,
@@ -68,7 +69,7 @@ class Operator(SoftPolicy, Stateful):
     version = "3"  # 1 had no lattice, 2 backed off from who had just let it pass
     STATE: ClassVar[tuple[str, ...]] = (
         *("_rng", "_ways", "_episode", "_began", "_plan", "_anchor", "_still", "_waiting"),
-        "_backing",
+        *("_backing", "_stuck_m"),
     )
 
     def __init__(self, *, epsilon: float = 0.03, seed: int = 0) -> None:
@@ -84,6 +85,7 @@ class Operator(SoftPolicy, Stateful):
         self._still = np.zeros(count, np.int64)
         self._waiting = np.zeros(count, np.bool_)
         self._backing = np.zeros(count, np.int64)
+        self._stuck_m = np.full((count, 2), np.nan)  # where each was stuck last, in its episode
         self._lattices: dict[int, tuple[int, StateLattice | None]] = {}  # by robot: of an episode
 
     def restored(self) -> None:
@@ -127,9 +129,10 @@ class Operator(SoftPolicy, Stateful):
         tries[:, table[:, 0] < 0] += 1.0
         stood = self._standing(env, pose) & (alone | (self._still > PATIENCE_STEPS))
         score[stood] = tries[stood]
+        self._note_stuck(env, pose, np.flatnonzero(stood & alone & ~icy & (self._still > 0)))
         action = np.asarray(score.argmax(axis=1), np.int64)
         ids = self._near_pallets(env, pose)
-        ids = ids[~stood[ids]]
+        ids = ids[~stood[ids] & alone[ids] & ~icy[ids]]
         if len(ids):
             action[ids] = self._past_pallets(env, ids, pose[ids], table)
         return action
@@ -173,15 +176,17 @@ class Operator(SoftPolicy, Stateful):
         return np.flatnonzero(guided)
 
     def _lattice(self, env: WarehouseVectorEnv, index: int) -> StateLattice | None:
-        """That of the robot's episode; None without pallets, and for robots that do not turn on
-        the spot."""
+        """That of the robot's episode, about the pallets and where it was stuck; None where
+        neither is, and for robots that do not turn on the spot."""
         episode = int(self._episode[index])
         kept, lattice = self._lattices.get(index, (-1, None))
         if kept == episode:
             return lattice
         pallets = env.simulation.pallets[index]
         pallets = pallets[pallets[:, 0] > 0]
-        motion = _motion(env) if len(pallets) else None
+        stuck = self._stuck_m[index : index + 1]
+        places = np.concatenate([pallets[:, :2], stuck[np.isfinite(stuck[:, 0])]])
+        motion = _motion(env) if len(places) else None
         lattice = None
         if motion is not None:
             goal_x, goal_y = env.navigation.goals_m[index].tolist()
@@ -196,10 +201,19 @@ class Operator(SoftPolicy, Stateful):
                 goal,
                 env.task.goal_radius_m,
                 motion,
-                WINDOW_M,
+                Window.around(places, WINDOW_M, planner.shape),
             )
         self._lattices[index] = episode, lattice
         return lattice
+
+    def _note_stuck(self, env: WarehouseVectorEnv, pose: F64, ids: Ints) -> None:
+        """From now on a lattice guides robots (n,) where they are stuck."""
+        for index in ids.tolist():
+            lattice = self._lattice(env, index)
+            if lattice is None or not lattice.window.covers(*pose[index, :2]):
+                self._stuck_m[index] = pose[index, :2]
+                del self._lattices[index]
+                self._ways[index] = self._way(env, index, pose[index])
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
         """No mistakes right beside people."""
@@ -251,20 +265,24 @@ class Operator(SoftPolicy, Stateful):
         stale = self._episode != serial
         offset = view_route(self._ways, pose[:, 0], pose[:, 1], pose[:, 2], ()).offset_m
         for index in np.flatnonzero(stale | (offset > 0.5)):
-            goal = env.navigation.goals_m[index]
-            x, y = float(pose[index, 0]), float(pose[index, 1])
-            target = (float(goal[0]), float(goal[1]))
             if stale[index]:
-                self._episode[index], self._began[index] = serial[index], (x, y)
-            planner = env.navigation.planner_of(int(index))
-            pallets = env.simulation.pallets[index]
-            pallets = pallets[pallets[:, 0] > 0]
-            lattice = self._lattice(env, int(index))
-            if lattice is not None:
-                way = lattice.plan(x, y, float(pose[index, 2]))
-            else:
-                way = planner.plan_around(x, y, target, pallets, PALLET_HALF_M[:2])
-            self._ways[index] = planner.plan(x, y, target) if way is None else way
+                self._episode[index], self._began[index] = serial[index], pose[index, :2]
+                self._stuck_m[index] = np.nan
+            self._ways[index] = self._way(env, int(index), pose[index])
+
+    def _way(self, env: WarehouseVectorEnv, index: int, pose: F64) -> F64:
+        """A robot's way (PLAN_POINTS, 2) past the pallets, from a pose (3,)."""
+        x, y, yaw = pose.tolist()
+        goal_x, goal_y = env.navigation.goals_m[index].tolist()
+        planner = env.navigation.planner_of(index)
+        pallets = env.simulation.pallets[index]
+        pallets = pallets[pallets[:, 0] > 0]
+        lattice = self._lattice(env, index)
+        if lattice is not None:
+            way = lattice.plan(x, y, yaw)
+        else:
+            way = planner.plan_around(x, y, (goal_x, goal_y), pallets, PALLET_HALF_M[:2])
+        return planner.plan(x, y, (goal_x, goal_y)) if way is None else way
 
     def _simulate(
         self, env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64

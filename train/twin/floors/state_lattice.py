@@ -184,15 +184,13 @@ def lattice_around(
     goal: tuple[float, float],
     goal_radius_m: float,
     motion: Motion,
-    reach_m: float,
+    window: Window,
 ) -> StateLattice:
-    """A lattice about boxes (K, 2) of half sizes (K, 2), with `reach_m` around their middles.
+    """A lattice over a window of a floor with boxes (K, 2) of half sizes (K, 2) on it.
 
     `graph` joins the floor's cells past the boxes, in metres, against the robot's way
     (`Planner.graph_around`): outside the window it goes on with that.
     """
-    size = round(floor.width_m / CELL_M), round(floor.depth_m / CELL_M)
-    window = Window.around(boxes, reach_m, size)
     room = _room(floor, boxes, half_m, window, motion.outline_m)
     free = room > TOUCH_M
     cost = 1.0 + NEAR_COST * np.clip(1.0 - room / NEAR_M, 0.0, 1.0)
