@@ -25,8 +25,8 @@ from restock.train.twin.floors.state_lattice import (
     StateLattice,
     Window,
     box_gap,
-    floor_gap,
     lattice_around,
+    near_floor_gap,
     rectangle,
 )
 from restock.train.twin.physics.model import PALLET_HALF_M, pallet_half_m
@@ -317,7 +317,7 @@ class Operator(SoftPolicy, Stateful):
         on = env.layout[ids]
         for index in np.unique(on):
             rows = np.flatnonzero(on == index)
-            room[rows] = floor_gap(env.floors[index], x[rows], y[rows])
+            room[rows] = near_floor_gap(env.floors[index], x[rows], y[rows])
         pallets = env.simulation.pallets[ids]
         for column in range(pallets.shape[1]):
             rows = np.flatnonzero(pallets[:, column, 0] > 0)

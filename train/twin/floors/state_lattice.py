@@ -30,6 +30,7 @@ ARC = 0.35  # of the time to turn on the spot, that the same turn takes while dr
 OFF_COST_S = 0.5  # a cell that a pose lies off the free ones
 _FIELD_M = 0.05  # cells of the clearance that outlines are looked up in
 _NO_WAY_S = 60.0  # of a heading without any free state
+NEAR_GAP_M = 0.5
 BORDER_CELLS = 2  # along a window's sides, where the floor's cells go on
 ENTER_RAD = 0.6  # the turn that coming in costs: outside, where a cell has no heading, none does
 
@@ -315,6 +316,24 @@ def floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
     room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
     for rack in floor.racks:
         room = np.minimum(room, box_gap(x, y, rack.center, rack.half_size))
+    return room
+
+
+def near_floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
+    """`floor_gap` of the points (n, …) of n robots, exact where it is below `NEAR_GAP_M`.
+
+    Racks farther from all points of a robot are left out: a floor made of scans has hundreds.
+    """
+    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    over = tuple(range(1, x.ndim))
+    low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - NEAR_GAP_M  # (n, 2)
+    high = np.stack([x.max(axis=over), y.max(axis=over)], axis=-1) + NEAR_GAP_M
+    for rack in floor.racks:
+        middle, half = np.array(rack.center), np.array(rack.half_size)
+        rows = np.flatnonzero(((low < middle + half) & (high > middle - half)).all(axis=1))
+        if len(rows):
+            gap = box_gap(x[rows], y[rows], rack.center, rack.half_size)
+            room[rows] = np.minimum(room[rows], gap)
     return room
 
 
