@@ -144,7 +144,7 @@ def test_a_policy_is_reproducible_from_its_seed() -> None:
 
 
 def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends() -> None:
-    """A real Neato's robot in passages of .5 m: it succeeded in .75 of its missions, now in .92."""
+    """A real Neato's robot was stuck before passages of .5 m, which its outline fits through."""
     env = WarehouseVectorEnv(4, conditions={"nominal": 1.0})
     first = Operator(seed=6)
     observation, _ = env.reset(seed=3)
@@ -164,3 +164,21 @@ def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends
             break
     assert (env.episodes_begun >= 2).all()
     assert np.isnan(first._stuck_m).all()
+
+
+def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
+    """At .28 m/s it makes less than .1 m in the steps after which the operator takes it for stuck:
+    backing off was what it taught in most states, and agents learned to."""
+    task = load_profile("warehouse_amr").task
+    slow = tuple((0.28 * v, w) for v, w in task.actions)
+    task = msgspec.structs.replace(task, actions=slow)
+    env = WarehouseVectorEnv(4, conditions={"nominal": 1.0}, task=task)
+    operator = Operator(epsilon=0.0)
+    env.reset(seed=3)
+    creep = 1  # ahead at .11 m/s
+    backwards = np.zeros(len(slow), np.bool_)
+    backwards[[v < 0 for v, _ in slow]] = True
+    for _ in range(12):
+        action, _ = operator.act(env, np.zeros(0, np.float32))
+        assert not backwards[action].any()
+        env.step(np.full(4, creep))

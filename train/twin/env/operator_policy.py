@@ -43,6 +43,8 @@ CAREFUL_M = 1.8  # from the robot's middle to a person's
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
 PATIENCE_STEPS = 20  # with somebody in the way; then it moves about, to be let pass
+MOVED = np.array([0.1, 0.2])  # m and rad, of a robot that makes a step of so much or more:
+MOVED_STEP = np.array([1.0, 1.2]) * 0.2
 WINDOW_M = 2.3  # that a lattice spans about pallets' middles
 # Near pallets: one action for FIRST steps, then another. The plan of the step before is kept unless
 # another is better by BETTER_S: otherwise replanning at every step can postpone a turn for ever.
@@ -245,7 +247,7 @@ class Operator(SoftPolicy, Stateful):
         near = _somebody_near(env, pose)
         let_pass = self._waiting & ~near
         self._waiting = near
-        moved = (np.abs(pose - self._anchor) > (0.1, 0.1, 0.2)).any(axis=1) | (env.steps == 0)
+        moved = (np.abs(pose - self._anchor) > _moved(env)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
         self._still = np.where(moved | let_pass, 0, self._still + 1)
         self._backing = np.where(
@@ -364,6 +366,17 @@ def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:
     people = env.simulation.traffic.position_m - pose[:, None, :2]
     near = np.hypot(people[..., 0], people[..., 1]) < CAREFUL_M
     return np.asarray(near.any(axis=1), np.bool_)
+
+
+def _moved(env: WarehouseVectorEnv) -> F64:
+    """Changes of x, y (m) and yaw (rad) from which on a robot has moved.
+
+    A slower robot's are smaller, by its highest speeds: else one that creeps, or that has just been
+    told to drive, is taken for stuck.
+    """
+    fastest = np.abs(np.asarray(env.task.actions, np.float64)).max(axis=0)
+    slower = np.minimum(fastest * env.task.control_period_s / MOVED_STEP, 1.0)
+    return np.asarray(MOVED[[0, 0, 1]] * slower[[0, 0, 1]])
 
 
 def _outline(env: WarehouseVectorEnv, points: int) -> F64:
