@@ -36,7 +36,10 @@ from restock.ingest.propose.propose import (
 from restock.ingest.propose.trial import Advice, Trial
 
 MOST_DRIVES = 12  # that are read
-MOST_CLOCKS = 4  # that are tried on all drives
+MOST_BASES = 4  # that are tried on all drives
+# Poses on a map are worth so many times the time that odometry serves: where some drives have no
+# map, most of the time would be lost for want of it.
+LOCALISED_WORTH = 1.25
 SAME_PACE = 1.5  # times the period: commands that are no further apart than this are of one pace
 
 
@@ -78,8 +81,9 @@ def propose_for_drives(
     ]
     seen = max(
         (pooled(base, drives) for base in _bases(drives)),
-        key=lambda one: sum(
-            t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives)
+        key=lambda one: (
+            sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives))
+            * (LOCALISED_WORTH if _on_map(one) else 1.0)
         ),
     )
     usual = _trials(seen, drives)
@@ -185,7 +189,7 @@ def _hold(drives: Sequence[CommandHold]) -> CommandHold:
 
 
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
-    """A drive of each clock that is proposed, the fullest first.
+    """A drive of each clock and source of poses that is proposed, the fullest first.
 
     Where one drive was told what to do far more often than another, a tick a command would be
     another time in each: then there is a tick every period, the middle one of the drives.
@@ -207,10 +211,14 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
             )
             for one in usable
         ]
-    clocks: dict[tuple[str, str], Evidence] = {}
+    bases: dict[tuple[str, str, bool], Evidence] = {}
     for one in usable:
-        clocks.setdefault((one.clock.alignment, one.clock.steps), one)
-    return list(clocks.values())[:MOST_CLOCKS]
+        bases.setdefault((one.clock.alignment, one.clock.steps, one.poses_from_frames), one)
+    return list(bases.values())[:MOST_BASES]
+
+
+def _on_map(one: Evidence) -> bool:
+    return one.poses_from_frames and one.frames is not None and one.frames.localised
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:

@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.driven_robot import FREE_M, PERIOD_S, Drive, columns, scans, write_bag
+from support.paths import ROOT
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import load_profile, parse_profile
+from restock.ingest.propose.drives import propose_for_drives
 from restock.ingest.propose.kinds import Lidar, RobotTraits, robot_kinds, robot_traits
+from restock.ingest.propose.propose import tried
 
 TWIST = "geometry_msgs/msg/Twist"
 WHEELS = "".join(
@@ -139,3 +142,23 @@ def test_what_a_recording_says_of_its_robot(tmp_path: Path):
     assert found.lidar is not None
     assert (found.lidar.beams, found.lidar.simulated) == (90, False)
     assert "described as trolley" in str(found)
+
+
+def test_where_one_drive_has_no_map_odometry_serves_all():
+    """Of two bags of a TurtleBot 4, one had rows; `restock start` stopped at the other."""
+    sample = ROOT / "sample_logs" / "amr_tuesday"
+    with open_recording(sample) as mapped, open_recording(sample) as without:
+        for recording in (mapped, without):
+            del recording.topics["/amcl_pose"]
+        of_maps = parse_profile(propose_for_drives([mapped, mapped], "amr").toml, where="p")
+        assert of_maps.frames is not None
+        assert of_maps.frames.fixed == "map"
+        del without.topics["/tf"]
+        proposal = propose_for_drives([mapped, without], "amr")
+        profile = parse_profile(proposal.toml, where="p")
+        assert profile.frames is None
+        assert profile.inputs.pose is not None
+        assert profile.inputs.pose.topic == "/odom"
+        rows = [tried(one, proposal.toml).transitions for one in (mapped, without)]
+        assert min(rows) > 600
+        assert sum(rows) == proposal.transitions
