@@ -334,7 +334,7 @@ def test_a_file_damaged_inside_is_found_when_it_is_decoded() -> None:
     with pytest.raises(ImageProblem, match="cannot be decoded"):
         pixels(bytes(data), layout)
     small = file_of(picture(1)[:8, :8], "PNG")
-    with pytest.raises(ImageProblem, match="another size"):
+    with pytest.raises(ImageProblem, match="its size differs"):
         pixels(small, layout)
 
 

@@ -86,5 +86,5 @@ def test_ranges_of_a_fixed_size_are_no_different() -> None:
 
 def test_an_angle_that_is_no_number_is_named() -> None:
     fields = scans([30], [-3.0], 4)
-    with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number a message"):
+    with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number per message"):
         REDUCE.apply({**fields, "angle_min": fields["ranges"]})

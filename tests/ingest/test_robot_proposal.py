@@ -186,7 +186,7 @@ def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     for content, message in (
         (robot().encode(), "has no wheels"),
-        (b"\xff\xfe<robot/>", "is no URDF"),
+        (b"\xff\xfe<robot/>", "is not a URDF"),
     ):
         path.write_bytes(content)
         with (

@@ -129,10 +129,10 @@ def test_the_clocks_of_dqn_are_the_configs() -> None:
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("network.dueling=true", "has no network"),
-        ("loss.munchausen=0.9", "has no loss.munchausen"),
-        ("guard.margin=0.1", "has no guard.margin"),
-        ("jump_start.env_steps=100", "has no jump_start.env_steps"),
+        ("network.dueling=true", "does not have network"),
+        ("loss.munchausen=0.9", "does not have loss.munchausen"),
+        ("guard.margin=0.1", "does not have guard.margin"),
+        ("jump_start.env_steps=100", "does not have jump_start.env_steps"),
     ],
 )
 def test_settings_without_a_counterpart_are_refused(setting: str, said: str) -> None:

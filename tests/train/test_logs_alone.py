@@ -75,5 +75,5 @@ def test_without_logs_there_is_nothing_to_learn_from(
     assert "there is no panel" in capsys.readouterr().err
     asked = flags("env.twin=false", "teacher.source=operator")
     assert main([*argv, "--panel", str(panel), *asked]) == 2
-    assert "is asked in the twin" in capsys.readouterr().err
+    assert "needs the twin" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

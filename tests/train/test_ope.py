@@ -63,7 +63,7 @@ def test_no_episode_is_both_fitted_on_and_evaluated_on(store: Path, panel: Panel
         rows = dataset.evaluation.rows
         seen = {tuple(row) for row in dataset.training.rows.observation[:, :3].tolist()}
         assert not seen & {tuple(row) for row in rows.observation[:, :3].tolist()}
-    assert "left aside" in load_ope_dataset(panel, TASK, str(store)).notes[0]
+    assert "left out" in load_ope_dataset(panel, TASK, str(store)).notes[0]
 
 
 def test_what_was_all_learnt_from_is_refused(store: Path, tmp_path: Path) -> None:

@@ -210,8 +210,8 @@ def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: st
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("practice={rule='shares', shares={fog=1}}", "'fog' is no kind"),
-        ("practice={rule='shares', shares={near_collision=1}}", "'near_collision' is no kind"),
+        ("practice={rule='shares', shares={fog=1}}", "'fog' is not a kind"),
+        ("practice={rule='shares', shares={near_collision=1}}", "'near_collision' is not a kind"),
         ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
         ("practice.rule='missions'", "env.missions a missions file"),
         ("practice={rule='success', floor=0.5}", "above 1"),

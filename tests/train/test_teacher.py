@@ -384,7 +384,7 @@ def test_logs_without_a_row_to_clone_are_refused(
     parts: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     settings = config(teacher={"source": "logs", "policies": ["teleop"]})
-    with pytest.raises(ConfigError, match=f"clones the rows of teleop, and {message}"):
+    with pytest.raises(ConfigError, match=f"clones the rows of teleop, but {message}"):
         session(tmp_path / "a", settings, **parts)
 
 

@@ -94,7 +94,7 @@ def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_pa
     longer = [*settings, "schedule.env_steps=9000"]
     said = describe_run(prepare_new(tmp_path / "a", few.path, None, longer))
     share = (len(few) * 4 - 30 * 32) / (8900 * 0.25 * 32)
-    assert f"{share:.1%} of each batch (of 50% that the mixture wants" in said
+    assert f"{share:.1%} of each batch (the mixture wants 50%" in said
     assert "a row may be drawn 4 times" in said
     said = describe_run(prepare_new(tmp_path / "a", panel, None, settings))
     assert "50% of each batch;" in said

@@ -63,6 +63,7 @@ def fit_response(
     drawn = (counts @ moments).reshape(-1, width, width)
     xx, xy, yy = drawn[:, :-1, :-1], drawn[:, :-1, -1], drawn[:, -1, -1]
     ridge = _RIDGE * np.trace(xx, axis1=1, axis2=2) / (width - 1)
+    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters without a change
     h = np.linalg.solve(xx + ridge[:, None, None] * np.eye(width - 1), xy[..., None])[..., 0]
     gain = h.sum(axis=1)
     safe = np.where(np.abs(gain) > 1e-9, gain, 1e-9)
