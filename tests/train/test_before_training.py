@@ -171,7 +171,7 @@ def test_rows_of_which_some_episodes_never_change_can_be_judged(
     logs: FedRows, twin: FedRows
 ) -> None:
     """Of a part of these rows, a bootstrap draw had no change at all: a singular matrix."""
-    for first in range(100, len(logs) - 200, 200):
+    for first in range(0, 1000, 100):
         part = np.arange(first, first + 200)
         assert diagnose_rows(logs.take(np.isin(np.arange(len(logs)), part)), twin).comparisons
 
