@@ -78,9 +78,8 @@ def profile_lines(
         lines += seen.motion.lines()
     if seen.signals:
         lines += [
-            "# Custom signals: columns of the table, for conditions and queries. To use one, "
-            "remove",
-            "# the first # of its lines; docs/profile.md describes paths.",
+            "# Custom signals: columns of the table, for conditions and queries. To use one,",
+            "# remove the first # of its lines; docs/profile.md describes paths.",
             "",
         ]
     for signal in seen.signals:
@@ -362,9 +361,8 @@ def _input_lines(
         *(
             [
                 "# The navigation stack's proposal, by its name. It is part of the observation,",
-                f"# beside the command that is driven ({seen.commands.topic}). Remove it if it "
-                "comes"
-                " after that command.",
+                f"# beside the command that is driven ({seen.commands.topic}). Remove it if it"
+                " comes after that command.",
             ]
             if role == "nav_command"
             else []

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from restock.arrays import F32, Bools
-from restock.replay.mixture.packed_row import row_columns
+from restock.replay.mixture.packed_row import SCALARS, row_columns
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import TeacherConfig
 from restock.train.feed.logs import Coded
@@ -40,15 +40,20 @@ def of_successes(
     return np.asarray((ended & ~helped)[episode.codes], np.bool_)
 
 
+def packed_successes(policy: Coded, episode: Coded, packed: F32, policies: Sequence[str]) -> Bools:
+    """`of_successes` of packed rows (n, W)."""
+    columns = row_columns((packed.shape[1] - len(SCALARS)) // 2)
+    reward, discount = (
+        np.asarray(packed[:, columns[name]]).ravel() for name in ("reward", "discount")
+    )
+    return of_successes(policy, episode, reward, discount, policies)
+
+
 def cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
     """The rows (n,) of a panel that are cloned before the first environment step."""
     policy = Coded.of(panel.meta["behaviour_policy"])
     rows = of_policies(policy, teacher.policies)
     if teacher.successes:
-        columns = row_columns(panel.header.observation_size)
-        reward, discount = (
-            np.asarray(panel.rows[:, columns[name]]).ravel() for name in ("reward", "discount")
-        )
         episode = Coded.of(panel.meta["episode_id"])
-        rows |= of_successes(policy, episode, reward, discount, teacher.policies)
+        rows |= packed_successes(policy, episode, panel.rows, teacher.policies)
     return rows

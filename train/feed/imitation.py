@@ -23,7 +23,7 @@ from restock.state import Stateful
 from restock.train.dqn.behaviour import UNKNOWN, Labelled, imitation_loss, plausible_actions
 from restock.train.dqn.config import TeacherConfig
 from restock.train.dqn.learner import Learner
-from restock.train.feed.cloned_rows import of_policies, of_successes
+from restock.train.feed.cloned_rows import of_policies, packed_successes
 from restock.train.feed.logs import Logs
 
 _MEASURED = 128  # rows a condition
@@ -60,7 +60,11 @@ class Imitation(Stateful):
         self._offline = self._online = _Drawn(np.empty(0, np.int64), np.empty(0))
         if logs is not None:
             by_teacher = of_policies(logs.behaviour_policy, config.policies)
-            every = by_teacher | _successes(logs, config) if config.successes else by_teacher
+            every = by_teacher
+            if config.successes:
+                every = by_teacher | packed_successes(
+                    *(logs.behaviour_policy, logs.episode, logs.rows.numpy(), config.policies)
+                )
             self._offline = _Drawn.of(logs, every)
             # A teacher who is asked says more of the agent's states than what others did.
             self._online = _Drawn.of(logs, by_teacher) if config.asks else self._offline
@@ -205,11 +209,6 @@ class _Drawn:
     def sample(self, count: int, rng: np.random.Generator) -> Ints:
         place = np.searchsorted(self.cumulative, rng.random(count), side="right")
         return self.rows[np.minimum(place, len(self.rows) - 1)]
-
-
-def _successes(logs: Logs, config: TeacherConfig) -> Bools:
-    reward, discount = logs.rows[:, -2].numpy(), logs.rows[:, -1].numpy()
-    return of_successes(logs.behaviour_policy, logs.episode, reward, discount, config.policies)
 
 
 __all__ = ["Imitation", "refuse_nothing_to_learn"]

@@ -184,8 +184,7 @@ class Operator(SoftPolicy, Stateful):
         kept, lattice = self._lattices.get(index, (-1, None))
         if kept == episode:
             return lattice
-        pallets = env.simulation.pallets[index]
-        pallets = pallets[pallets[:, 0] > 0]
+        pallets = _pallets(env, index)
         stuck = self._stuck_m[index : index + 1]
         places = np.concatenate([pallets[:, :2], stuck[np.isfinite(stuck[:, 0])]])
         motion = _motion(env) if len(places) else None
@@ -277,13 +276,13 @@ class Operator(SoftPolicy, Stateful):
         x, y, yaw = pose.tolist()
         goal_x, goal_y = env.navigation.goals_m[index].tolist()
         planner = env.navigation.planner_of(index)
-        pallets = env.simulation.pallets[index]
-        pallets = pallets[pallets[:, 0] > 0]
         lattice = self._lattice(env, index)
         if lattice is not None:
             way = lattice.plan(x, y, yaw)
         else:
-            way = planner.plan_around(x, y, (goal_x, goal_y), pallets, PALLET_HALF_M[:2])
+            way = planner.plan_around(
+                x, y, (goal_x, goal_y), _pallets(env, index), PALLET_HALF_M[:2]
+            )
         return planner.plan(x, y, (goal_x, goal_y)) if way is None else way
 
     def _simulate(
@@ -359,6 +358,12 @@ class Operator(SoftPolicy, Stateful):
         gap = np.abs(pose[:, None, :2] - patches[:, :, :2]) - patches[:, :, 2:4]
         distance = np.hypot(np.maximum(gap[..., 0], 0), np.maximum(gap[..., 1], 0))
         return np.asarray((distance < 0.9).any(axis=1), np.bool_)
+
+
+def _pallets(env: WarehouseVectorEnv, index: int) -> F64:
+    """Those (K, 3) on a robot's floor."""
+    pallets = env.simulation.pallets[index]
+    return np.asarray(pallets[pallets[:, 0] > 0])
 
 
 def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:

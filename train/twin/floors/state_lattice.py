@@ -313,10 +313,14 @@ def _filled(times: F64) -> F64:
 
 def floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
     """From points to the nearest rack or wall; negative inside."""
-    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    room = _wall_gap(floor, x, y)
     for rack in floor.racks:
         room = np.minimum(room, box_gap(x, y, rack.center, rack.half_size))
     return room
+
+
+def _wall_gap(floor: Warehouse, x: F64, y: F64) -> F64:
+    return np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
 
 
 def near_floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
@@ -324,13 +328,14 @@ def near_floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
 
     Racks farther from all points of a robot are left out: a floor made of scans has hundreds.
     """
-    room = np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
+    room = _wall_gap(floor, x, y)
     over = tuple(range(1, x.ndim))
     low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - NEAR_GAP_M  # (n, 2)
     high = np.stack([x.max(axis=over), y.max(axis=over)], axis=-1) + NEAR_GAP_M
-    for rack in floor.racks:
-        middle, half = np.array(rack.center), np.array(rack.half_size)
-        rows = np.flatnonzero(((low < middle + half) & (high > middle - half)).all(axis=1))
+    corners = np.array([rack.edges for rack in floor.racks]).reshape(-1, 4)
+    near = (low[:, None] < corners[:, 2:]) & (high[:, None] > corners[:, :2])  # (n, racks, 2)
+    for rack, beside in zip(floor.racks, np.asarray(near.all(axis=2)).T, strict=True):
+        rows = np.flatnonzero(beside)
         if len(rows):
             gap = box_gap(x[rows], y[rows], rack.center, rack.half_size)
             room[rows] = np.minimum(room[rows], gap)
