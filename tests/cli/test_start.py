@@ -16,7 +16,8 @@ from restock import cli
 from restock.cli.start import outcomes
 from restock.cli.start.decisions import no_room, robot_line
 from restock.cli.start.stage import Stage
-from restock.cli.start.start import StartCommand, _way
+from restock.cli.start.start import StartCommand
+from restock.cli.start.way import Way
 from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
 
@@ -151,7 +152,7 @@ def test_a_failed_evaluation_does_not_end_well(tmp_path: Path, fails: str) -> No
             return ended
 
     work = Failing(tmp_path / "out", Verbs(), SILENT, plan=True)
-    stopped = _way(StartCommand(("bags",), tmp_path / "out"), work)
+    stopped = Way(StartCommand(("bags",), tmp_path / "out"), work).go()
     assert work.ended[-1].name == "report"
     assert stopped is not None
     assert "restock eval" in stopped.why

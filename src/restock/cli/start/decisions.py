@@ -11,6 +11,7 @@ from restock.cli.start.outcomes import of_nominal
 from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import FOLDER, Ended
+from restock.errors import ConfigError
 from restock.files import read_json
 
 STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is made for
@@ -113,6 +114,43 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
     return f"in nominal driving it is {verdict['verdict']}: {'; '.join(verdict['reasons'])}"
 
 
+def fit_is_worse(gap: Document) -> str | None:
+    """Why the fitted twin is farther from the logs than the twin as described; None: it is not.
+
+    By the position gap of nominal driving, of the same segments: both its median and its 90th
+    percentile.
+    """
+    ends = {
+        row["source"]: row
+        for row in gap.get("paths", ())
+        if row["condition"] == "nominal" and row["quantity"] == "position"
+    }
+    described, fitted = ends.get("nominal"), ends.get("calibrated")
+    if described is None or fitted is None:
+        return None
+    if fitted["median"] <= described["median"] or fitted["p90"] < described["p90"]:
+        return None
+    return (
+        f"with it the twin ends {fitted['median']:.3f} m from the log in nominal driving (median),"
+        f" without it {described['median']:.3f} m"
+    )
+
+
+def no_ways(to: Settings, floor: Document) -> str | None:
+    """Why none of the routes that the panel holds out can be driven; None where one can."""
+    from restock.replay.panel.panel import Panel
+    from restock.train.evaluation.logged_ways import logged_missions
+    from restock.train.twin.floors.floors import open_floors
+
+    try:
+        logged_missions(Panel.open(to.panel), open_floors(str(to.floor))[0], ("nominal",))
+    except ConfigError as error:
+        own = f" (the floor has its frame, {floor['frame']}, from one recording)"
+        several = any("recordings in the store" in note for note in floor.get("notes", ()))
+        return error.what + own * several
+    return None
+
+
 def floor_settings(to: Settings, document: Document) -> list[str]:
     """Train on that floor, on the kinds of episode that it has room for."""
     from restock.toml import toml_value
@@ -190,6 +228,7 @@ def robot_line(profile: Path | str | None) -> str:
 
 __all__ = [
     "edited",
+    "fit_is_worse",
     "floor_settings",
     "fullest",
     "has_goal",
@@ -197,6 +236,7 @@ __all__ = [
     "logs_alone_settings",
     "mistrust",
     "no_room",
+    "no_ways",
     "of_other_kinds",
     "practice_settings",
     "robot_line",

@@ -1,0 +1,257 @@
+"""The way of `restock start`: which stage follows which, and where a person must decide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from restock.cli.start import stages
+from restock.cli.start.decisions import (
+    edited,
+    fit_is_worse,
+    floor_settings,
+    fullest,
+    has_goal,
+    horizon,
+    logs_alone_settings,
+    mistrust,
+    no_room,
+    no_ways,
+    of_other_kinds,
+    practice_settings,
+    robot_line,
+    several_kinds,
+    updates_settings,
+)
+from restock.cli.start.settings import Settings
+from restock.cli.start.stage import Document, Stop
+from restock.cli.start.work import Ended, Work, escape
+
+if TYPE_CHECKING:
+    from restock.cli.start.start import StartCommand
+
+HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
+ODOMETRY = "--odometry-as-command"
+SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
+
+
+class Stopped(Exception):
+    """The way ends here: a person must decide."""
+
+    def __init__(self, why: str, *remedies: str) -> None:
+        super().__init__(why)
+        self.stop = Stop(why, remedies)
+
+
+class Way:
+    """From recordings to a report, one stage after the other.
+
+    `to` is what the stages share; it changes as the way goes on.
+    """
+
+    def __init__(self, asked: StartCommand, work: Work) -> None:
+        self.asked, self.work = asked, work
+        self.again = f"then run the same command again: finished stages are kept in {asked.out}"
+        self.to = Settings(
+            logs=asked.paths,
+            out=asked.out,
+            profile=asked.profile or asked.out / "profile.toml",
+            seconds=30.0 * asked.minutes,
+            episodes=max(round(4 * asked.minutes), 1),
+            device=asked.device,
+            mixture=asked.mixture,
+            typestore=asked.typestore,
+            definitions=asked.definitions,
+            salvage=asked.salvage,
+            tags=asked.tag,
+            map=asked.map,
+        )
+
+    def go(self) -> Stop | None:
+        """The whole way; where a person must decide, why and what to do."""
+        try:
+            readable = self._recordings()
+            self._profile(readable)
+            coverage, panel = self._panel()
+            twin = self._twin()
+            self._policy(twin, coverage, panel)
+            self._judge(twin, panel)
+        except Stopped as stopped:
+            return stopped.stop
+        return None
+
+    def _warn(self, text: str) -> None:
+        self.work.say(f"   [yellow]{escape(text)}[/]")
+
+    def _recordings(self) -> list[Document]:
+        """What can be read, a document of `restock info` each."""
+        found = self.work.do(stages.info(self.to))
+        readable = list(found.document.get("recordings", ()))
+        if not (found.good or readable):
+            known = "give a file, a bag's folder, or a folder of bags"
+            if any("cannot be read" in why for why in found.errors):
+                known = "see the message for each above, or give other recordings"
+            damaged = any("--salvage" in why for why in found.errors)
+            raise Stopped("no recording can be read", SALVAGING if damaged else known)
+        if not found.good:
+            self.work.say(f"   continuing with the {len(readable)} that can be read; or {SALVAGING}")
+        return readable
+
+    def _profile(self, readable: list[Document]) -> None:
+        """The user's profile, or one that is proposed; and what it makes of a recording."""
+        asked, to = self.asked, self.to
+        recording = fullest({"recordings": readable}) or asked.paths[0]
+        own = asked.profile is not None
+        if not own and not edited(to.profile, asked.out):
+            self._propose(asked.paths if len(readable) > 1 else (recording,))
+        elif asked.urdf is not None or asked.footprint is not None:
+            self._warn(
+                f"{to.profile} was edited: --urdf and --footprint apply only to a proposed "
+                "profile, and have no effect"
+            )
+        if others := [] if own or self.work.plan else of_other_kinds(asked.out):
+            mine = [row for row in readable if row["path"] not in others]
+            self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
+            recording = fullest({"recordings": mine}) or recording
+        checked = self.work.do(stages.check(to, recording))
+        if not checked.good:
+            known = "; if it is of another robot, give only the recordings of this one"
+            raise Stopped(
+                f"the profile does not fit {recording}",
+                f"edit {to.profile}{known if len(readable) > 1 else ''}",
+                self.again,
+            )
+        if not self.work.plan:
+            self.work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
+
+    def _propose(self, sources: tuple[str, ...]) -> None:
+        asked, to = self.asked, self.to
+        flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
+        flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
+        flags += [ODOMETRY] * asked.odometry_as_command
+        proposed = self.work.do(stages.propose(to, sources, flags, asked.urdf))
+        if not proposed.good:
+            raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
+        document = proposed.document
+        if not document.get("wheeled", True):
+            Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
+            raise Stopped("; ".join(document["problems"]), "give recordings of a robot on wheels")
+        if problems := document.get("problems"):
+            told = f"edit {to.profile}: its first lines list what is missing"
+            if document.get("missing"):
+                told = (
+                    "give recordings that contain it; or, if a topic in these recordings does, "
+                    f"edit {to.profile}, whose first lines list the topics"
+                )
+            if any(ODOMETRY in problem for problem in problems):
+                told = f"add {ODOMETRY} to this command, or {told}"
+            raise Stopped("; ".join(problems), told, self.again)
+        if asked.accept:
+            return
+        if kinds := document.get("kinds"):
+            stop = several_kinds(kinds, asked.out)
+            raise Stopped(stop.why, *stop.remedies)
+        if driving := document.get("commands", []):
+            raise Stopped(
+                f"several topics may be the command that drives the robot: {', '.join(driving)}; "
+                "the profile uses the first",
+                f"edit `topic` of [inputs.command] in {to.profile}, and run the same command again",
+                "or add --accept to it, if the first one is right",
+            )
+
+    def _panel(self) -> tuple[Document, Document]:
+        """Rows, what they cover, and what is drawn of them: coverage and panel."""
+        to, do = self.to, self.work.do
+        if not do(stages.ingest(to)).good:
+            raise Stopped("nothing could be ingested", f"edit {to.profile}", self.again)
+        covered = do(stages.coverage(to))
+        do(stages.audit(to))
+        mixed = do(stages.mix(to))
+        if not mixed.good:
+            raise Stopped(
+                "the mixture does not fit these logs",
+                "write one that fits (docs/mixture.md), and add --mixture FILE to the command",
+                self.again,
+            )
+        return covered.document, mixed.document
+
+    def _twin(self) -> Ended | None:
+        """The floor, where a policy can be trained in the twin; None: on the logs alone."""
+        asked, to = self.asked, self.to
+        if asked.twin == "no":
+            return None
+        floor = self.work.do(stages.floor(to))
+        if not floor.good and to.map is not None:
+            sized = "measure the robot, and add --footprint LxW to this command"
+            raise Stopped(
+                f"{to.map} cannot be the floor of these recordings",
+                *([sized] if any("--footprint" in why for why in floor.errors) else ()),
+                "give the map.yaml in which the robot was localised, or leave out --map: the "
+                "floor is then made from the recordings",
+                self.again,
+            )
+        settings = practice_settings(to.profile)
+        if floor.good:
+            settings += floor_settings(to, floor.document)
+        gap, fitted = self._fit()
+        if fitted:
+            settings.append(f"env.perturbation={to.fitted}")
+        why, remedy = no_room(floor), ""
+        if why is None and asked.twin != "yes" and not self.work.plan:
+            why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
+        if why is not None:
+            self._warn(f"no training in the twin{remedy}: {why}")
+            return None
+        self.to = replace(to, train=tuple(settings))
+        return floor
+
+    def _fit(self) -> tuple[Ended, bool]:
+        """The gap of the twin that is used, and whether that is the fitted one."""
+        horizon_s = horizon(self.to.profile)
+        fitted = self.work.do(stages.fit(self.to, horizon_s))
+        gap = self.work.do(stages.gap(self.to, horizon_s, fitted=fitted.good))
+        if not (fitted.good and gap.good) or (why := fit_is_worse(gap.document)) is None:
+            return gap, fitted.good
+        self._warn(f"the fit is not used: {why}")
+        return self.work.do(stages.gap(self.to, horizon_s, fitted=False)), False
+
+    def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
+        asked, twin = self.asked, floor is not None
+        settings = [*self.to.train] if twin else logs_alone_settings(coverage)
+        settings += updates_settings(panel, asked.minutes, twin=twin, seconds=self.to.seconds)
+        self.to = replace(self.to, train=tuple(settings))
+        trained = self.work.do(stages.train(self.to, twin=twin))
+        if not trained.good:
+            raise Stopped("training did not finish", *trained.errors[:2], self.again)
+
+    def _judge(self, floor: Ended | None, panel: Document) -> None:
+        """In the twin, on the logs that were held out, and on one page."""
+        to, do, judged = self.to, self.work.do, []
+        if floor is not None:
+            goal = has_goal(to.profile)
+            if goal and floor.good:
+                why = None if self.work.plan else no_ways(to, floor.document)
+                if why is None:
+                    judged.append(do(stages.evaluate_on_ways(to)))
+                else:
+                    self._warn(f"no evaluation on the routes of the logs: {why}")
+            judged.append(do(stages.evaluate(to, goal=goal)))
+        if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
+            judged.append(do(stages.judge(to)))
+        else:
+            self._warn(
+                "these logs are too short to hold any of them out, so the policy cannot be judged "
+                "by logs: ingest more recordings"
+            )
+        if not do(stages.report(to)).good:
+            raise Stopped("there is no report", self.again)
+        if failed := [ended for ended in judged if not ended.good]:
+            why_failed = [one for ended in failed for one in ended.errors[:1]]
+            names = " and ".join(f"`{ended.command}`" for ended in failed)
+            raise Stopped(
+                f"the report lacks the stages that failed: {names}", *why_failed, self.again
+            )
+
+
+__all__ = ["Way"]
