@@ -50,6 +50,7 @@ def propose_for_drives(
     footprint: Footprint | None = None,
     urdf: Path | None = None,
     odometry_as_command: bool = False,
+    hindsight_goals: bool = False,
 ) -> Proposal:
     """One profile for all of these recordings, as `propose_profile` makes it for one.
 
@@ -57,7 +58,7 @@ def propose_for_drives(
         recordings: drives of one kind of robot; of several kinds those of the first are taken that
             has most drives with a command.
         name: of the profile.
-        footprint, urdf, odometry_as_command: as of `propose_profile`.
+        footprint, urdf, odometry_as_command, hindsight_goals: as of `propose_profile`.
 
     Raises:
         ConfigError: the URDF cannot be used; says why.
@@ -71,12 +72,17 @@ def propose_for_drives(
             footprint=footprint,
             urdf=urdf,
             odometry_as_command=odometry_as_command,
+            hindsight_goals=hindsight_goals,
         )
     traits = [robot_traits(recording) for recording in recordings]
     kinds = robot_kinds(traits)
     kind = max(kinds, key=lambda members: sum(bool(traits[one].command) for one in members))
     drives = [
-        gather(recordings[one], footprint, urdf, odometry_as_command=odometry_as_command)
+        gather(
+            *(recordings[one], footprint, urdf),
+            odometry_as_command=odometry_as_command,
+            hindsight_goals=hindsight_goals,
+        )
         for one in kind
     ]
     seen = max(

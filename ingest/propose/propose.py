@@ -73,6 +73,7 @@ def propose_profile(
     footprint: Footprint | None = None,
     urdf: Path | None = None,
     odometry_as_command: bool = False,
+    hindsight_goals: bool = False,
 ) -> Proposal:
     """A profile for recordings like this one.
 
@@ -82,13 +83,18 @@ def propose_profile(
         footprint: the robot's outline, where it is known; else what the recording says of it.
         urdf: a file that describes the robot, in place of the recording's own description.
         odometry_as_command: take the measured motion for commands where none was recorded.
+        hindsight_goals: take goals in hindsight even where most of the drive has none: its rows
+            are then left out.
 
     Raises:
         ConfigError: the URDF cannot be used; says why.
     """
-    return propose_from(
-        gather(recording, footprint, urdf, odometry_as_command=odometry_as_command), name
+    seen = gather(
+        *(recording, footprint, urdf),
+        odometry_as_command=odometry_as_command,
+        hindsight_goals=hindsight_goals,
     )
+    return propose_from(seen, name)
 
 
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:

@@ -44,10 +44,20 @@ class Turntable(Unguided):
         return 1.0 + 0.0 * time_s
 
 
-def proposed(drive: Drive, folder: Path, capsys) -> tuple[Path, Path, dict]:
+class Waiting(Unguided):
+    """It stands for a minute, and then drives 6 m."""
+
+    def x_at(self, time_s):
+        return 1.0 + 0.5 * np.maximum(time_s - 60.0, 0.0)
+
+
+def proposed(drive: Drive, folder: Path, capsys, *flags: str) -> tuple[Path, Path, dict]:
     """A bag of the drive, the profile that is proposed for it, and what the proposal said."""
-    bag, file = write_bag(drive, folder / "bag"), folder / "robot.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file), "--json"]) == 0
+    bag, file = folder / "bag", folder / "robot.toml"
+    if not bag.exists():
+        write_bag(drive, bag)
+    file.unlink(missing_ok=True)
+    assert main(["profile", "new", str(bag), "--out", str(file), "--json", *flags]) == 0
     return bag, file, json.loads(capsys.readouterr().out)
 
 
@@ -128,6 +138,26 @@ def test_a_robot_that_gets_nowhere_has_no_goal_and_the_proposal_says_so(tmp_path
     _, file, said = proposed(Turntable(20.0), tmp_path, capsys)
     assert load_profile(file).task.goal == "none"
     assert "in hindsight" in said["toml"]
+    assert said["transitions"] > 90
+
+
+def test_a_robot_that_mostly_stood_has_goals_where_they_are_asked_for(tmp_path, capsys) -> None:
+    _, file, said = proposed(Waiting(72.0), tmp_path, capsys)
+    assert load_profile(file).task.goal == "none"
+    assert said["transitions"] > 340
+    bag, file, said = proposed(Waiting(72.0), tmp_path, capsys, "--hindsight-goals")
+    assert load_profile(file).goal_source == "hindsight"
+    assert 100 <= said["transitions"] < 120  # the drive, and ten seconds before it
+    assert any("standing still" in line for line in said["toml"].splitlines())
+    with ingested(bag, file, tmp_path / "store", capsys) as store:
+        assert store.sql("SELECT DISTINCT goal_source FROM transitions").fetchall() == [
+            ("hindsight",)
+        ]
+
+
+def test_where_it_got_nowhere_no_goal_can_be_asked_for(tmp_path, capsys) -> None:
+    _, file, said = proposed(Turntable(20.0), tmp_path, capsys, "--hindsight-goals")
+    assert load_profile(file).task.goal == "none"
     assert said["transitions"] > 90
 
 

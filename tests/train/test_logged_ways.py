@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,14 @@ from support.stores import recording_transitions, write_store
 
 from restock.arrays import F64
 from restock.cli import main
+from restock.cli.start.decisions import no_ways
+from restock.cli.start.settings import Settings
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.train.evaluation.evaluation_plan import plan_evaluation
 from restock.train.evaluation.logged_ways import AGREE_M, goal_of, logged_missions
 from restock.train.run.kept_evaluations import read_evaluations
+from restock.train.twin.floors.floor_file import write_floor
 from restock.train.twin.floors.floors import open_floors
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.4\n"
@@ -100,6 +104,20 @@ def test_held_out_ways_are_missions_and_what_the_floor_lacks_is_counted(panel: P
     held_out = logged_missions(panel, FLOOR, ("nominal",))
     assert "that the panel holds out" in held_out.text
     assert 0 < held_out.logged < 24
+
+
+def test_start_says_why_no_route_of_the_logs_can_be_driven(panel: Panel) -> None:
+    to = Settings((), panel.path.parent)
+    write_floor(FLOOR, to.floor)
+    assert no_ways(to, {"frame": "map"}) is None
+    to.floor.unlink()
+    write_floor(replace(FLOOR, map_origin=(900.0, 0.0, 0.0)), to.floor)
+    note = "by monday.mcap, of 2 recordings in the store"
+    why = no_ways(to, {"frame": "odom", "notes": [note]})
+    to.floor.unlink()
+    assert why is not None
+    assert "0 of " in why
+    assert why.endswith("(the floor has its frame, odom, from one recording)")
 
 
 def test_eval_drives_the_ways_of_the_logs(

@@ -97,6 +97,7 @@ def gather(
     urdf: Path | None = None,
     *,
     odometry_as_command: bool,
+    hindsight_goals: bool = False,
 ) -> Evidence:
     """What a recording says of its robot."""
     topics = usable_topics(recording)
@@ -174,7 +175,7 @@ def gather(
         footprint,
         notes,
         outline,
-        GoalChoice.of(logged=bool(roles["goal"])),
+        GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
         candidates(
             recording,
             without={topic.name for role, topic, _ in best if role in SPENT},

@@ -9,6 +9,7 @@ from restock.ingest.profile.inputs import HINDSIGHT
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
+FEWEST_ROWS = 100  # with a goal in hindsight, where these are wanted and the rest is left out
 
 
 @dataclass(frozen=True)
@@ -17,16 +18,19 @@ class GoalChoice:
 
     source: GoalSource | None
     why: str = ""  # there is none
+    hindsight_wanted: bool = False  # also where most of the drive has none
 
     @classmethod
-    def of(cls, *, logged: bool) -> GoalChoice:
+    def of(cls, *, logged: bool, hindsight_wanted: bool = False) -> GoalChoice:
         """Where goals and plans were not recorded, they come in hindsight."""
-        return cls("logged" if logged else "hindsight")
+        return cls("logged" if logged else "hindsight", hindsight_wanted=hindsight_wanted)
 
     def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
-        """The choice after a trial: no goal where hindsight finds none for most of the drive."""
+        """The choice after a trial: no goal where hindsight finds none for most of the drive, or,
+        where it is wanted, for all but a few rows."""
         without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
-        if self.source != "hindsight" or without <= transitions:
+        enough = self.hindsight_wanted and transitions >= FEWEST_ROWS
+        if self.source != "hindsight" or without <= transitions or enough:
             return self
         return GoalChoice(
             None, f"in hindsight, {without:,} ticks have no goal and {transitions:,} have one"

@@ -56,6 +56,9 @@ class ProfileCommand:
     odometry_as_command: bool = False
     """For `new`: use odometry as the command if no command was recorded: the measured motion then
     stands for the commanded motion."""
+    hindsight_goals: bool = False
+    """For `new`: take goals in hindsight even if most of the drive has none, as when the robot
+    mostly stood. Rows without a goal are then left out. See docs/goals.md."""
     out: Path | None = None
     """Where `new` writes the profile. An existing file is not overwritten."""
     typestore: str | None = None
@@ -110,6 +113,7 @@ class ProfileCommand:
                     footprint=footprint,
                     urdf=self.urdf,
                     odometry_as_command=self.odometry_as_command,
+                    hindsight_goals=self.hindsight_goals,
                 )
         if left_out:
             output.say(

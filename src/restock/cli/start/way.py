@@ -130,6 +130,7 @@ class Way:
         flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
         flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
         flags += [ODOMETRY] * asked.odometry_as_command
+        flags += ["--hindsight-goals"]  # without a goal there is no success to train for
         proposed = self.work.do(stages.propose(to, sources, flags, asked.urdf))
         if not proposed.good:
             raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
@@ -240,9 +241,9 @@ class Way:
         if self.work.plan or any(HELD_OUT in why for why in panel["left_out"]):
             judged.append(do(stages.judge(to)))
         else:
-            self._warn(
-                "these logs are too short to hold any of them out, so the policy cannot be judged "
-                "by logs: ingest more recordings"
+            self.work.say(
+                "\n[yellow]These logs are too short to hold any of them out, so the policy cannot be "
+                "evaluated. Ingest more recordings.[/]"
             )
         if not do(stages.report(to)).good:
             raise Stopped("there is no report", self.again)
