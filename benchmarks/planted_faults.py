@@ -5,10 +5,10 @@
 Three faults of the buffer, all in the blocked aisles, which the twin's training episodes then lack:
 their logged rows are removed; stale (next observations and rewards of other rows of the stratum);
 or mislabelled (the label stands on nominal rows). Two of the logs' actions: one (backing up) that
-they lack, or that is rare (a fiftieth is left) in the blocked aisles. Four of the target and the
-optimizer: frozen, too slow, no target at all (tau 1), learning rate a thousand times too high. Runs
-are kept in --out and taken up where they are, so that a table can be made again without training
-again.
+they lack, or that is rare (a fiftieth is left) in the blocked aisles; the twin's training episodes
+lack these then, too, as they would supply the action. Four of the target and the optimizer: frozen,
+too slow, no target at all (tau 1), learning rate a thousand times too high. Runs are kept in --out
+and taken up where they are, so that a table can be made again without training again.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ FAULTS: dict[str, tuple[set[str], list[str]]] = {
     "stratum removed": (BUFFER, [LACKING]),
     "stratum stale": (BUFFER, [LACKING]),
     "stratum mislabelled": (BUFFER, [LACKING]),
-    "action missing": (ACTIONS, []),
-    "action rare": (ACTIONS, []),
+    "action missing": (ACTIONS, [LACKING]),
+    "action rare": (ACTIONS, [LACKING]),
     "target frozen": (TARGET, ["target={rule='hard', every=1000000}"]),
     "target too slow": (TARGET, ["target={rule='polyak', tau=0.00003}"]),
     "target too fast": (TARGET, ["target={rule='polyak', tau=1.0}"]),

@@ -34,3 +34,16 @@ def adam(
 ) -> None: ...
 def gather(rows: Any, index: Any, out: Any, /) -> None: ...
 def find_places(priority: Any, sums: Any, ends: Any, at: Any, out: Any, /) -> None: ...
+def ranges(
+    origin: Any,
+    heading: Any,
+    direction: Any,
+    bearing: Any,
+    order: Any,
+    floor: Any,
+    first: Any,
+    standing: Any,
+    moving: Any,
+    out: Any,
+    /,
+) -> None: ...

@@ -1,8 +1,8 @@
 """Whether this installation has what `restock/compiled/` is, and whether it is used.
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
-network, the gather of a batch and draws by priority. Without it PyTorch and NumPy do the same, an
-update to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
+network, the gather of a batch, draws by priority and the twin's lidar. Without it PyTorch, NumPy
+and MuJoCo do the same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ else:
 
 
 def is_used() -> bool:
-    """Whether compiled code updates plain networks on the CPU, and draws batches there."""
+    """Whether compiled code updates plain networks on the CPU, draws batches and ranges there."""
     return IS_THERE and os.environ.get(SWITCH, "1") != "0"
 
 

@@ -40,6 +40,7 @@ def make_run(
     until: int | None = None,  # the window in which the symptoms end
     actions: Mapping[str, tuple[float, float]] | None = None,  # of `turn`: wanted, of the logs
     logged: int = 400,  # different rows of each condition in the logs
+    supplied: float = 0.0,  # of the fresh rows of these conditions, those with `turn`
     held_out: Mapping[str, int] | None = None,  # rows of a condition in each evaluation
 ) -> Run:
     """A run whose evaluations show these figures, as training writes them."""
@@ -70,7 +71,8 @@ def make_run(
                     }
                 ],
             )
-            run.append("actions", action_rows(clocks, name, (actions or {}).get(name), logged))
+            turn = (actions or {}).get(name)
+            run.append("actions", action_rows(clocks, name, turn, logged, supplied))
             if share:
                 run.append(
                     "conditions",
@@ -120,13 +122,20 @@ def make_run(
 
 
 def action_rows(
-    clocks: Mapping[str, int], condition: str, turn: tuple[float, float] | None, logged: int
+    clocks: Mapping[str, int],
+    condition: str,
+    turn: tuple[float, float] | None,
+    logged: int,
+    supplied: float,
 ) -> list[dict[str, Any]]:
-    """Of two actions in a condition: `turn` is taken in some of the fresh rows, and of the logs."""
+    """Of two actions in a condition: `turn` is wanted in some of the fresh rows, and is in some of
+    the logs' and of the fresh ones."""
     wanted, share = turn or (0.4, 0.4)
+    fresh = 0.4 if turn is None else supplied
     rows = []
     for source, drawn, greedy in (("logs", 5 * logged, 60), ("fresh", 2000, 100)):
-        for action, (has, wants) in enumerate(((1 - share, 1 - wanted), (share, wanted))):
+        there = share if source == "logs" else fresh
+        for action, (has, wants) in enumerate(((1 - there, 1 - wanted), (there, wanted))):
             rows.append(
                 {
                     **clocks,
@@ -136,7 +145,7 @@ def action_rows(
                     "condition": condition,
                     "action": action,
                     "name": ("stop", "turn")[action],
-                    "drawn_rows": round(drawn * (has if source == "logs" else wants)),
+                    "drawn_rows": round(drawn * has),
                     "drawn_share": None,
                     "unique_rows": round(logged * has),
                     "audited_rows": greedy,
@@ -182,6 +191,9 @@ def action_rows(
         ({"actions": {"recovery": (0.3, 0.01)}}, "ACTION_COVERAGE"),
         ({"actions": {"recovery": (0.3, 0.05)}}, "HEALTHY"),  # rare, and there
         ({"actions": {"recovery": (0.1, 0.0)}}, "HEALTHY"),  # not there, and hardly wanted
+        # The critic sees in fresh rows what it leads to.
+        ({"actions": {"recovery": (0.3, 0.0)}, "supplied": 0.1}, "HEALTHY"),
+        ({"actions": {"recovery": (0.3, 0.0)}, "supplied": 0.01}, "ACTION_COVERAGE"),
         # Nobody knows of so few rows what they lack.
         ({"actions": {"recovery": (0.3, 0.0)}, "logged": 40}, "HEALTHY"),
         ({"actions": {"recovery": (0.3, 0.0)}, "gap": {"blocked_aisle": 6.0}}, "BUFFER"),
@@ -206,10 +218,18 @@ def test_the_evidence_names_the_action(tmp_path: Path) -> None:
     found = diagnose([run])
     (line,) = [line for line in found.evidence if "turn" in line]
     assert line.startswith("recovery: the policy takes 'turn' in 30% of the rows looked at")
-    assert "in 1.0%: 4 of 400 different rows, fresh rows in 30%" in line
+    assert "in 1.0%: 4 of 400 different rows, fresh rows in 0%" in line
     assert "'turn' in recovery" in found.experiment
     with pytest.raises(RunError, match="no setting can add the rows that the logs lack"):
         confirm(run, found, tmp_path / "c")
+
+
+def test_an_action_that_only_fresh_rows_have_is_told_of_a_healthy_run(tmp_path: Path) -> None:
+    found = diagnose([make_run(tmp_path / "r", actions={"recovery": (0.3, 0.0)}, supplied=0.2)])
+    assert found.cause == "HEALTHY"
+    (line,) = [line for line in found.evidence if "turn" in line]
+    assert "fresh rows in 20%" in line
+    assert line.endswith("a policy from these logs alone never learns what it leads to")
 
 
 def test_without_fresh_rows_the_logged_ones_say_what_is_wanted(tmp_path: Path) -> None:

@@ -1,9 +1,9 @@
 """Actions that the policy wants and the logs lack: by condition, from the run's table `actions`.
 
-A condition can be in every batch, and an action in none of its rows: then nothing that was logged
-says what the action leads to there, and the critic's value of it is a guess until the policy has
-tried it itself. Driving supplies such an action in time; what it costs until then, and what logs
-should be recorded, this says.
+A condition can be in every batch, and an action in none of its logged rows: then nothing that was
+logged says what the action leads to there, and the critic's value of it is a guess until the policy
+has tried it itself. Where fresh rows have it, driving supplies it; a policy from the logs alone has
+no such help, so which logs should be recorded is said all the same.
 """
 
 from __future__ import annotations

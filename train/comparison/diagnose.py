@@ -14,8 +14,8 @@ A network that generalises, or memorises few rows, hides what is wrong with its 
 all of these. So three figures look at the rows, not at the critic
 (`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
 how many of its logged rows look like it; and whether their next observations follow from them.
-And a condition may be well supplied, and an action of it not (`action_coverage`): the logs do not
-say what it leads to, and the policy wants it.
+And a condition may be well supplied, and an action of it not (`action_coverage`): neither logs nor
+fresh rows say what it leads to, and the policy wants it.
 
 Each figure is its median over the last evaluations. The limits are from faults planted in the twin
 (benchmarks/planted_faults.py; the table is in docs/diagnose.md).
@@ -43,6 +43,7 @@ WINDOWS = 3  # the last, that figures are the median of
 _LEAST_ROWS = 20  # held out, for a condition to be diagnosed
 _LEAST_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
 _LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
+ALONE = "a policy from these logs alone never learns what it leads to"
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class DiagnosisLimits:
     unexplained_relative: float = 1.6  # and over that of the condition with the least
     quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
     wanted: float = 0.18  # of a condition's fresh rows, those where the policy takes an action …
-    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it
+    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it …
+    fresh: float = 0.02  # … and of its fresh rows drawn: nor does driving supply it
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class Window:
             )
         return reasons
 
-    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+    def unlogged(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
         """Actions that the policy wants in a condition, and whose logged rows hardly have them."""
         return [
             symptom
@@ -163,6 +165,11 @@ class Window:
             and symptom.wanted_low >= limits.wanted
             and symptom.logs_share <= limits.logged
         ]
+
+    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+        """Of these, the ones that fresh rows do not supply either."""
+        unlogged = self.unlogged(limits)
+        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= limits.fresh]
 
     def target(self, limits: DiagnosisLimits) -> bool:
         """Whether the target is in doubt."""
@@ -351,7 +358,11 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     ]
     for condition, reasons in window.bad(limits).items():
         lines += [f"{condition}: {reason}" for reason in reasons]
-    return lines + [f"{lack.condition}: {lack.reason}" for lack in window.lacking(limits)]
+    lacking = window.lacking(limits)
+    for symptom in window.unlogged(limits):
+        alone = "" if symptom in lacking else f"; {ALONE}"
+        lines.append(f"{symptom.condition}: {symptom.reason}{alone}")
+    return lines
 
 
 def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits) -> str:

@@ -1,15 +1,18 @@
-/* `restock._native`: an update of a plain Q network and the drawing of its batches, compiled.
+/* `restock._native`: an update of a plain Q network, the drawing of its batches, and the twin's lidar,
+ * compiled.
  *
- * What `restock.train.dqn` does with PyTorch's operations and `restock.replay.sampling` with NumPy's,
- * in fewer calls and fewer passes over memory. Python's side is `restock/native.py`,
- * `train/dqn/native_backprop.py`, `replay/sampling/gather.py` and `priorities.py`. Compiled with
+ * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` with NumPy's and
+ * `restock.train.twin` with MuJoCo's rays, in fewer calls and fewer passes over memory. Python's side is
+ * `restock/native.py`, `train/dqn/native_backprop.py`, `replay/sampling/gather.py` and `priorities.py`,
+ * `train/twin/physics/lidar.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
- * importing it fails, and PyTorch does the work. Stable ABI: one build serves Python 3.11 and later.
+ * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.
  */
 #include "buffers.h"
 #include "learning.h"
 #include "network.h"
+#include "ranging.h"
 #include "sampling.h"
 
 static PyMethodDef module_methods[] = {
@@ -17,6 +20,7 @@ static PyMethodDef module_methods[] = {
     {"adam", adam, METH_VARARGS, adam_doc},
     {"gather", gather, METH_VARARGS, gather_doc},
     {"find_places", find_places, METH_VARARGS, find_places_doc},
+    {"ranges", ranges, METH_VARARGS, ranges_doc},
     {NULL, NULL, 0, NULL},
 };
 

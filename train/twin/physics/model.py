@@ -27,6 +27,7 @@ PALLETS = 2
 PALLET_HALF_M = (0.60, 0.40, 0.30)  # long side along the aisle
 PEOPLE = 2
 PERSON_RADIUS_M = 0.25
+PERSON_HALF_HEIGHT_M = 0.85
 FORKLIFTS = 1
 FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
 PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
@@ -148,7 +149,7 @@ def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
 
 def _add_mocap(spec: Any) -> None:
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
-    person = (PERSON_RADIUS_M, 0.85, 0.0)
+    person = (PERSON_RADIUS_M, PERSON_HALF_HEIGHT_M, 0.0)
     for kind, count, shape, size, rgba in (
         ("pallet", PALLETS, box, PALLET_HALF_M, [0.70, 0.52, 0.32, 1]),
         ("person", PEOPLE, cylinder, person, [0.20, 0.45, 0.80, 1]),

@@ -46,17 +46,17 @@ class Scenery(Stateful):
         self.traffic = Traffic(num_envs, robot_half_m)
         self.pallets = np.full((num_envs, PALLETS, 3), PARKED_M[0])
         self.walked = np.zeros(0, np.int64)  # where traffic moved in the last block
-        self._position = batch.bind("mocap_pos")
-        self._quat = batch.bind("mocap_quat")
-        self._building = [building_boxes(floor, rack_slots) for floor in floors]
-        self._floor = np.zeros(num_envs, np.int64)  # whose building stands
+        self.position_m = batch.bind("mocap_pos")  # (N, nmocap, 3) of pallets, people, forklifts
+        self.quat = batch.bind("mocap_quat")
+        self.buildings = [building_boxes(floor, rack_slots) for floor in floors]
+        self.floor = np.zeros(num_envs, np.int64)  # whose building stands
 
     def build(self, env: int, floor: int) -> None:
         """Racks and walls of a floor."""
-        if floor == self._floor[env]:
+        if floor == self.floor[env]:
             return
-        self._floor[env] = floor
-        where, (middle, half) = self.handles.building, self._building[floor]
+        self.floor[env] = floor
+        where, (middle, half) = self.handles.building, self.buildings[floor]
         self.batch.expand("geom_pos")[env, where] = middle
         self.batch.expand("geom_size")[env, where] = half
         self.batch.expand("geom_aabb")[env, where, 3:] = half
@@ -65,12 +65,12 @@ class Scenery(Stateful):
     def reset(self, env: int, episode: Episode) -> None:
         """Pallets, people and forklifts as an episode begins."""
         self.pallets[env] = episode.pallets
-        self._position[env, :, :] = PARKED_M
-        self._quat[env, :, :] = (1.0, 0.0, 0.0, 0.0)
+        self.position_m[env, :, :] = PARKED_M
+        self.quat[env, :, :] = (1.0, 0.0, 0.0, 0.0)
         span = self.handles.pallets
-        self._position[env, span, :2] = episode.pallets[:, :2]
-        self._position[env, span, 2] = PALLET_HALF_M[2]
-        self._quat[env, span] = quaternion(episode.pallets[:, 2])
+        self.position_m[env, span, :2] = episode.pallets[:, :2]
+        self.position_m[env, span, 2] = PALLET_HALF_M[2]
+        self.quat[env, span] = quaternion(episode.pallets[:, 2])
         self.traffic.reset(env, episode.walks)
         ids = np.array([env])
         self._show_traffic(ids)
@@ -86,9 +86,9 @@ class Scenery(Stateful):
         self.walked = ids
         if not len(ids):
             return
-        begin = self._position[ids][:, None].copy()
+        begin = self.position_m[ids][:, None].copy()
         self._show_traffic(ids)
-        end = self._position[ids][:, None]
+        end = self.position_m[ids][:, None]
         substeps = self.moves.shape[1]
         share = ((np.arange(substeps) + 1) / substeps)[None, :, None, None]
         jumped = (np.abs(end - begin) > 1.0).any(axis=-1, keepdims=True)
@@ -97,7 +97,7 @@ class Scenery(Stateful):
 
     def stand_still(self, ids: Ints) -> None:
         """Nothing moves in `ids` during the coming block."""
-        self.moves[ids] = self._position[ids].reshape(len(ids), 1, self.moves.shape[2])
+        self.moves[ids] = self.position_m[ids].reshape(len(ids), 1, self.moves.shape[2])
 
     def restored(self) -> None:
         """Bodies stand where the restored physics has them."""
@@ -106,8 +106,8 @@ class Scenery(Stateful):
     def _show_traffic(self, ids: Ints) -> None:
         if len(ids):
             people = slice(self.handles.people.start, self.handles.forklifts.stop)
-            self._position[ids, people, :2] = self.traffic.position_m[ids]
-            self._quat[ids, people] = quaternion(self.traffic.heading_rad[ids])
+            self.position_m[ids, people, :2] = self.traffic.position_m[ids]
+            self.quat[ids, people] = quaternion(self.traffic.heading_rad[ids])
 
 
 def quaternion(yaw_rad: F64) -> F64:

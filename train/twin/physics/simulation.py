@@ -23,8 +23,9 @@ from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.contact import FLOOR_FRICTION, OBSTACLE_GROUP, FloorFriction
+from restock.train.twin.physics.contact import FLOOR_FRICTION, FloorFriction
 from restock.train.twin.physics.episode import Episode
+from restock.train.twin.physics.lidar import Lidar
 from restock.train.twin.physics.model import build_model, yaw_of
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import RobotBody, SteeringController, base_controller
@@ -140,9 +141,7 @@ class Simulation(Stateful):
 
         self.bearings_rad = np.array(robot.bearings_rad)  # (beams,) in the lidar's own frame
         ahead = self.bearings_rad + task.body.lidar_yaw_rad
-        self._beam = np.stack([np.cos(ahead), np.sin(ahead)], axis=-1)
-        self._groups = np.zeros(6, np.uint8)
-        self._groups[OBSTACLE_GROUP] = 1
+        self.lidar = Lidar(self.batch, self.scenery, ahead, robot.lidar_z_m)
         self.callback: Callable[[BodyState], None] | None = None
         self.callback_period_s = 0.02
 
@@ -330,16 +329,8 @@ class Simulation(Stateful):
     def cast(self, ids: Ints) -> F64:
         """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
         heading = yaw_of(self.qpos[ids, 3:7])
-        cos, sin = np.cos(heading), np.sin(heading)
-        rays = np.zeros((len(ids), self.beams, 3))
-        rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
-        rays[..., 1] = sin[:, None] * self._beam[:, 0] + cos[:, None] * self._beam[:, 1]
-        origin = np.full((len(ids), 1, 3), self.robot.lidar_z_m)
-        ahead = self.lidar_x_m
-        origin[:, 0, 0] = self.qpos[ids, 0] + cos * ahead
-        origin[:, 0, 1] = self.qpos[ids, 1] + sin * ahead
-        distance = self.batch.ray(origin, rays, self._groups, ids=ids)[0]
-        return np.where(distance < 0, np.inf, distance)
+        ahead = self.lidar_x_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        return self.lidar.ranges(ids, self.qpos[ids, :2] + ahead, heading)
 
     # -- state ----------------------------------------------------------------------------------
 

@@ -95,7 +95,8 @@ class Way:
             damaged = any("--salvage" in why for why in found.errors)
             raise Stopped("no recording can be read", SALVAGING if damaged else known)
         if not found.good:
-            self.work.say(f"   continuing with the {len(readable)} that can be read; or {SALVAGING}")
+            intact = f"the {len(readable)} that can be read"
+            self.work.say(f"   continuing with {intact}; or {SALVAGING}")
         return readable
 
     def _profile(self, readable: list[Document]) -> None:
@@ -242,8 +243,8 @@ class Way:
             judged.append(do(stages.judge(to)))
         else:
             self.work.say(
-                "\n[yellow]These logs are too short to hold any of them out, so the policy cannot be "
-                "evaluated. Ingest more recordings.[/]"
+                "\n[yellow]These logs are too short to hold any of them out, so the policy cannot "
+                "be evaluated. Ingest more recordings.[/]"
             )
         if not do(stages.report(to)).good:
             raise Stopped("there is no report", self.again)

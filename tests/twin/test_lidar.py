@@ -1,0 +1,115 @@
+"""The twin's lidar: compiled ranges are MuJoCo's own, whatever stands and moves on the floor."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from restock import native
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.robot import Lidar as LidarLimits
+from restock.ingest.task.robot import Robot
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())
+TASK = load_profile("warehouse_amr").task
+KINDS = {"nominal": 0.2, "wheel_slip": 0.2, "blocked_aisle": 0.3, "near_collision": 0.3}
+
+
+def environment(layouts: str, robot: Robot | None = None) -> WarehouseVectorEnv:
+    """Eight robots with everything that an episode may hold, a few steps in."""
+    env = WarehouseVectorEnv(8, task=TASK, robot=robot, layouts=layouts, conditions=KINDS)
+    env.reset(seed=5)
+    for _ in range(30):
+        env.step(np.zeros(8, np.int64))
+    return env
+
+
+@pytest.fixture(scope="module")
+def environments() -> list[WarehouseVectorEnv]:
+    behind = Robot(lidar=LidarLimits(beams=97, angle_min_rad=-math.pi, angle_max_rad=1.0))
+    return [environment("default"), environment("generated:test:3"), environment("default", behind)]
+
+
+def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
+    found = []
+    for switch in ("1", "0"):
+        monkeypatch.setenv(native.SWITCH, switch)
+        found.append(env.simulation.cast(np.arange(8)))
+    return found
+
+
+@needs_native
+@given(
+    which=st.integers(0, 2),
+    places=st.lists(
+        st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(-7, 7)), min_size=8, max_size=8
+    ),
+)
+def test_compiled_ranges_are_those_of_mujoco(
+    which: int, places: list[tuple[float, float, float]], environments: list[WarehouseVectorEnv]
+) -> None:
+    env = environments[which]
+    for index, (x, y, yaw) in enumerate(places):
+        floor = env.floor_of(index)
+        env.simulation.place_robot(index, x * floor.width_m, y * floor.depth_m, yaw)
+    with pytest.MonkeyPatch.context() as patch:
+        compiled, cast = both(env, patch)
+    np.testing.assert_allclose(compiled, cast, rtol=1e-12, atol=1e-12)
+    assert np.isfinite(compiled).all()  # a floor has walls
+
+
+@needs_native
+def test_people_pallets_and_forklifts_are_seen(
+    environments: list[WarehouseVectorEnv], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulation, floor = environments[0].simulation, environments[0].floor_of(0)
+    moving = simulation.scenery
+    x, y = floor.goals[0]
+    simulation.place_robot(0, x, y, 0.3)
+    for kind in (moving.handles.pallets, moving.handles.people, moving.handles.forklifts):
+        place = moving.position_m[0, kind.start]
+        kept = place.copy()
+        place[:] = -40.0, -40.0, 0.3
+        without = both(environments[0], monkeypatch)
+        place[:] = x + 1.0, y + 0.3, 0.3
+        there = both(environments[0], monkeypatch)
+        place[:] = kept
+        np.testing.assert_allclose(there[0], there[1], rtol=1e-12, atol=1e-12)
+        assert (there[0][0] < without[0][0] - 0.1).any()
+
+
+@needs_native
+def test_a_robot_that_is_nowhere_sees_nothing_and_ends(
+    environments: list[WarehouseVectorEnv], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulation = environments[0].simulation
+    simulation.place_robot(3, math.nan, 1.0, 0.0)
+    monkeypatch.setenv(native.SWITCH, "1")
+    ranges = simulation.cast(np.arange(8))
+    assert np.isinf(ranges[3]).all()
+    assert np.isfinite(ranges[[0, 1, 2, 4, 5, 6, 7]]).all()
+    simulation.place_robot(3, 1.0, 1.0, 0.0)
+
+
+@needs_native
+def test_what_does_not_fit_is_refused() -> None:
+    place, one, two = np.zeros(2), np.zeros(1), np.zeros(2, np.int64)
+    first = np.zeros(1, np.int64)
+    arguments = [place, one, place, one, first, first, two, np.zeros(0), np.zeros(6), one.copy()]
+    native.compiled.ranges(*arguments)
+    for at, wrong, refusal in (
+        (0, np.zeros(3), ValueError),
+        (4, np.array([1]), IndexError),
+        (5, np.array([-1]), IndexError),
+        (6, np.array([0, 1]), IndexError),
+        (7, np.zeros(3), ValueError),
+        (9, np.zeros(1, np.float32), TypeError),
+    ):
+        with pytest.raises(refusal):
+            native.compiled.ranges(*arguments[:at], wrong, *arguments[at + 1 :])
