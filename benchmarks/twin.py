@@ -8,17 +8,21 @@ CPU time (of all processes and threads) and of wall time. Everything but AsyncVe
 contestants "2 threads" has one thread.
 
 Then how the vector environment's cost grows with the share of episodes that have traffic, with the
-beams of the lidar and with the floor, and what its parts cost. `--check` exits 1 where, at 32 or
-128 environments, it costs more than 1.7 times its physics, or where at 8 it is not 1.7 times as
-fast as a SyncVectorEnv of as many.
+beams of the lidar and with the floor, what its parts cost, and what lidar ranges cost by compiled
+code and by MuJoCo's rays. `--check` exits 1 where, at 32 or 128 environments, it costs more than
+1.7 times its physics, where at 8 it is not 1.7 times as fast as a SyncVectorEnv of as many, or
+where compiled ranges cost more than MuJoCo's.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +33,13 @@ import pyarrow as pa
 from harness import finish, in_turns, option_parser
 
 import restock  # noqa: F401 - registers the environment
+from restock import native
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.conditions import label
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.train.twin.env import vector_env
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics import sensing
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS
 from restock.train.twin.physics.sensing import Sensing
@@ -45,6 +51,7 @@ SCALED = 32  # environments while something else is scaled
 UNDER_WAY = 20  # steps before anything is timed
 TRAFFIC = (0.0, 0.15, 0.5, 1.0)  # share of episodes
 BEAMS = (36, LIDAR_BEAMS, 180, 360)
+PIECES = 280  # boxes of a floor that is made from scans, as those of docs/fleet.md
 TARGET = 1.7
 
 
@@ -101,6 +108,33 @@ def with_beams(beams: int) -> Contestant:
     env.simulation = Simulation(SCALED, env.task, env.warehouse, old.timestep_s, 1, beams=beams)
     env.sensing = Sensing(env.simulation, env.task)
     return Contestant(under_way(env), SCALED)
+
+
+def in_pieces(floor: Warehouse, count: int) -> Warehouse:
+    """The same floor with its racks cut, along x, into so many boxes: what a map gives."""
+    each = -(-count // len(floor.racks))
+    racks = []
+    for rack in floor.racks:
+        edges = np.linspace(rack.x_min, rack.x_max, each + 1).tolist()
+        racks += [Rect(x0, rack.y_min, x1, rack.y_max) for x0, x1 in pairwise(edges)]
+    return replace(floor, racks=tuple(racks))
+
+
+def ranging(switch: str, beams: int, boxes: int | None) -> Contestant:
+    """Lidar ranges alone, of robots under way."""
+    env = WarehouseVectorEnv(SCALED, seed=1)
+    under_way(env)
+    floor = env.warehouse if boxes is None else in_pieces(env.warehouse, boxes)
+    sim = Simulation(SCALED, env.task, floor, env.simulation.timestep_s, 1, beams=beams)
+    sim.qpos[:] = env.simulation.qpos
+    ids = np.arange(SCALED)
+
+    def run() -> None:
+        os.environ[native.SWITCH] = switch
+        sim.cast(ids)
+        os.environ[native.SWITCH] = "1"
+
+    return Contestant(run, SCALED)
 
 
 def physics(count: int) -> Contestant:
@@ -294,6 +328,11 @@ def main() -> int:
         contestants[f"{beams} beams"] = with_beams(beams)
     for name in options.layouts:
         contestants[f"floors: {name}"] = vector(SCALED, layouts=name)
+    ranged = [(LIDAR_BEAMS, None), (360, None), (LIDAR_BEAMS, PIECES), (360, PIECES)]
+    for beams, boxes in ranged if native.is_used() else []:
+        name = f"{beams} beams, {'default floor' if boxes is None else f'in {boxes} boxes'}"
+        contestants[f"ranges, {name}"] = ranging("1", beams, boxes)
+        contestants[f"MuJoCo's rays, {name}"] = ranging("0", beams, boxes)
     steps = 160 if options.quick else 640
     rounds = {name: partial(contestant.round, steps) for name, contestant in contestants.items()}
     measured = in_turns(rounds, 3 if options.quick else 12)
@@ -310,6 +349,11 @@ def main() -> int:
     }
     for name in (f"SyncVectorEnv, {PEERS}", f"AsyncVectorEnv, {PEERS}"):
         ratios[f"{name} / vector"] = cpu[name] / cpu[f"vector environment, {PEERS}"]
+    ratios |= {
+        f"{name} / compiled": cpu[name] / cpu[name.replace("MuJoCo's rays", "ranges")]
+        for name in cpu
+        if name.startswith("MuJoCo's rays")
+    }
     shares = {
         count: parts(count, steps=30 if options.quick else 150) for count in (COUNTS[0], COUNTS[-1])
     }
@@ -321,6 +365,11 @@ def main() -> int:
     sync = ratios[f"SyncVectorEnv, {PEERS} / vector"]
     if sync < TARGET:
         missed.append(f"SyncVectorEnv / vector: {sync:.2f}, target at least {TARGET}")
+    missed += [
+        f"{name}: {ratio:.2f}, target at least 1"
+        for name, ratio in ratios.items()
+        if name.endswith("/ compiled") and ratio < 1
+    ]
     figures = {name: {"cpu_us": cpu[name], "wall_us": wall[name]} for name in cpu}
     answer = {"us_per_env_step": figures, "ratios": ratios, "parts_us": shares}
     return finish(options, answer, missed, lines(cpu, wall, ratios, shares))
