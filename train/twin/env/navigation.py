@@ -6,6 +6,7 @@ blocked, which is remembered for the rest of the episode.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
+from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.state import Stateful
@@ -24,6 +26,10 @@ from restock.train.twin.physics.sensing import Sensing, add_route
 
 STRAYED_M = 0.6
 LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
+
+# Of the stand-in, whose measures the follower's are: its speeds, and the room to turn on the spot.
+FASTEST_MPS, FASTEST_RADPS, PIVOT_M = 1.0, 1.2, 0.14
+STANDING_SHARE = 0.2  # of the distances at which a robot stops and slows, however slow it is
 
 
 class Navigation(Stateful):
@@ -148,14 +154,17 @@ class PathFollower:
 
     Args:
         stop_m: something this near ahead stops it.
-        slow_m: and this near slows it down.
+        slow_m: and this near slows it down. Both of a robot that drives 1 m/s; of a slower one,
+            which needs less room to stop, they are less.
     """
 
-    pivot_m = 0.14  # room that turning on the spot needs around the body
-
     def __init__(self, task: Task, *, stop_m: float = 0.30, slow_m: float = 0.80) -> None:
-        self.stop_m, self.slow_m = stop_m, slow_m
         self.table = np.asarray(task.actions, np.float64)  # (A, 2)
+        fastest, turning = np.abs(self.table).max(axis=0)
+        self._pace = np.minimum([fastest / FASTEST_MPS, turning / FASTEST_RADPS], 1.0)
+        slower = STANDING_SHARE + (1.0 - STANDING_SHARE) * self._pace[0]
+        self.stop_m, self.slow_m = stop_m * slower, slow_m * slower
+        self.pivot_m = PIVOT_M * _corner_m(task.body) / _corner_m(Body(length_m=0.6, width_m=0.5))
         self.lidar = task.lidar
         half = max(round(task.sectors * 30 / 360), 1)
         self._ahead = slice(task.sectors // 2 - half, task.sectors // 2 + half)
@@ -173,7 +182,9 @@ class PathFollower:
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
         front, bend = self.front(signals), np.abs(near)
-        slow = (np.abs(far) > 0.5) | (front < self.slow_m) | (signals["goal_distance_m"] < 0.8)
+        slow = (
+            (np.abs(far) > 0.5) | (front < self.slow_m) | (signals["goal_distance_m"] < self.slow_m)
+        )
         side = np.where(near > 0, 1, 2)  # left, right
         careful = (slow | (bend > 0.45)) & (bend > 0.12)
         action = self._drive[(slow | careful).astype(np.intp), np.where(bend > 0.12, side, 0)]
@@ -213,4 +224,11 @@ class PathFollower:
         )
 
     def _index(self, speed_mps: float, yaw_rate_radps: float) -> int:
-        return int(np.abs(self.table - (speed_mps, yaw_rate_radps)).sum(axis=1).argmin())
+        """The action nearest to a velocity of the stand-in's, at this robot's pace."""
+        wanted = self._pace * (speed_mps, yaw_rate_radps)
+        return int(np.abs(self.table - wanted).sum(axis=1).argmin())
+
+
+def _corner_m(body: Body) -> float:
+    """How far an outline's corners stand out beyond its nearer sides, for who turns on the spot."""
+    return math.hypot(body.length_m, body.width_m) / 2 - min(body.length_m, body.width_m) / 2

@@ -17,6 +17,14 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.route import view_route
 from restock.state import Stateful
+from restock.train.twin.env.foresight import (
+    PERSON_MARGIN_M,
+    margins_of,
+    outline_of,
+    room_of,
+    simulated,
+    steps_of,
+)
 from restock.train.twin.env.policies import SoftPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.planner import PLAN_POINTS
@@ -24,31 +32,24 @@ from restock.train.twin.floors.state_lattice import (
     Motion,
     StateLattice,
     Window,
-    box_gap,
     lattice_around,
-    near_floor_gap,
-    rectangle,
 )
 from restock.train.twin.physics.model import PALLET_HALF_M, pallet_half_m
-from restock.train.twin.physics.traffic import RETREATING, WALKING
 
-BACK_STEPS = (12, 16)
+BACK_S = (2.4, 3.2)
 _LOOK_M = tuple(0.3 * step for step in range(14))
-HORIZON = 6  # steps of the control period
-TOUCH_M = 0.05
-ROOMY_M = 0.12
-PERSON_MARGIN_M = 0.4
-STANDING_MARGIN_M = 0.2
+HORIZON_S = 1.2
 CAREFUL_M = 1.8  # from the robot's middle to a person's
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0
 STANDING_MPS = 0.12
-PATIENCE_STEPS = 20  # with somebody in the way; then it moves about, to be let pass
+STILL_S = 1.0  # without having moved: it is stuck
+PATIENCE_S = 4.0  # with somebody in the way; then it moves about, to be let pass
 MOVED = np.array([0.1, 0.2])  # m and rad, of a robot that makes a step of so much or more:
 MOVED_STEP = np.array([1.0, 1.2]) * 0.2
 WINDOW_M = 2.3  # that a lattice spans about pallets' middles
-# Near pallets: one action for FIRST steps, then another. The plan of the step before is kept unless
+# Near pallets: one action for FIRST_S, then another. The plan of the step before is kept unless
 # another is better by BETTER_S: otherwise replanning at every step can postpone a turn for ever.
-PAIR_HORIZON, FIRST, BETTER_S = 8, 3, 0.1
+PAIR_S, FIRST_S, NEXT_S, BETTER_S = 1.6, 0.6, 0.4, 0.1
 
 
 def harsh_actions(table: F64) -> Bools:
@@ -68,7 +69,9 @@ class Operator(SoftPolicy, Stateful):
     """Privileged: reads the simulation's state. Keeps a way of its own for each robot."""
 
     name = "operator"
-    version = "3"  # 1 had no lattice, 2 backed off from who had just let it pass
+    # 1 had no lattice, 2 backed off from who had just let it pass, 3 looked ahead and kept clear by
+    # the stand-in's measures, whatever the robot
+    version = "4"
     STATE: ClassVar[tuple[str, ...]] = (
         *("_rng", "_ways", "_episode", "_began", "_plan", "_anchor", "_still", "_waiting"),
         *("_backing", "_stuck_m"),
@@ -76,13 +79,13 @@ class Operator(SoftPolicy, Stateful):
 
     def __init__(self, *, epsilon: float = 0.03, seed: int = 0) -> None:
         super().__init__(epsilon=epsilon, seed=seed)
-        self._prepare(0)
+        self._prepare(0, 0)
 
-    def _prepare(self, count: int) -> None:
+    def _prepare(self, count: int, pair_steps: int) -> None:
         self._ways = np.zeros((count, PLAN_POINTS, 2))
         self._episode = np.full(count, -1)
         self._began = np.zeros((count, 2))  # where each was as its episode began
-        self._plan = np.zeros((count, PAIR_HORIZON), np.int64)  # actions to go on with
+        self._plan = np.zeros((count, pair_steps), np.int64)  # actions to go on with
         self._anchor = np.zeros((count, 3))
         self._still = np.zeros(count, np.int64)
         self._waiting = np.zeros(count, np.bool_)
@@ -101,9 +104,11 @@ class Operator(SoftPolicy, Stateful):
         table = np.asarray(env.task.actions, np.float64)
         count, actions = env.num_envs, len(table)
         everyone = np.arange(count)
-        held = np.broadcast_to(table[:, None], (count, actions, HORIZON, 2))
-        ends, speed = self._simulate(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
-        room, people = self._room(env, everyone, ends)  # (N, A, T)
+        horizon = steps_of(env, HORIZON_S)
+        touch_m, roomy_m = margins_of(env)
+        held = np.broadcast_to(table[:, None], (count, actions, horizon, 2))
+        ends, speed = simulated(env, everyone, pose, held)  # (N, A, T, 3), (N, A, T)
+        room, people = room_of(env, everyone, ends)  # (N, A, T)
         people = np.where(np.abs(speed) < STANDING_MPS, 9.0, people)  # they stop before who stands
         arrived = self._arrived(env, everyone, ends)
         room[arrived] = people[arrived] = 9.0  # what comes after the goal does not matter
@@ -115,11 +120,11 @@ class Operator(SoftPolicy, Stateful):
         score = -(view.remaining_m + 1.2 * view.offset_m + 0.5 * np.minimum(bearing, 2.0))
         score = score.reshape(count, actions)
         nearest = room.min(axis=2)
-        score -= 2.0 * np.clip(ROOMY_M - nearest, 0.0, ROOMY_M) / ROOMY_M * (room[:, :, 0] > 0)
+        score -= 2.0 * np.clip(roomy_m - nearest, 0.0, roomy_m) / roomy_m * (room[:, :, 0] > 0)
         score -= 8.0 * np.clip(PERSON_MARGIN_M - people.min(axis=2), 0.0, 1.0)
-        when = np.argmax(np.minimum(room, people) < TOUCH_M, axis=2)
-        hits = (np.minimum(room, people) < TOUCH_M).any(axis=2)
-        score -= np.where(hits, 20.0 + 5.0 * (HORIZON - when), 0.0)
+        when = np.argmax(np.minimum(room, people) < touch_m, axis=2)
+        hits = (np.minimum(room, people) < touch_m).any(axis=2)
+        score -= np.where(hits, 20.0 + 30.0 * (horizon - when) / horizon, 0.0)
         icy = self._icy(env, pose)
         score -= np.where(icy[:, None] & harsh_actions(table)[None, :], 3.0, 0.0)
         score += 1.0 * arrived.any(axis=2)
@@ -129,7 +134,7 @@ class Operator(SoftPolicy, Stateful):
         tries = self._rng.random(score.shape) * 0.5 - 10.0 * hits
         tries[:, 0] -= 1.0
         tries[:, table[:, 0] < 0] += 1.0
-        stood = self._standing(env, pose) & (alone | (self._still > PATIENCE_STEPS))
+        stood = self._standing(env, pose) & (alone | (self._still > steps_of(env, PATIENCE_S)))
         score[stood] = tries[stood]
         self._note_stuck(env, pose, np.flatnonzero(stood & alone & ~icy & (self._still > 0)))
         action = np.asarray(score.argmax(axis=1), np.int64)
@@ -143,25 +148,27 @@ class Operator(SoftPolicy, Stateful):
         """Of robots (n,) that a lattice guides: the first action of the pair that leaves the
         least time, and touches nothing."""
         first, then = (part.ravel() for part in np.indices((len(table),) * 2))
-        pairs = np.where(np.arange(PAIR_HORIZON) < FIRST, first[:, None], then[:, None])  # (P, T)
+        horizon, begun = steps_of(env, PAIR_S), steps_of(env, FIRST_S)
+        touch_m, roomy_m = margins_of(env)
+        pairs = np.where(np.arange(horizon) < begun, first[:, None], then[:, None])  # (P, T)
         plans = np.broadcast_to(pairs, (len(ids), *pairs.shape))
         plans = np.concatenate([plans, self._plan[ids][:, None]], axis=1)  # (n, P + 1, T)
-        ends, _ = self._simulate(env, ids, pose, table[plans])
-        room, people = self._room(env, ids, ends)
+        ends, _ = simulated(env, ids, pose, table[plans])
+        room, people = room_of(env, ids, ends)
         room = np.minimum(room, people)
         arrived = self._arrived(env, ids, ends)
         room[arrived] = 9.0
-        touched = np.logical_or.accumulate(room < TOUCH_M, axis=2)
+        touched = np.logical_or.accumulate(room < touch_m, axis=2)
         left_s = np.empty(room.shape)
         for row, index in enumerate(ids.tolist()):
             lattice = self._lattices[index][1]
             assert lattice is not None
             left_s[row] = lattice.time_s(ends[row])
-        steps = (np.arange(PAIR_HORIZON) + 1) * env.task.control_period_s
+        steps = (np.arange(horizon) + 1) * env.task.control_period_s
         score = -np.where(arrived, 0.0, left_s) - 0.5 * steps - 50.0 * touched
-        score = score[:, :, FIRST:].max(axis=2)
-        nearest = room[:, :, : FIRST + 2].min(axis=2)
-        score -= np.clip(ROOMY_M - nearest, 0.0, ROOMY_M) / ROOMY_M * (room[:, :, 0] > 0)
+        score = score[:, :, begun:].max(axis=2)
+        nearest = room[:, :, : begun + steps_of(env, NEXT_S)].min(axis=2)
+        score -= np.clip(roomy_m - nearest, 0.0, roomy_m) / roomy_m * (room[:, :, 0] > 0)
         score[plans[:, :, 0] == 0] -= 0.3  # nobody to wait for
         score[:, -1] += BETTER_S
         chosen = plans[np.arange(len(ids)), score.argmax(axis=1)]  # (n, T)
@@ -249,19 +256,20 @@ class Operator(SoftPolicy, Stateful):
         moved = (np.abs(pose - self._anchor) > _moved(env)).any(axis=1) | (env.steps == 0)
         self._anchor[moved] = pose[moved]
         self._still = np.where(moved | let_pass, 0, self._still + 1)
+        least, most = (steps_of(env, seconds) for seconds in BACK_S)
         self._backing = np.where(
-            self._still > 5,
-            self._rng.integers(*BACK_STEPS, size=len(pose)),
+            self._still > steps_of(env, STILL_S),
+            self._rng.integers(least, max(most, least + 1), size=len(pose)),
             np.maximum(self._backing - 1, 0),
         )
-        waits = near & (self._still <= PATIENCE_STEPS)
+        waits = near & (self._still <= steps_of(env, PATIENCE_S))
         self._backing[waits | let_pass | (env.steps == 0)] = 0
         return self._backing > 0
 
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
         """A plan past the pallets at the start of each episode, and again off that plan."""
         if len(self._ways) != env.num_envs:
-            self._prepare(env.num_envs)
+            self._prepare(env.num_envs, steps_of(env, PAIR_S))
         serial = env.episodes_begun
         stale = self._episode != serial
         offset = view_route(self._ways, pose[:, 0], pose[:, 1], pose[:, 2], ()).offset_m
@@ -284,73 +292,6 @@ class Operator(SoftPolicy, Stateful):
                 x, y, (goal_x, goal_y), _pallets(env, index), PALLET_HALF_M[:2]
             )
         return planner.plan(x, y, (goal_x, goal_y)) if way is None else way
-
-    def _simulate(
-        self, env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64
-    ) -> tuple[F64, F64]:
-        """Where robots (n,) get to by commands (n, A, T, 2): poses (n, A, T, 3) and speeds
-        (n, A, T)."""
-        period = env.task.control_period_s
-        shape = commands.shape[:3]
-        x, y, yaw = (np.broadcast_to(pose[:, axis, None], shape[:2]) for axis in range(3))
-        velocity = np.broadcast_to(
-            env.simulation.controller.set_point[ids][:, None], (*shape[:2], 2)
-        )
-        ends = np.empty((*shape, 3))
-        speed = np.empty(shape)
-        for step in range(shape[2]):
-            velocity = velocity + 0.8 * (commands[:, :, step] - velocity)
-            middle = yaw + velocity[..., 1] * period / 2
-            x = x + velocity[..., 0] * np.cos(middle) * period
-            y = y + velocity[..., 0] * np.sin(middle) * period
-            yaw = yaw + velocity[..., 1] * period
-            ends[:, :, step] = np.stack([x, y, yaw], axis=-1)
-            speed[:, :, step] = velocity[..., 0]
-        return ends, speed
-
-    def _room(self, env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
-        """Clearance (n, A, T) to racks, walls and pallets, and to people where they will be."""
-        outline = _outline(env, points=3)
-        cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
-        x = ends[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1]  # (n, A, T, K)
-        y = ends[..., 1, None] + sin * outline[:, 0] + cos * outline[:, 1]
-        room = np.empty_like(x)
-        on = env.layout[ids]
-        for index in np.unique(on):
-            rows = np.flatnonzero(on == index)
-            room[rows] = near_floor_gap(env.floors[index], x[rows], y[rows])
-        pallets = env.simulation.pallets[ids]
-        for column in range(pallets.shape[1]):
-            rows = np.flatnonzero(pallets[:, column, 0] > 0)
-            if len(rows):
-                middle = pallets[rows, column, :2][:, None, None, None]
-                half = pallet_half_m(pallets[rows, column, 2])[:, None, None, None]
-                gap = box_gap(
-                    x[rows], y[rows], (middle[..., 0], middle[..., 1]), (half[..., 0], half[..., 1])
-                )
-                room[rows] = np.minimum(room[rows], gap)
-        people = np.full(ends.shape[:3], 9.0)
-        traffic = env.simulation.traffic
-        rows = np.flatnonzero(traffic.active[ids])
-        if len(rows):
-            about = ids[rows]
-            later = (np.arange(ends.shape[2]) + 1) * env.task.control_period_s
-            arrived = traffic.travelled_m[about] >= traffic.length_m[about]
-            walking = (traffic.state[about] == WALKING) & ~arrived
-            sign = np.where(walking, 1.0, np.where(traffic.state[about] == RETREATING, -0.6, 0.0))
-            walked = (traffic.speed_mps[about] * sign)[..., None] * later  # (n, G, T)
-            heading = traffic.heading_rad[about][..., None]
-            px = traffic.position_m[about, :, 0, None] + np.cos(heading) * walked
-            py = traffic.position_m[about, :, 1, None] + np.sin(heading) * walked
-            gap = np.hypot(
-                x[rows][:, None] - px[:, :, None, :, None],
-                y[rows][:, None] - py[:, :, None, :, None],
-            )
-            gap = gap.min(axis=4) - traffic.radius_m[None, :, None, None]
-            standing = sign == 0.0  # one may pass nearer to who stands
-            gap += np.where(standing, PERSON_MARGIN_M - STANDING_MARGIN_M, 0.0)[:, :, None, None]
-            people[rows] = gap.min(axis=1)
-        return room.min(axis=3), people
 
     def _icy(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
         """Whether slippery floor lies under the robot or within .9 m of its middle, (N,)."""
@@ -384,12 +325,6 @@ def _moved(env: WarehouseVectorEnv) -> F64:
     return np.asarray(MOVED[[0, 0, 1]] * slower[[0, 0, 1]])
 
 
-def _outline(env: WarehouseVectorEnv, points: int) -> F64:
-    """Points on the body's outline, (K, 2), about its axle."""
-    body = env.task.body
-    return rectangle(body.length_m, body.width_m, env.simulation.robot.axle_x_m, points)
-
-
 def _motion(env: WarehouseVectorEnv) -> Motion | None:
     """What a lattice must know of the robot; None of one that does not turn on the spot."""
     table = np.asarray(env.task.actions, np.float64)
@@ -397,4 +332,4 @@ def _motion(env: WarehouseVectorEnv) -> Motion | None:
     ahead, back = float(table[:, 0].max()), float(-table[:, 0].min())
     if turn == 0.0 or ahead <= 0.0:
         return None
-    return Motion(_outline(env, points=5), ahead, max(back, 0.0), turn)
+    return Motion(outline_of(env, points=5), ahead, max(back, 0.0), turn)
