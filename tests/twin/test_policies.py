@@ -8,10 +8,13 @@ import pytest
 from support.long import one_in
 
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
+from restock.train.twin.env.navigation import PathFollower
 from restock.train.twin.env.operator_policy import Operator, harsh_actions
 from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec
 
 
@@ -182,3 +185,52 @@ def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
         action, _ = operator.act(env, np.zeros(0, np.float32))
         assert not backwards[action].any()
         env.step(np.full(4, creep))
+
+
+def small_slow_robot() -> Task:
+    """As a TurtleBot3 Burger: .14 x .18 m, .22 m/s, a tick every .1 s."""
+    speeds = (
+        (0, 0),
+        (0.11, 0),
+        (0.22, 0),
+        (0.176, 0.257),
+        (0.176, -0.257),
+        (0, 0.429),
+        (0, -0.429),
+    )
+    return msgspec.structs.replace(
+        load_profile("warehouse_amr").task,
+        body=Body(length_m=0.14, width_m=0.18),
+        actions=speeds,
+        control_period_s=0.1,
+        time_limit_steps=600,
+        goal_radius_m=0.15,
+    )
+
+
+def test_the_operator_of_a_small_slow_robot_drives_through_a_gap_that_is_wide_for_it() -> None:
+    """It turned left and right before any gap narrower than one that the stand-in wants."""
+    gap = Rect(1.5, 0.0, 2.5, 0.8), Rect(1.5, 1.2, 2.5, 2.0)
+    ends = (3.4, 1.0), (0.6, 1.0)
+    floor = Warehouse(
+        4.0, 2.0, gap, (), ends, starts_m=ends[1:], room_m=0.12, way_m=(2.0, 6.0), name="gap"
+    )
+    env = WarehouseVectorEnv(
+        6, task=small_slow_robot(), layouts=(floor,), conditions={"nominal": 1.0}
+    )
+    observation, _ = env.reset(seed=0)
+    operator, arrived = Operator(epsilon=0.0), np.zeros(6, np.bool_)
+    for _ in range(200):
+        observation, _, terminated, _, info = env.step(operator.act(env, observation)[0])
+        arrived |= terminated & info["success"]
+    assert arrived.all()
+
+
+def test_the_planner_keeps_distances_by_the_robots_size_and_speeds() -> None:
+    stand_in = PathFollower(load_profile("warehouse_amr").task)
+    assert (stand_in.stop_m, stand_in.slow_m, stand_in.pivot_m) == (0.3, 0.8, 0.14)
+    small = PathFollower(small_slow_robot())
+    assert 0.06 < small.stop_m < 0.15
+    assert small.slow_m < 0.4
+    assert small.pivot_m < 0.06
+    assert small.table[small._index(0.4, 0.0)].tolist() == [0.11, 0.0]  # slow, for it

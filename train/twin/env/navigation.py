@@ -27,8 +27,10 @@ from restock.train.twin.physics.sensing import Sensing, add_route
 STRAYED_M = 0.6
 LOOK_M = 1.9  # something this near ahead makes the finder look at the scan
 
-# Of the stand-in, whose measures the follower's are: its speeds, and the room to turn on the spot.
-FASTEST_MPS, FASTEST_RADPS, PIVOT_M = 1.0, 1.2, 0.14
+# Of the stand-in, whose measures the follower's are: its speeds, its outline, and the room that it
+# wants around it to turn on the spot.
+FASTEST_MPS, FASTEST_RADPS = 1.0, 1.2
+STAND_IN, PIVOT_M = Body(length_m=0.70, width_m=0.50), 0.14
 STANDING_SHARE = 0.2  # of the distances at which a robot stops and slows, however slow it is
 
 
@@ -164,7 +166,7 @@ class PathFollower:
         self._pace = np.minimum([fastest / FASTEST_MPS, turning / FASTEST_RADPS], 1.0)
         slower = STANDING_SHARE + (1.0 - STANDING_SHARE) * self._pace[0]
         self.stop_m, self.slow_m = stop_m * slower, slow_m * slower
-        self.pivot_m = PIVOT_M * _corner_m(task.body) / _corner_m(Body(length_m=0.6, width_m=0.5))
+        self.pivot_m = PIVOT_M * (_corner_m(task.body) / _corner_m(STAND_IN))
         self.lidar = task.lidar
         half = max(round(task.sectors * 30 / 360), 1)
         self._ahead = slice(task.sectors // 2 - half, task.sectors // 2 + half)
