@@ -10,12 +10,9 @@ import zstandard
 
 from restock.errors import RecordingError
 from restock.ingest.containers.discover import ZSTD_MAGIC
+from restock.ingest.containers.formats.plausible import FILE, most_bytes
 from restock.ingest.decoding.messages import MessageBatch
 
-# What decompresses to more than both is taken for an attack (or for an accident).
-PLAUSIBLE_SIZE = 256 << 20
-PLAUSIBLE_RATIO = 1000
-PLAUSIBLE_MESSAGE = 64 << 20
 LARGEST_MESSAGE = 1 << 30
 PIECE = 32 << 20  # of messages decompressed at a time
 BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
@@ -27,7 +24,7 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
     Raises:
         RecordingError: it is damaged, cut short, or decompresses to implausibly much.
     """
-    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * path.stat().st_size)
+    limit = most_bytes(path.stat().st_size, FILE)
     size = 0
     problem = None
     with path.open("rb") as source, target.open("wb") as sink:
@@ -88,7 +85,7 @@ def _piece(batch: MessageBatch, payloads: list[bytes], good: list[int]) -> Messa
 def _plain(payload: bytes) -> bytes:
     if not payload.startswith(ZSTD_MAGIC):
         return payload
-    limit = min(max(PLAUSIBLE_MESSAGE, PLAUSIBLE_RATIO * len(payload)), LARGEST_MESSAGE)
+    limit = min(most_bytes(len(payload)), LARGEST_MESSAGE)
     size = zstandard.frame_content_size(payload)
     if 0 <= size <= limit:
         return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))

@@ -24,11 +24,9 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Chunk, Header, IndexData, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
+from restock.ingest.containers.formats.plausible import most_bytes
 from restock.ingest.containers.storage import Packed, Watch
 
-# A chunk's size is the file's claim: what decompresses to more than both is refused.
-PLAUSIBLE_SIZE = 64 << 20
-PLAUSIBLE_RATIO = 1000
 # Of chunks that are read again: who proposes a profile reads topic after topic, and bz2 is slow.
 KEPT_BYTES = 128 << 20
 
@@ -220,7 +218,7 @@ class Bag(Reader):
         cut = position in self._cut
         if chunk.datasize > self._size and not cut:
             raise ReaderError("it is longer than the bag")
-        if size > max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * chunk.datasize):
+        if size > most_bytes(chunk.datasize):
             raise ReaderError(f"{chunk.datasize:,} bytes that claim to hold {size:,}")
         self.bio.seek(chunk.datapos)
         stored = self.bio.read(chunk.datasize)

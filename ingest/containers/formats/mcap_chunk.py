@@ -23,13 +23,12 @@ from restock.ingest.containers.formats.mcap_records import (
     parse,
     walk,
 )
+from restock.ingest.containers.formats.plausible import most_bytes
 from restock.ingest.decoding.columns import gather
 from restock.ingest.decoding.messages import Channel
 
-# A chunk's uncompressed size is the file's claim: beyond these it is refused, not allocated.
+# A chunk's uncompressed size is the file's claim: beyond this it is refused, not allocated.
 LARGEST_CHUNK = 4 << 30
-PLAUSIBLE_SIZE = 64 << 20
-PLAUSIBLE_RATIO = 1000
 LATEST_NS = 2**63 - 1
 STEP = 1 << 12  # of damaged data at a time: damage costs no more than what is near it
 
@@ -102,8 +101,7 @@ def refuse_implausible(chunk: Chunk) -> None:
         BadChunk: it is more than its stored bytes can hold.
     """
     stored = chunk.stop - chunk.start
-    limit = max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * stored)
-    if chunk.size > min(limit, LARGEST_CHUNK):
+    if chunk.size > min(most_bytes(stored), LARGEST_CHUNK):
         raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
 
 
@@ -153,7 +151,7 @@ def _check(chunk: Chunk, data: bytes | memoryview) -> None:
 def inflate_partly(chunk: Chunk, file: Buffer) -> bytes:
     """The part of a cut or damaged chunk that still decompresses; unchecked."""
     stored = file[chunk.start : chunk.stop]
-    limit = min(chunk.size, max(PLAUSIBLE_SIZE, PLAUSIBLE_RATIO * len(stored)), LARGEST_CHUNK)
+    limit = min(chunk.size, most_bytes(len(stored)), LARGEST_CHUNK)
     if chunk.compression == "":
         return stored[:limit]
     if chunk.compression not in _DECODERS:
