@@ -9,7 +9,6 @@ from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import (
-    NEAR_GAP_M,
     Motion,
     StateLattice,
     Window,
@@ -141,8 +140,8 @@ def test_the_clearance_of_near_points_is_that_of_the_floor(layouts: str) -> None
     rng = np.random.default_rng(0)
     middle = rng.uniform((0.0, 0.0), (floor.width_m, floor.depth_m), (200, 2))
     x, y = np.moveaxis(middle[:, None] + rng.uniform(-0.6, 0.6, (200, 12, 2)), -1, 0)
-    exact, near = floor_gap(floor, x, y), near_floor_gap(floor, x, y)
-    close = exact < NEAR_GAP_M
+    exact, near = floor_gap(floor, x, y), near_floor_gap(floor, x, y, 0.3)
+    close = exact < 0.3
     assert 0.2 < close.mean() < 1.0
     np.testing.assert_array_equal(near[close], exact[close])
-    assert (near[~close] >= NEAR_GAP_M).all()
+    assert (near[~close] >= 0.3).all()

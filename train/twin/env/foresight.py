@@ -41,7 +41,10 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
 
 
 def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
-    """Clearance (n, A, T) to racks, walls and pallets, and to people where they will be."""
+    """Clearance (n, A, T) to racks, walls and pallets, and to people where they will be.
+
+    It is exact below `ROOMY_M`: what is farther away than that counts alike.
+    """
     outline = outline_of(env, points=3)
     cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
     x = ends[..., 0, None] + cos * outline[:, 0] - sin * outline[:, 1]  # (n, A, T, K)
@@ -50,7 +53,7 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     on = env.layout[ids]
     for index in np.unique(on):
         rows = np.flatnonzero(on == index)
-        room[rows] = near_floor_gap(env.floors[index], x[rows], y[rows])
+        room[rows] = near_floor_gap(env.floors[index], x[rows], y[rows], ROOMY_M)
     pallets = env.simulation.pallets[ids]
     for column in range(pallets.shape[1]):
         rows = np.flatnonzero(pallets[:, column, 0] > 0)

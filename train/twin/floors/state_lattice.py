@@ -30,7 +30,6 @@ ARC = 0.35  # of the time to turn on the spot, that the same turn takes while dr
 OFF_COST_S = 0.5  # a cell that a pose lies off the free ones
 _FIELD_M = 0.05  # cells of the clearance that outlines are looked up in
 _NO_WAY_S = 60.0  # of a heading without any free state
-NEAR_GAP_M = 0.5
 BORDER_CELLS = 2  # along a window's sides, where the floor's cells go on
 ENTER_RAD = 0.6  # the turn that coming in costs: outside, where a cell has no heading, none does
 
@@ -323,15 +322,15 @@ def _wall_gap(floor: Warehouse, x: F64, y: F64) -> F64:
     return np.minimum(np.minimum(x, floor.width_m - x), np.minimum(y, floor.depth_m - y))
 
 
-def near_floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
-    """`floor_gap` of the points (n, …) of n robots, exact where it is below `NEAR_GAP_M`.
+def near_floor_gap(floor: Warehouse, x: F64, y: F64, within_m: float) -> F64:
+    """`floor_gap` of the points (n, …) of n robots, exact where it is below `within_m`.
 
     Racks farther from all points of a robot are left out: a floor made of scans has hundreds.
     """
     room = _wall_gap(floor, x, y)
     over = tuple(range(1, x.ndim))
-    low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - NEAR_GAP_M  # (n, 2)
-    high = np.stack([x.max(axis=over), y.max(axis=over)], axis=-1) + NEAR_GAP_M
+    low = np.stack([x.min(axis=over), y.min(axis=over)], axis=-1) - within_m  # (n, 2)
+    high = np.stack([x.max(axis=over), y.max(axis=over)], axis=-1) + within_m
     corners = np.array([rack.edges for rack in floor.racks]).reshape(-1, 4)
     near = (low[:, None] < corners[:, 2:]) & (high[:, None] > corners[:, :2])  # (n, racks, 2)
     for rack, beside in zip(floor.racks, np.asarray(near.all(axis=2)).T, strict=True):
