@@ -251,9 +251,13 @@ def _robot_lines(seen: Evidence) -> list[str]:
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
-    """A bumper stops the robot, unless it is pressed so often that it hardly is one."""
+    """A bumper stops the robot, unless it is pressed so often that it hardly is one.
+
+    Without one nothing changes in logs; in the twin, which knows every contact, a robot would else
+    press on against a wall to the end of its time.
+    """
     if not roles["bumper"]:
-        return []
+        return ["bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"]
     topic, kind = roles["bumper"][0]
     fields = recording.read({topic.name: [kind.fields["pressed"]]})[topic.name].fields
     pressed = np.asarray(fields[kind.fields["pressed"]], np.float64) > 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
@@ -113,3 +114,27 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(refusal):
             native.compiled.ranges(*arguments[:at], wrong, *arguments[at + 1 :])
+
+
+def test_people_and_forklifts_stand_on_the_floor() -> None:
+    """A forklift hung .4 m above it: no lidar saw it, and robots drove through below."""
+    env = WarehouseVectorEnv(64, task=TASK, conditions={"near_collision": 1.0})
+    env.reset(seed=0)
+    simulation, handles = env.simulation, env.simulation.handles
+    model, mocap = simulation.model, simulation.scenery.position_m
+    for kind in (handles.pallets, handles.people, handles.forklifts):
+        body = int(np.flatnonzero(model.body_mocapid == kind.start)[0])
+        (geom,) = np.flatnonzero(model.geom_bodyid == body)
+        cylinder = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
+        half_height_m = model.geom_size[geom, 1 if cylinder else 2]
+        np.testing.assert_allclose(mocap[:, kind, 2], half_height_m)
+    there = np.flatnonzero(mocap[:, handles.forklifts.start, 0] > 0)
+    assert len(there)
+    x, y, _ = mocap[there[0], handles.forklifts.start]
+    simulation.place_robot(there[0], x - 1.2, y, 0.0)
+    assert simulation.cast(there[:1]).min() < 0.7
+    for _ in range(8):
+        simulation.drive(np.tile([0.5, 0.0], (64, 1)))
+        if simulation.bumped[there[0]]:
+            break
+    assert simulation.bumped[there[0]]
