@@ -29,9 +29,14 @@ from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.stats import interval_text, wilson
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import (
+    BehaviourPolicy,
+    Handover,
+    PlannerFollower,
+    RandomPolicy,
+)
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation

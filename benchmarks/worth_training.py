@@ -36,9 +36,9 @@ from numpy.typing import NDArray
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, Episode, EpisodeSpec, draw_episode
 from restock.train.twin.physics.traffic import PEOPLE

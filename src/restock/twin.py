@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from restock.train.twin.calibration.segments import log_segments as log_segments
     from restock.train.twin.calibration.twin_gap import GapConfig as GapConfig
     from restock.train.twin.calibration.twin_gap import write_gap as write_gap
-    from restock.train.twin.env.policies import PlannerFollower as PlannerFollower
-    from restock.train.twin.env.policies import RandomPolicy as RandomPolicy
+    from restock.train.twin.drivers.policies import PlannerFollower as PlannerFollower
+    from restock.train.twin.drivers.policies import RandomPolicy as RandomPolicy
     from restock.train.twin.env.single_env import WarehouseEnv as WarehouseEnv
     from restock.train.twin.env.vector_env import WarehouseVectorEnv as WarehouseVectorEnv
     from restock.train.twin.floors.floors import open_floors as open_floors
@@ -41,7 +41,7 @@ else:
             "restock.train.twin.calibration.open_loop": ["replay_segments"],
             "restock.train.twin.calibration.segments": ["log_segments"],
             "restock.train.twin.calibration.twin_gap": ["GapConfig", "write_gap"],
-            "restock.train.twin.env.policies": ["PlannerFollower", "RandomPolicy"],
+            "restock.train.twin.drivers.policies": ["PlannerFollower", "RandomPolicy"],
             "restock.train.twin.env.single_env": ["WarehouseEnv"],
             "restock.train.twin.env.vector_env": ["WarehouseVectorEnv"],
             "restock.train.twin.floors.floors": ["open_floors"],

@@ -40,7 +40,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.env.operator_policy import Operator
+from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy

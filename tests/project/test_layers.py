@@ -60,20 +60,20 @@ MAY_IMPORT = {
     "train/dqn": "twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
-        "dqn run twin/env twin/floors replay/mixture replay/panel replay/ring replay/sampling"
-        " ingest/task"
+        "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel replay/ring"
+        " replay/sampling ingest/task"
     ),
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
-        "dqn evaluation/off_policy feed run twin/env twin/floors twin/physics replay/panel"
-        " replay/ring replay/store ingest/live ingest/profile ingest/task"
+        "dqn evaluation/off_policy feed run twin/drivers twin/env twin/floors twin/physics"
+        " replay/panel replay/ring replay/store ingest/live ingest/profile ingest/task"
     ),
     "train/comparison": (
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
     ),
     "train/diagnosis": (
-        "feed run twin/calibration twin/env twin/physics replay/panel replay/store ingest/profile"
-        " ingest/store ingest/task"
+        "feed run twin/calibration twin/drivers twin/env twin/physics replay/panel replay/store"
+        " ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
@@ -85,8 +85,9 @@ MAY_IMPORT = {
     "train/twin/floors": "",
     "train/twin/physics": "twin/floors ingest/task",
     "train/twin/env": "twin/floors twin/physics replay/fleet ingest/profile ingest/task",
+    "train/twin/drivers": "twin/env twin/floors twin/physics ingest/task",
     "train/twin/recording": (
-        "twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
+        "twin/drivers twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
     ),
     "train/twin/survey": (
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
@@ -123,8 +124,8 @@ MAY_IMPORT = {
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
-        " replay/mixture replay/panel replay/trace train/dqn train/run train/twin/env"
-        " train/twin/floors"
+        " replay/mixture replay/panel replay/trace train/dqn train/evaluation train/run"
+        " train/twin/env train/twin/floors"
     ),
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"

@@ -12,10 +12,10 @@ from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import label
 from restock.ingest.task.label_scores import true_names
 from restock.ingest.task.signals import STORED_SIGNALS
-from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.truth import EXPOSURES
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
-from restock.train.twin.physics.truth import EXPOSURES
 
 STORED = [signal.name for signal in STORED_SIGNALS]
 

@@ -10,9 +10,14 @@ from support.long import one_in
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
+from restock.train.twin.drivers.operator_policy import Operator, harsh_actions
+from restock.train.twin.drivers.policies import (
+    BehaviourPolicy,
+    Handover,
+    PlannerFollower,
+    RandomPolicy,
+)
 from restock.train.twin.env.navigation import PathFollower
-from restock.train.twin.env.operator_policy import Operator, harsh_actions
-from restock.train.twin.env.policies import BehaviourPolicy, Handover, PlannerFollower, RandomPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec

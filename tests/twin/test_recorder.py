@@ -25,8 +25,8 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
 from restock.train.twin.recording.recorder import (
     HARDWARE,

@@ -18,7 +18,7 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import OpenLoopStart, drive_open_loop
-from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.model import build_robot_alone
 from restock.train.twin.physics.perturbation import Perturbation

@@ -21,8 +21,8 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.evidence.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
+from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.floor_report import describe_floor
-from restock.train.twin.env.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_file import read_floor
 from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame

@@ -19,7 +19,7 @@ from restock.ingest.task.signals import SIGNALS
 from restock.ingest.task.task import observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
-from restock.train.twin.env.policies import PlannerFollower
+from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import (

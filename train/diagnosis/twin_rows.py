@@ -19,8 +19,8 @@ from restock.ingest.task.robot import Robot
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.ingest.task.task import Task
 from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import Handover, PlannerFollower
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import Handover, PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS
 from restock.train.twin.physics.perturbation import Perturbation

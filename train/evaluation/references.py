@@ -19,8 +19,8 @@ def reference(name: str, seed: int = 0) -> Policy:
     Raises:
         ConfigError: there is none of the name.
     """
-    from restock.train.twin.env.operator_policy import Operator
-    from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
+    from restock.train.twin.drivers.operator_policy import Operator
+    from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 
     if name == "planner":
         return PlannerFollower(epsilon=0.0, seed=seed)

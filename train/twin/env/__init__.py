@@ -1,1 +1,1 @@
-"""The twin as Gymnasium environments, and who can drive in it."""
+"""The twin as Gymnasium environments."""

@@ -51,6 +51,7 @@ from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
+from restock.train.twin.env.truth import Truth
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
@@ -58,7 +59,6 @@ from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
-from restock.train.twin.physics.truth import Truth
 
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 

@@ -1,6 +1,6 @@
 """Who drives the recorded fleet: each robot by its own mission's driver, at its own turn.
 
-A driver is a script of `restock.train.twin.env.policies`, or any policy that acts on observations.
+A driver is a script of `restock.train.twin.drivers`, or any policy that acts on observations.
 Each is tagged with a name, a version and the probability of every action, so that what it drove is
 its own behaviour policy in the store.
 """
@@ -11,14 +11,14 @@ import numpy as np
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError
-from restock.train.twin.env.interface import Policy, epsilon_greedy
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import (
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import (
     BehaviourPolicy,
     Handover,
     PlannerFollower,
     RandomPolicy,
 )
+from restock.train.twin.env.interface import Policy, epsilon_greedy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.recording.missions import Mission
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionsFile, as_toml
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.mission_orders import MissionOrders
-from restock.train.twin.env.operator_policy import Operator
-from restock.train.twin.env.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 

@@ -17,7 +17,7 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.route import view_route
 from restock.state import Stateful
-from restock.train.twin.env.foresight import (
+from restock.train.twin.drivers.foresight import (
     PERSON_MARGIN_M,
     margins_of,
     outline_of,
@@ -25,7 +25,7 @@ from restock.train.twin.env.foresight import (
     simulated,
     steps_of,
 )
-from restock.train.twin.env.policies import SoftPolicy
+from restock.train.twin.drivers.policies import SoftPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.floors.state_lattice import (
