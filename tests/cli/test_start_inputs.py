@@ -15,11 +15,18 @@ from support.profile_texts import WAREHOUSE
 
 from restock import cli
 from restock.cli.start import stages
-from restock.cli.start.decisions import practice_settings, updates_settings
+from restock.cli.start.decisions import (
+    floor_settings,
+    missions_unseen,
+    practice_settings,
+    updates_settings,
+)
 from restock.cli.start.settings import Settings
 from restock.cli.start.work import Work
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile_text import profile_toml
 from restock.replay.store.store import Store
+from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.floors.occupancy_map import write_pgm
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
@@ -276,3 +283,22 @@ def test_what_is_wrong_with_an_option_is_said_before_the_first_stage(
     assert why in said.err
     assert said.out == ""
     assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(
+    tmp_path: Path, lidar: bool
+) -> None:
+    profile = tmp_path / "robot.toml"
+    text = profile_toml(load_profile("turtlebot3"))
+    if not lidar:
+        lines = text.replace("sectors = 36", "sectors = 0").splitlines()
+        text = "\n".join(line for line in lines if not line.startswith("scan = "))
+    profile.write_text(text)
+    assert load_profile(profile).task.lidar is lidar
+    to, floor = Settings((), tmp_path, profile=profile), {"episodes": list(DEFAULT_CONDITIONS)}
+    conditions = [one for one in floor_settings(to, floor) if one.startswith("env.conditions")]
+    assert bool(conditions) is not lidar
+    assert not any("blocked_aisle" in one for one in conditions)
+    assert (missions_unseen(to, floor) is None) is lidar
+    assert missions_unseen(to, {"episodes": ["nominal"]}) is None

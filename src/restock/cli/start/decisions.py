@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from restock.cli.start.outcomes import of_nominal
 from restock.cli.start.settings import Settings
@@ -14,10 +14,14 @@ from restock.cli.start.work import FOLDER, Ended
 from restock.errors import ConfigError
 from restock.files import read_json
 
+if TYPE_CHECKING:
+    from restock.ingest.task.task import Task
+
 STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is made for
 WARM_UP_PART = 0.5  # of the draws that few rows allow
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
 INTERVALS = 20  # at least so many points of every curve
+BLOCKED = "blocked_aisle"
 DRIVERS = "behaviour_policies"  # of a row of the coverage
 
 
@@ -69,21 +73,25 @@ def of_other_kinds(out: Path) -> list[str]:
 
 def horizon(profile: Path | str | None) -> float:
     """Some 3 s in whole control periods: the twin's limits are of that."""
-    from restock.ingest.profile.profile import load_profile
-
-    if profile is None or (isinstance(profile, Path) and not profile.is_file()):
+    if (task := _task(profile)) is None:
         return 3.0
-    period_s = load_profile(str(profile)).task.control_period_s
+    period_s = task.control_period_s
     return round(max(round(3.0 / period_s), 1) * period_s, 6)
 
 
 def has_goal(profile: Path | str | None) -> bool:
     """Whether the task has one: without, there is no success to compare."""
+    task = _task(profile)
+    return task is None or task.goal != "none"
+
+
+def _task(profile: Path | str | None) -> Task | None:
+    """Of a profile; None where there is none yet, as before a proposal."""
     from restock.ingest.profile.profile import load_profile
 
     if profile is None or (isinstance(profile, Path) and not profile.is_file()):
-        return True
-    return load_profile(str(profile)).task.goal != "none"
+        return None
+    return load_profile(str(profile)).task
 
 
 def practice_settings(profile: Path | str | None) -> list[str]:
@@ -152,16 +160,29 @@ def no_ways(to: Settings, floor: Document) -> str | None:
 
 
 def floor_settings(to: Settings, document: Document) -> list[str]:
-    """Train on that floor, on the kinds of episode that it has room for."""
+    """Train on that floor, on the kinds of episode that it has room for and that can be done."""
     from restock.toml import toml_value
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 
     settings = [f"env.layouts={to.floor}"]
     fitting = document.get("episodes", [])
-    kinds = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in fitting}
+    unseen = {BLOCKED} if missions_unseen(to, document) else set()
+    kinds = {
+        name: share
+        for name, share in DEFAULT_CONDITIONS.items()
+        if name in fitting and name not in unseen
+    }
     if fitting and len(kinds) < len(DEFAULT_CONDITIONS):
         settings.append(f"env.conditions={toml_value(kinds)}")
     return settings
+
+
+def missions_unseen(to: Settings, document: Document) -> str | None:
+    """What there is room for on the floor and no sensor sees, so that it is left out."""
+    task = _task(to.profile)
+    if task is None or task.lidar or BLOCKED not in document.get("episodes", []):
+        return None
+    return "no missions with blocked aisles: without a lidar, a robot finds one by driving into it"
 
 
 def logs_alone_settings(coverage: Document) -> list[str]:
@@ -234,6 +255,7 @@ __all__ = [
     "has_goal",
     "horizon",
     "logs_alone_settings",
+    "missions_unseen",
     "mistrust",
     "no_room",
     "no_ways",

@@ -15,6 +15,7 @@ from restock.cli.start.decisions import (
     has_goal,
     horizon,
     logs_alone_settings,
+    missions_unseen,
     mistrust,
     no_room,
     no_ways,
@@ -196,6 +197,8 @@ class Way:
         settings = practice_settings(to.profile)
         if floor.good:
             settings += floor_settings(to, floor.document)
+            if (unseen := missions_unseen(to, floor.document)) is not None:
+                self._warn(unseen)
         gap, fitted = self._fit()
         if fitted:
             settings.append(f"env.perturbation={to.fitted}")
