@@ -209,3 +209,19 @@ def test_every_common_type_can_be_gone_through(kind, capsys):
     said = json.loads(capsys.readouterr().out)
     assert said["transitions"] == 0 != len(said["problems"])  # two messages a topic
     parse_profile(with_all_signals(said["toml"]), where="p")
+
+
+@pytest.mark.parametrize("bumper", [True, False])
+def test_a_contact_ends_an_episode_whether_a_bumper_was_recorded_or_not(bumper, tmp_path, capsys):
+    class Robot(Drive):
+        def topics(self):
+            topics = super().topics()
+            if not bumper:
+                del topics["/bumper"]
+            return topics
+
+    recording = write_bag(Robot(8.0), tmp_path / "bag")
+    file = proposed(recording, tmp_path, capsys)
+    assert load_profile(file).task.bump_terminates
+    assert ("no bumper seen" in file.read_text()) is not bumper
+    assert check(file, recording, capsys)["transitions"] > 30

@@ -15,15 +15,7 @@ import numpy as np
 from restock import native
 from restock.arrays import F64, Ints
 from restock.train.twin.physics.contact import OBSTACLE_GROUP
-from restock.train.twin.physics.model import (
-    FORKLIFT_HALF_M,
-    FORKLIFTS,
-    PALLET_HALF_M,
-    PALLETS,
-    PEOPLE,
-    PERSON_HALF_HEIGHT_M,
-    PERSON_RADIUS_M,
-)
+from restock.train.twin.physics.model import MOVING_HALF_M
 from restock.train.twin.physics.scenery import Scenery
 
 FAR_AWAY = (1e9, 1e9, 1.0, 0.0, 0.1, 0.1)  # of a shape that the beams pass over or under
@@ -43,12 +35,8 @@ class Lidar:
         standing = [self._in_plane(*boxes) for boxes in scenery.buildings]
         self._first = np.cumsum([0, *(len(boxes) for boxes in standing)])
         self._standing = np.concatenate(standing)
-        kinds = (
-            (PALLETS, (*PALLET_HALF_M[:2], PALLET_HALF_M[2])),
-            (PEOPLE, (PERSON_RADIUS_M, 0.0, PERSON_HALF_HEIGHT_M)),  # 0: it is round
-            (FORKLIFTS, FORKLIFT_HALF_M),
-        )
-        self._moving = np.array([half for count, half in kinds for _ in range(count)])
+        self._half_m = MOVING_HALF_M[:, :2].copy()  # of pallets, people and forklifts
+        self._half_m[scenery.handles.people, 1] = 0.0  # they are round
 
     def _in_plane(self, middle: F64, half: F64) -> F64:
         """Boxes (G, 4) that the plane of the beams cuts: x, y and half sizes."""
@@ -85,8 +73,8 @@ class Lidar:
         shapes[..., :2] = position[..., :2]
         shapes[..., 2] = quat[..., 0] * quat[..., 0] - quat[..., 3] * quat[..., 3]
         shapes[..., 3] = 2 * (quat[..., 0] * quat[..., 3])
-        shapes[..., 4:] = self._moving[:, :2]
-        above = np.abs(position[..., 2] - self.height_m) > self._moving[:, 2]
+        shapes[..., 4:] = self._half_m
+        above = np.abs(position[..., 2] - self.height_m) > MOVING_HALF_M[:, 2]
         shapes[above] = FAR_AWAY
         return shapes
 

@@ -30,6 +30,12 @@ PERSON_RADIUS_M = 0.25
 PERSON_HALF_HEIGHT_M = 0.85
 FORKLIFTS = 1
 FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
+# Of the mocap bodies (M, 3), in their order; a person is a cylinder.
+MOVING_HALF_M = np.repeat(
+    [PALLET_HALF_M, (PERSON_RADIUS_M, PERSON_RADIUS_M, PERSON_HALF_HEIGHT_M), FORKLIFT_HALF_M],
+    [PALLETS, PEOPLE, FORKLIFTS],
+    axis=0,
+)
 PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
 PARKED_RACK_M = (-60.0, -60.0, 1.0)
 RACK_HALF_HEIGHT_M = 0.75

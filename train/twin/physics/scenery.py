@@ -16,13 +16,9 @@ from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.model import (
-    FORKLIFT_HALF_M,
-    FORKLIFTS,
-    PALLET_HALF_M,
+    MOVING_HALF_M,
     PALLETS,
     PARKED_M,
-    PEOPLE,
-    PERSON_HALF_HEIGHT_M,
     Handles,
     building_boxes,
 )
@@ -52,10 +48,6 @@ class Scenery(Stateful):
         self.walked = np.zeros(0, np.int64)  # where traffic moved in the last block
         self.position_m = batch.bind("mocap_pos")  # (N, nmocap, 3) of pallets, people, forklifts
         self.quat = batch.bind("mocap_quat")
-        self._half_height_m = np.repeat(
-            [PALLET_HALF_M[2], PERSON_HALF_HEIGHT_M, FORKLIFT_HALF_M[2]],
-            [PALLETS, PEOPLE, FORKLIFTS],
-        )
         self.buildings = [building_boxes(floor, rack_slots) for floor in floors]
         self.floor = np.zeros(num_envs, np.int64)  # whose building stands
 
@@ -74,7 +66,7 @@ class Scenery(Stateful):
         """Pallets, people and forklifts as an episode begins."""
         self.pallets[env] = episode.pallets
         self.position_m[env, :, :2] = PARKED_M[:2]
-        self.position_m[env, :, 2] = self._half_height_m  # they stand on the floor
+        self.position_m[env, :, 2] = MOVING_HALF_M[:, 2]  # they stand on the floor
         self.quat[env, :, :] = (1.0, 0.0, 0.0, 0.0)
         span = self.handles.pallets
         self.position_m[env, span, :2] = episode.pallets[:, :2]

@@ -132,7 +132,7 @@ class Way:
         flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
         flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
         flags += [ODOMETRY] * asked.odometry_as_command
-        flags += ["--hindsight-goals"]  # without a goal there is no success to train for
+        flags.append("--hindsight-goals")  # without a goal there is no success to train for
         proposed = self.work.do(stages.propose(to, sources, flags, asked.urdf))
         if not proposed.good:
             raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
