@@ -77,7 +77,7 @@ def test_conditions_are_rare_and_all_there(manifest: dict[str, Any]) -> None:
         *("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
     }
     for made in manifest["recorded"].values():
-        assert set(made["policy_steps"]) == {"planner 1", "planner 2", "operator 2"}
+        assert set(made["policy_steps"]) == {"planner 1", "planner 2", "operator 4"}
         assert made["handovers"] > 0
     assert sum(sum(m["missions"].values()) for m in manifest["recorded"].values()) > 60
 
