@@ -153,7 +153,7 @@ def _check_conditions(profile: Profile, where: str) -> None:
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):
-        condition = condition.with_constants(profile.noise.constants)
+        condition = condition.with_constants(profile.constants)
         try:
             label_with_probabilities(steps, [condition])
         except ConfigError as error:

@@ -48,9 +48,10 @@ from restock.ingest.profile.robot_file import with_robot_file
 from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
 from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import shipped, with_files
-from restock.ingest.task.conditions import Condition, Kind, Noise, labels_version, of_kind
+from restock.ingest.task.conditions import Condition, Kind, labels_version, of_kind
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.limiter import Limiter
+from restock.ingest.task.noise import Noise
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
@@ -97,10 +98,15 @@ class Profile(Checked, frozen=True):
         """The situations that are listed beside them."""
         return self._of("exposure", self.shipped_exposures)
 
+    @property
+    def constants(self) -> dict[str, float]:
+        """What the SQL of its conditions may name beside the columns of steps."""
+        return self.noise.constants | self.task.condition_limits
+
     def _of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
-        known = shipped(self.noise, kind)
+        known = shipped(self.constants, kind)
         own = of_kind(self.own_conditions, kind)
-        constants = self.noise.constants
+        constants = self.constants
         return [known[name] for name in names] + [one.with_constants(constants) for one in own]
 
     @property

@@ -44,7 +44,7 @@ def read_profile_toml(text: str, *, where: str) -> Profile:
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
     """The same profile with other conditions; those that come with Restock go by their names."""
-    known = shipped(profile.noise) | shipped(profile.noise, "exposure")
+    known = shipped(profile.constants) | shipped(profile.constants, "exposure")
     named = [c for c in conditions if known.get(c.name) == c]
     return msgspec.structs.replace(
         profile,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import textwrap
 
-import msgspec
 import numpy as np
 
 from restock.errors import visible
@@ -15,11 +13,8 @@ from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.evidence.cameras import camera_lines
 from restock.ingest.propose.evidence.clock_choice import ClockChoice
-from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.footprint import GUESS
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
-from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import (
     FIX,
     KINDS,
@@ -28,17 +23,11 @@ from restock.ingest.propose.evidence.roles import (
     Kind,
     Roles,
 )
-from restock.ingest.propose.evidence.scanned_outline import range_lines
+from restock.ingest.propose.task_lines import actions_of, task_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import unseen
-from restock.ingest.task.robot import Robot
-from restock.ingest.task.task import Task
-
-GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
-ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
-LONGEST_TIME_LIMIT_STEPS = 1000
-MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
+from restock.ingest.task.noise import Noise
 
 
 def profile_lines(
@@ -57,13 +46,14 @@ def profile_lines(
         f'name = "{name}"',
         f"conditions = {json.dumps(_conditions(seen))}",
         *_unknown_lines(seen),
+        *_slip_lines(seen),
         f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
         f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
         "",
-        *_task_lines(seen, trial),
+        *task_lines(seen, trial),
         *seen.goal.table_lines(),
         *_robot_lines(seen),
-        *_noise_lines(seen),
+        *_noise_lines(seen, trial),
         *_clock_lines(seen.clock, trial),
     ]
     for role, fitting in seen.roles.items():
@@ -91,8 +81,25 @@ def profile_lines(
 
 def _conditions(seen: Evidence) -> list[str]:
     """The shipped conditions that this robot's signals can show."""
-    slip = ["wheel_slip"] if seen.motion is None else []
+    slip = ["wheel_slip"] if _shows_slip(seen) else []
     return ["recovery", "near_collision", *slip, "blocked_aisle"]
+
+
+def _shows_slip(seen: Evidence) -> bool:
+    """Whether anything beside its wheels says how the robot moved."""
+    return seen.motion is None and not _slip_lines(seen)
+
+
+def _slip_lines(seen: Evidence) -> list[str]:
+    """Why odometry alone shows no slip."""
+    pose, wheels = (seen.roles[role][:1] for role in ("pose", "wheels"))
+    same = pose and wheels and pose[0][0].name == wheels[0][0].name and not seen.poses_from_frames
+    if not same or seen.roles["imu"]:
+        return []
+    return [
+        f"# No wheel_slip: poses and wheel speeds are both of {pose[0][0].name}, and there is no"
+        " IMU: nothing would show it."
+    ]
 
 
 def _unknown_lines(seen: Evidence) -> list[str]:
@@ -106,7 +113,7 @@ def _unknown_lines(seen: Evidence) -> list[str]:
 
 def _exposures(seen: Evidence) -> list[str]:
     """The shipped exposures that this robot's signals can show."""
-    slip = ["slippery_floor"] if seen.motion is None else []
+    slip = ["slippery_floor"] if _shows_slip(seen) else []
     return slip + (["closing_traffic", "plan_blocked"] if seen.roles["scan"] else [])
 
 
@@ -134,11 +141,6 @@ def _trial_lines(trial: Trial) -> list[str]:
     return [f"# It gives {trial.transitions:,} transitions from {trial.ticks:,} ticks{dropped}."]
 
 
-def _said(trial: Trial, *keys: str) -> list[str]:
-    """What the trial says of these keys, as comments."""
-    return [f"# {each.text}." for each in trial.advice if each.key in keys]
-
-
 def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str]:
     """Every topic with its rate and what it is taken for, as a comment."""
     taken: dict[str, list[str]] = {}
@@ -153,75 +155,6 @@ def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str
         why = f"skipped: {topic.skipped}" if topic.skipped else ", ".join(taken.get(name, []))
         lines.append(f"# {name:<{width}}  {topic.type:<{kinds}}  {rate}  {why}".rstrip())
     return [*lines, ""]
-
-
-def _task_lines(seen: Evidence, trial: Trial) -> list[str]:
-    roles, commands = seen.roles, seen.commands
-    kind = "speeds" if commands.measured else "commands"
-    held_back = [
-        f"# {told} beyond {reached:g} {unit} were commanded, but not reached by the robot."
-        for told, reached, unit in zip(
-            ("Speeds", "Yaw rates"), commands.reached, ("m/s", "rad/s"), strict=True
-        )
-        if reached is not None
-    ]
-    origin = f"from {commands.count} {kind} of {commands.topic}" if commands.count else "a guess"
-    actions = _actions(commands, seen.robot)
-    return [
-        "[task]",
-        *_bump_lines(seen.recording, roles),
-        *seen.goal.task_lines((seen.footprint if seen.footprint.measured else GUESS).length_m),
-        f"control_period_s = {seen.clock.period_s:g}",
-        *_time_limit_lines(seen, max(speed for speed, _ in actions)),
-        *_range_lines(seen),
-        *held_back,
-        f"actions = [  # (m/s, rad/s), {origin}; the first must be stop",
-        *(f"  [{v:.3g}, {w:.3g}]," for v, w in actions),
-        "]",
-        "",
-        *_body_lines(seen, trial),
-    ]
-
-
-def _time_limit_lines(seen: Evidence, speed_mps: float) -> list[str]:
-    """The time limit of a robot that is too slow for the one that a task has otherwise."""
-    if seen.goal.source is None or speed_mps <= 0.0:
-        return []
-    steps = 10 * math.ceil(ROUTE_M / (speed_mps * seen.clock.period_s) / 10)
-    (default,) = (f.default for f in msgspec.structs.fields(Task) if f.name == "time_limit_steps")
-    if steps <= default:
-        return []
-    steps = min(steps, LONGEST_TIME_LIMIT_STEPS)
-    reach_m = steps * seen.clock.period_s * speed_mps
-    return [f"time_limit_steps = {steps}  # {reach_m:.0f} m at {speed_mps:.3g} m/s"]
-
-
-def _actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
-    """Speeds (m/s) and yaw rates (rad/s) by the fastest that were commanded; the first is stop."""
-    speed, turn = commands.speed_mps, commands.yaw_rate_radps
-    if robot.values.get("drive") == "ackermann":
-        return _steered_actions(commands, robot)
-    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
-    actions += [(0.8 * speed, 0.6 * turn), (0.8 * speed, -0.6 * turn), (0.0, turn), (0.0, -turn)]
-    if 0.8 * speed > GENTLE_MPS:  # over slippery floor it needs a curve, too, that is none of these
-        slow, bend = min(0.35 * speed, GENTLE_MPS), min(0.5 * turn, GENTLE_RADPS)
-        actions += [(slow, bend), (slow, -bend)]
-    actions += [(-speed / 2, 0.0)] if commands.backs else []
-    return actions
-
-
-def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
-    """Of a robot that steers: no turn on the spot, nor one tighter than its steering allows."""
-    speed, turn = commands.speed_mps, commands.yaw_rate_radps
-    known = {key: robot.values[key] for key in ("max_steering_rad",) if key in robot.values}
-    wheelbase_m = robot.values.get("wheelbase_m", commands.wheelbase_m)
-    least_m = Robot(drive="ackermann", wheelbase_m=wheelbase_m, **known).min_turning_radius_m
-    slow = 0.4 * speed
-    wide, tight = min(0.6 * turn, 0.8 * speed / least_m), min(turn, slow / least_m)
-    curves = [(0.8 * speed, wide), (slow, tight), *([(-slow, tight)] if commands.backs else [])]
-    actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
-    actions += [(v, side * 0.99 * w) for v, w in curves for side in (1, -1)]
-    return actions + ([(-slow, 0.0)] if commands.backs else [])
 
 
 def steered_by(seen: Evidence) -> str:
@@ -247,56 +180,7 @@ def steered_by(seen: Evidence) -> str:
 def _robot_lines(seen: Evidence) -> list[str]:
     """What the twin builds; the actions are within its limits."""
     robot = seen.robot.limited(*seen.commands.reached)
-    return robot.lines(*np.abs(_actions(seen.commands, robot)).max(axis=0).tolist())
-
-
-def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
-    """A bumper stops the robot, unless it is pressed so often that it hardly is one.
-
-    Without one nothing changes in logs; in the twin, which knows every contact, a robot would else
-    press on against a wall to the end of its time.
-    """
-    if not roles["bumper"]:
-        return ["bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"]
-    topic, kind = roles["bumper"][0]
-    fields = recording.read({topic.name: [kind.fields["pressed"]]})[topic.name].fields
-    pressed = np.asarray(fields[kind.fields["pressed"]], np.float64) > 0
-    if len(pressed) and pressed.mean() > MOSTLY_FREE:
-        return [
-            f"# {topic.name} is pressed in {pressed.mean():.0%} of its messages: CHECK its meaning",
-            "# bump_terminates = true  # a protective stop; what follows is another episode",
-        ]
-    return ["bump_terminates = true  # a protective stop; what follows is another episode"]
-
-
-def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
-    footprint = seen.footprint
-    x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
-    return [
-        "[task.body]  # the outline, from which clearance is measured",
-        f"# {footprint.source}"
-        + ("" if footprint.measured else ", or give --footprint LENGTHxWIDTH"),
-        *(f"# {note}" for note in seen.footprint_notes),
-        *_said(trial, "task.body"),
-        f"length_m = {round(footprint.length_m, 4):g}",
-        f"width_m = {round(footprint.width_m, 4):g}",
-        *(
-            [
-                f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
-                + ("; a guess" if x is None else f"; {footprint.lidar_source}")
-            ]
-            if seen.roles["scan"]
-            else []
-        ),
-        *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
-        "",
-    ]
-
-
-def _range_lines(seen: Evidence) -> list[str]:
-    if not seen.roles["scan"]:
-        return ["sectors = 0  # no lidar: clearance is unknown, and no part of the observation"]
-    return range_lines(seen.recording, seen.roles["scan"][0][0].name, seen.outline)
+    return robot.lines(*np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist())
 
 
 def _fix_topic(seen: Evidence) -> str:
@@ -305,9 +189,18 @@ def _fix_topic(seen: Evidence) -> str:
     return pose[0][0].name if pose and pose[0][0].type == FIX else ""
 
 
-def _noise_lines(seen: Evidence) -> list[str]:
+def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
+    """How noisy its poses are, where that is more than a profile has otherwise."""
     if not (topic := _fix_topic(seen)):
-        return []
+        noise_m = trial.pose_noise_m
+        if noise_m is None or noise_m <= Noise().localiser_m or not _shows_slip(seen):
+            return []
+        return [
+            "[noise]",
+            f"localiser_m = {noise_m:.2g}  # by so much poses and wheels differ here in a control"
+            " period; less would be taken for slip",
+            "",
+        ]
     apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)
     return fix_noise_lines(seen.recording, topic, 2 * seen.commands.speed_mps * apart_s)
 
@@ -319,9 +212,9 @@ def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
         "[clock]",
         *(f"# {comment}" for comment in clock.comments),
         f'alignment = "{clock.alignment}"' + offset,
-        *_said(trial, "clock.steps"),
+        *trial.comments("clock.steps"),
         f'steps = "{clock.steps}"  # {why}' + ("" if clock.every_s is None else ", mostly"),
-        *_said(trial, "clock.max_gap_s"),
+        *trial.comments("clock.max_gap_s"),
         f"max_gap_s = {clock.max_gap_s:g}  # a longer one ends an episode",
         "",
     ]
@@ -394,7 +287,7 @@ def _input_lines(
             lines += [f"# {comment}" for comment in seen.hold.comments]
             if seen.hold.stops_hold:
                 lines.append("stop_holds = true  # a command to stop, until the next one")
-        lines += [*_said(trial, f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
+        lines += [*trial.comments(f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
     if role in FALLBACKS:
         lines.append("optional = true")
     return [*lines, ""]

@@ -21,12 +21,14 @@ from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.task.task import Task
 
 MUCH = 0.1  # of the ticks: what costs so many is worth a word
 GAIN = 1.1  # times the transitions: what gives so many is worth a try
-NEAR_M = 0.14  # as of the shipped conditions near_collision and recovery
 OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
 OFTEN_INSIDE = 0.02
+MOVING, LEAST_MOVING = 0.2, 30  # of the fastest action; ticks
+NOISE_IN_LIMIT = 1.25  # slip is more than twice what the noise makes of a period's speed
 EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
 EVEN = 0.25  # of a control period
 UNEVEN = 4.0  # times the time that can be followed: worth a tick a period
@@ -55,6 +57,11 @@ class Trial:
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     advice: list[Advice] = field(default_factory=list)
     problem: str = ""  # why there is nothing
+    pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
+
+    def comments(self, *keys: str) -> list[str]:
+        """What it says of these keys of the profile, as comments of its TOML."""
+        return [f"# {each.text}." for each in self.advice if each.key in keys]
 
 
 def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
@@ -85,7 +92,26 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         dict(endings.most_common()),
         advice,
         problem,
+        _pose_noise_m(steps, profile.task),
     )
+
+
+def _pose_noise_m(steps: Steps, task: Task) -> float | None:
+    """The noise of poses over a control period, for limits of slip well above how far they and the
+    wheels differ, over two periods, at nine in ten of the ticks at which either moved."""
+    wheels_mps = steps.signals["wheel_speed_mps"]
+    usable = np.array([problem == "" for problem in steps.problem], np.bool_)
+    follows = (np.diff(steps.segment) == 0) & usable[1:] & usable[:-1]
+    driven_mps = (wheels_mps[1:] + wheels_mps[:-1]) / 2
+    poses_mps = steps.signals["localised_speed_mps"][1:]
+    fastest_mps = max(abs(speed) for speed, _ in task.actions)
+    follows &= np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * fastest_mps
+    off_mps = driven_mps - poses_mps
+    off_mps[1:] = (off_mps[1:] + off_mps[:-1]) / 2
+    off_mps = np.abs(off_mps[follows])
+    if len(off_mps) < LEAST_MOVING or np.isnan(off_mps).any():
+        return None
+    return float(np.percentile(off_mps, 90)) * task.control_period_s / NOISE_IN_LIMIT
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:
@@ -180,14 +206,15 @@ class _Advisor:
             return []
         usable = np.array([problem == "" for problem in self.steps.problem], np.bool_)
         clearance = self.steps.signals["clearance_m"][usable]
-        inside, near = int((clearance <= 0).sum()), int((clearance < NEAR_M).sum())
+        near_m = self.profile.task.rewards.tight_clearance_m  # as of near_collision and recovery
+        inside, near = int((clearance <= 0).sum()), int((clearance < near_m).sum())
         often = inside > OFTEN_INSIDE * len(clearance) or near > OFTEN_NEAR * len(clearance)
         if not len(clearance) or not often:
             return []
         body = self.profile.task.body
         text = (
             f"with an outline of {body.length_m:g} x {body.width_m:g} m, the lidar sees something "
-            f"nearer than {NEAR_M:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
+            f"nearer than {near_m:g} m at {near:,} of {len(clearance):,} ticks, and inside the "
             f"robot at {inside:,}: these are labelled near_collision and recovery. Measure the "
             "robot"
         )

@@ -20,6 +20,7 @@ are not.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -27,19 +28,24 @@ from typing import Any
 import msgspec
 
 from restock.errors import ConfigError
-from restock.ingest.task.conditions import Condition, Kind, Noise
+from restock.ingest.task.conditions import Condition, Kind
+from restock.ingest.task.noise import Noise
+from restock.ingest.task.task import STAND_IN_LIMITS
 
 LARGEST_BYTES = 100_000  # of a condition's file
 _PART = re.compile(r"-- (?:let ([A-Za-z]\w*)|(label|probability)):\s*")
 _SETTINGS = ("kind", "timing", "priority", "uncertain")
 
 
-def shipped(noise: Noise | None = None, kind: Kind = "outcome") -> dict[str, Condition]:
+def shipped(
+    constants: Mapping[str, float] | None = None, kind: Kind = "outcome"
+) -> dict[str, Condition]:
     """The conditions of a kind that come with Restock, by name: `ingest/task/conditions/*.sql`.
 
-    `noise` is of the sensors of the robot whose steps they label; None: as the profile's defaults.
+    `constants` are `Profile.constants` of the robot whose steps they label; None: of the stand-in,
+    with a profile's default noise.
     """
-    constants = (noise or Noise()).constants
+    constants = constants or Noise().constants | STAND_IN_LIMITS
     folder = files("restock.ingest.task") / "conditions"
     conditions = {}
     for entry in sorted(folder.iterdir(), key=lambda item: item.name):

@@ -15,6 +15,10 @@ A condition may have a **probability** beside its label: an expression of the sa
 0 to 1, from how far the signals are from the rule's limits against the noise of the sensors. A step
 whose probability lies within the condition's `uncertain` band is too near to call.
 
+Its limits may follow the robot: its SQL may name the profile's [noise], and `Task.condition_limits`
+(how near is near, how much is slip, the control period); a number of steps may be written as a
+time, `{1.6 s}`.
+
 A condition is of one of two kinds. An **outcome** (the default) names what came of it, and gives a
 row its one `condition`. An **exposure** names the situation, whatever came of it: someone close by,
 a blocked plan. It is `pre`, has no probability, is listed beside the outcomes (`exposures`), and
@@ -33,13 +37,12 @@ import hashlib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
-from msgspec import Meta
 
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
@@ -52,6 +55,7 @@ Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
 Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
+_TIME = re.compile(r"\{(\d*\.?\d+) s\}")
 NO_LIDAR = "no lidar"  # why a condition is unknown
 
 
@@ -70,10 +74,21 @@ class Condition(Checked, frozen=True):
     kind: Kind = "outcome"  # "exposure": a situation, whatever the outcome
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
-        """The condition with those of the constants that its SQL names; its own win."""
-        words = self.words
+        """The condition of one robot: with those of the constants that its SQL names; its own win.
+
+        Where `control_period_s` is among them, times such as `{1.6 s}` become numbers of steps.
+        """
+        made = self
+        if period_s := constants.get("control_period_s"):
+            made = msgspec.structs.replace(
+                self,
+                sql=_in_steps(self.sql, period_s),
+                probability=_in_steps(self.probability, period_s),
+                let={name: _in_steps(sql, period_s) for name, sql in self.let.items()},
+            )
+        words = made.words
         used = {name: value for name, value in constants.items() if name in words}
-        return msgspec.structs.replace(self, constants=used | self.constants)
+        return msgspec.structs.replace(made, constants=used | self.constants)
 
     @property
     def words(self) -> set[str]:
@@ -100,22 +115,9 @@ class Condition(Checked, frozen=True):
             )
 
 
-class Noise(Checked, frozen=True):
-    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
-
-    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
-    """
-
-    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # standard deviation of a range
-    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the distance between two poses, per axis
-    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the wheel speed
-    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # of the yaw rate, including bias
-
-    @property
-    def constants(self) -> dict[str, float]:
-        """Each by the name that SQL has for it."""
-        named = msgspec.structs.asdict(self)
-        return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}
+def _in_steps(sql: str, period_s: float) -> str:
+    """SQL with times as numbers of steps of so long: one or more."""
+    return _TIME.sub(lambda time: str(max(round(float(time[1]) / period_s), 1)), sql)
 
 
 def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:

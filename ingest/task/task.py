@@ -26,6 +26,8 @@ from restock.toml import Checked
 # different code are never mixed unseen.
 TASK_CODE_VERSION = 2
 
+SLIP_MPS = 0.15  # wheels against the world: slip, of a robot of 1 m/s or faster
+
 
 class Rewards(Checked, frozen=True):
     """What each event of a step is worth."""
@@ -99,11 +101,34 @@ class Task(Checked, frozen=True):
         return [_action_name(*action) for action in self.actions]
 
     @property
+    def slip_limit_mps(self) -> float:
+        """How fast wheels move over the floor that slip."""
+        fastest = max(abs(speed) for speed, _ in self.actions)
+        return SLIP_MPS * min(fastest or 1.0, 1.0)
+
+    @property
+    def condition_limits(self) -> dict[str, float]:
+        """What the SQL of conditions may name of the robot's task."""
+        return {
+            "tight_clearance_m": self.rewards.tight_clearance_m,
+            "body_width_m": self.body.width_m,
+            "slip_limit_mps": self.slip_limit_mps,
+            "control_period_s": self.control_period_s,
+        }
+
+    @property
     def hash(self) -> str:
         """Names the definition, its parameters and the version of this code: 12 hex digits."""
         content = msgspec.json.encode([TASK_CODE_VERSION, self])
         return hashlib.blake2b(content, digest_size=6).hexdigest()
 
+
+STAND_IN_LIMITS = {  # `condition_limits` of the stand-in
+    "tight_clearance_m": 0.15,
+    "body_width_m": 0.5,
+    "slip_limit_mps": SLIP_MPS,
+    "control_period_s": 0.2,
+}
 
 # Entries of an observation that change their sign where left and right are exchanged.
 _ODD = ("near_sin", "far_sin", "gyro_yaw_rate", "slip_yaw_rate", "lateral_speed", "nav_yaw_rate")

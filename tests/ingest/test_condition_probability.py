@@ -19,12 +19,12 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import settings_of, shipped
 from restock.ingest.task.conditions import (
     Condition,
-    Noise,
     label,
     labels_version,
     probabilities,
     too_near_to_call,
 )
+from restock.ingest.task.noise import Noise
 from restock.ingest.task.schema import COVERAGE, steps_schema
 from restock.replay.store.store import Store
 
@@ -124,10 +124,10 @@ def test_a_profile_states_the_noise_and_stays_the_same_profile_for_rows():
     assert usual.hash == noisy.hash
     assert usual.labels_version != noisy.labels_version
     near = next(one for one in noisy.conditions if one.name == "near_collision")
-    assert near.constants == {"lidar_noise_m": 0.05}
+    assert near.constants == {"lidar_noise_m": 0.05, "tight_clearance_m": 0.15}
     carried = read_profile_toml(profile_toml(noisy), where="its text")
     assert carried.labels_version == noisy.labels_version
-    assert shipped(noisy.noise)["near_collision"] == near
+    assert shipped(noisy.constants)["near_collision"] == near
     with pytest.raises(ConfigError, match="lidar_m"):
         parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0\n", where="c")
 

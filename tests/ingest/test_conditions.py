@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from restock.errors import ConfigError
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
+from restock.ingest.task.noise import Noise
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 
 SHIPPED = list(shipped().values())
@@ -124,6 +125,47 @@ def test_recovery_lasts_until_there_is_room_again():
     assert found[0] >= 10
     assert found[-1] <= 17
     assert found == list(range(found[0], found[-1] + 1))
+
+
+SMALL = {  # of a robot of .2 m/s that is .15 m wide, and decides ten times a second
+    "tight_clearance_m": 0.05,
+    "body_width_m": 0.15,
+    "slip_limit_mps": 0.03,
+    "control_period_s": 0.1,
+}
+
+
+def held_by(constants: dict[str, float], table: pa.Table, name: str) -> list[int]:
+    made = (shipped(constants) | shipped(constants, "exposure"))[name]
+    return np.flatnonzero(label(table, [made])[name]).tolist()
+
+
+def test_how_near_is_near_follows_the_robot():
+    table = steps(30, clearance_m=np.array([2.0] * 10 + [0.1] * 3 + [0.2] * 4 + [0.5] * 13))
+    small = Noise().constants | SMALL
+    assert given_to(table, "near_collision")
+    assert held_by(small, table, "near_collision") == held_by(small, table, "recovery") == []
+    nearer = steps(30, clearance_m=np.array([2.0] * 10 + [0.02] * 3 + [0.2] * 17))
+    assert {9, 10, 11} <= set(held_by(small, nearer, "near_collision")) <= set(range(8, 13))
+    assert held_by(small, nearer, "recovery")[-1] <= 13  # there is room again at .1 m
+
+
+def test_how_much_is_slip_follows_the_robot_and_its_localisers_noise():
+    table = steps(20, wheel_speed_mps=changed(0.62, 0.5, 20, slice(8, 14)))
+    assert given_to(table, "wheel_slip") == []
+    still = Noise(localiser_m=0.002).constants | SMALL
+    assert set(range(9, 12)) <= set(held_by(still, table, "wheel_slip")) <= set(range(7, 15))
+    assert held_by(still, table, "slippery_floor")
+    # What two poses a tenth of a second apart make of a centimetre is no slip.
+    assert held_by(Noise(localiser_m=0.01).constants | SMALL, table, "wheel_slip") == []
+
+
+def test_times_are_in_steps_of_the_robot():
+    came = changed(0.3, 0.0, 40, slice(8, 9))
+    for period_s, last in ((0.2, 16), (0.1, 24), (0.5, 11), (3.0, 10)):  # .6 s and 1 s, in steps
+        task = Noise().constants | SMALL | {"control_period_s": period_s}
+        held = held_by(task, steps(40, came_nearer_m=came), "closing_traffic")
+        assert held == list(range(8, last + 1))
 
 
 values = st.floats(-2, 4, width=32)

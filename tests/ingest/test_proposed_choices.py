@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import BEAMS, START_NS, Drive, scans, write_bag
+from support.driven_robot import BEAMS, START_NS, Drive, pose, scans, write_bag
 from support.paths import SHARED
 
 from restock.cli import main
@@ -146,6 +146,64 @@ def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):
     assert said["advice"] == []
     body = load_profile(file).task.body
     assert (body.length_m, body.width_m) == (0.1, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("width_m", "near_m"), [(0.1, 0.05), (0.3, 0.09), (0.5, 0.15), (0.7, 0.15)]
+)
+def test_how_near_is_near_follows_the_width(width_m, near_m, tmp_path, capsys):
+    outline = f"0.3x{width_m}"
+    _, said, file = propose(Commanded(10.0), tmp_path, capsys, "--footprint", outline)
+    profile = load_profile(file)
+    assert profile.task.rewards.tight_clearance_m == near_m
+    near = next(one for one in profile.conditions if one.name == "near_collision")
+    assert near.constants["tight_clearance_m"] == near_m
+    assert ("tight_clearance_m" in said["toml"]) == (near_m < 0.15)
+
+
+@dataclass
+class Unsteady(Commanded):
+    """Poses that lie up to this far ahead of where the robot is, or behind it, by turns."""
+
+    off_m: float = 0.0
+    odometry_alone: bool = False
+
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        poses = topics["/amcl_pose"].fields
+        x = np.asarray(poses["pose.pose.position.x"])
+        off = self.off_m * np.random.default_rng(0).uniform(-1, 1, len(x))
+        poses["pose.pose.position.x"] = x + off
+        if self.odometry_alone:
+            del topics["/imu"], topics["/amcl_pose"]
+            at = np.arange(0, self.duration_s, 0.02)
+            topics["/odom"].fields.update(pose("pose.pose", self.x_at(at), 1.0))
+        return topics
+
+
+def test_by_how_much_poses_and_wheels_differ_is_measured(tmp_path, capsys):
+    for off_m in (0.0, 0.03, 0.1):
+        folder = tmp_path / str(off_m)
+        folder.mkdir()
+        bag, said, file = propose(Unsteady(20.0, off_m=off_m), folder, capsys)
+        profile = load_profile(file)
+        assert ("[noise]" in said["toml"]) == (off_m > 0.02)
+        assert profile.noise.localiser_m == pytest.approx(max(off_m / 2, 0.01), rel=0.3)
+        assert main(["profile", "check", str(file), str(bag)]) == 0
+        assert "`wheel_slip` holds" not in capsys.readouterr().out
+
+
+def test_odometry_alone_shows_no_slip(tmp_path, capsys):
+    _, said, file = propose(Unsteady(10.0), tmp_path, capsys)
+    assert "wheel_slip" in load_profile(file).shipped_conditions
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    _, said, file = propose(Unsteady(10.0, odometry_alone=True), alone, capsys)
+    profile = load_profile(file)
+    assert profile.inputs.pose is not None
+    assert profile.inputs.pose.topic == profile.inputs.wheels.topic == "/odom"
+    assert not {"wheel_slip", "slippery_floor"} & {one.name for one in profile.definitions}
+    assert "wheel_slip" in said["toml"]  # why it is not there
 
 
 @pytest.mark.parametrize("pace", PACES)

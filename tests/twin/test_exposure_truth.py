@@ -7,17 +7,41 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.episode_rows import label_table
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import label
 from restock.ingest.task.label_scores import true_names
+from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import Rewards, Task
 from restock.train.twin.drivers.policies import PlannerFollower
-from restock.train.twin.env.truth import EXPOSURES
+from restock.train.twin.env.truth import EXPOSURES, Truth
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 
 STORED = [signal.name for signal in STORED_SIGNALS]
+
+
+def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
+    small = Task(
+        body=Body(0.2, 0.2),
+        actions=((0.0, 0.0), (0.2, 0.0)),
+        rewards=Rewards(tight_clearance_m=0.06),
+    )
+    usual = load_profile("warehouse_amr").task
+    no = np.zeros(2, np.bool_)
+    for task, near, room in (
+        (small, [True, False], [False, False]),
+        (usual, [True, True], [True, True]),
+    ):
+        truth = Truth(task, 2)
+        told = truth.condition(no, no, np.array([0.05, 0.1]))
+        assert [text == "near_collision" for text in told] == near
+        truth.condition(no, no, np.full(2, 0.16))  # .16 m is room again for the small one alone
+        told = truth.condition(no, no, np.full(2, 0.16))
+        assert [text == "recovery" for text in told] == room
+    assert (small.slip_limit_mps, usual.slip_limit_mps) == (0.03, 0.15)
 
 
 def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episodes() -> None:

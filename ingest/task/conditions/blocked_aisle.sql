@@ -1,9 +1,9 @@
 -- Something stands on the plan just ahead, and stays where it is: what has been driven of the plan and
 -- what is free of it add up to the same place along it, now and 1.6 s before; nobody came nearer within
--- 8 s; and a return lies within .1 m of the plan's middle, which the corner of a rack that the plan
--- passes does not. Where the robot has turned away from the plan it sees less of what stands on it. In
--- the first 1.6 s of an episode nothing says that it stays. It takes clear evidence within 1 s, and
--- holds on through gaps.
+-- 8 s; and a return lies within a fifth of the robot's width of the plan's middle, which the corner of
+-- a rack that the plan passes does not. Where the robot has turned away from the plan it sees less of
+-- what stands on it. In the first 1.6 s of an episode nothing says that it stays. It takes clear
+-- evidence within 1 s, and holds on through gaps.
 -- Weights: a logistic regression; `python benchmarks/labels.py --cache FOLDER --fit blocked_aisle`.
 -- That of someone_m was raised by hand, on two logs, when edges and lost beams ceased to count in it.
 -- timing: pre
@@ -18,17 +18,17 @@ END
 -- let at_m:
 driven_m + ahead_m
 -- let came_m:
-sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
+sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)
 -- let moved_m:
-least(abs(at_m - coalesce(lag(at_m, 8) OVER episode, first_value(at_m) OVER episode)), 0.6)
+least(abs(at_m - coalesce(lag(at_m, {1.6 s}) OVER episode, first_value(at_m) OVER episode)), 0.6)
 -- let bend_rad:
 least(abs(atan2(waypoint_near_y_m, waypoint_near_x_m)), 1.5)
 -- let someone_m:
-least(max(came_m) OVER (episode ROWS BETWEEN 40 PRECEDING AND CURRENT ROW), 1)
+least(max(came_m) OVER (episode ROWS BETWEEN {8 s} PRECEDING AND CURRENT ROW), 1)
 -- let aside_m:
-greatest(least(plan_gap_m, 0.25) - 0.1, 0)
+greatest(least(plan_gap_m / body_width_m, 0.5) - 0.2, 0) * 0.5
 -- let early:
-greatest(1 - step_index / 8, 0)
+greatest(1 - step_index / {1.6 s}, 0)
 -- let odds:
 CASE WHEN ahead_m < 1.45 THEN
     + 3.86
@@ -39,6 +39,6 @@ CASE WHEN ahead_m < 1.45 THEN
     - 3.82 * early
 ELSE -9 END
 -- label:
-odds > -2.9 AND max(odds) OVER (episode ROWS BETWEEN 5 PRECEDING AND CURRENT ROW) > 2.2
+odds > -2.9 AND max(odds) OVER (episode ROWS BETWEEN {1 s} PRECEDING AND CURRENT ROW) > 2.2
 -- probability:
 1 / (1 + exp(-greatest(least(odds, 30), -30)))

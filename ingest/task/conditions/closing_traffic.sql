@@ -4,6 +4,6 @@
 -- kind: exposure
 -- timing: pre
 -- let came_m:
-sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
+sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)
 -- label:
-max(came_m) OVER (episode ROWS BETWEEN 5 PRECEDING AND CURRENT ROW) > 0.1
+max(came_m) OVER (episode ROWS BETWEEN {1 s} PRECEDING AND CURRENT ROW) > 0.1

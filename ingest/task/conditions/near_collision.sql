@@ -1,19 +1,19 @@
--- Something is about to be nearer than .15 m, or the bumper to be pressed. The smallest of many noisy
--- lidar beams reads short by about half its noise, and one reading is too noisy to tell: so it is
--- weighed with those a step before and after it. A step near the limit holds where one within two
--- steps is clear.
+-- Something is about to be nearer than `tight_clearance_m` of the robot's rewards (.15 m for a robot
+-- that is half a metre wide), or the bumper to be pressed. The smallest of many noisy lidar beams
+-- reads short by about half its noise, and one reading is too noisy to tell: so it is weighed with
+-- those a step before and after it. A step near the limit holds where one within two steps is clear.
 -- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures what they give.
 -- timing: post
 -- priority: 20
 -- uncertain: 0.2 to 0.8
 -- let room_m:
-least(clearance_m, 0.35)
+least(clearance_m, tight_clearance_m + 0.2)
 -- let after_m:
 lead(room_m) OVER episode
 -- let around_m:
-least((room_m + coalesce(lead(room_m, 2) OVER episode, 0.35)) / 2, after_m + 2 * lidar_noise_m)
+least((room_m + coalesce(lead(room_m, 2) OVER episode, tight_clearance_m + 0.2)) / 2, after_m + 2 * lidar_noise_m)
 -- let odds:
-2.7 * (0.15 - 0.45 * lidar_noise_m - 0.53 * after_m - 0.47 * around_m) / lidar_noise_m
+2.7 * (tight_clearance_m - 0.45 * lidar_noise_m - 0.53 * after_m - 0.47 * around_m) / lidar_noise_m
 -- let bump:
 coalesce(lead(bumped) OVER episode, false)
 -- label:

@@ -1,12 +1,12 @@
 -- Something lies or stands on the plan within view (2.2 m), whether the robot is stopped by it or finds
--- its way: a lidar return within half the robot's width of the look-ahead points in each of the last
--- five steps, and nobody came nearer within 5 s. Who stands still on the plan cannot be told from a
+-- its way: a lidar return within half the robot's width of the look-ahead points in each step of
+-- the last .8 s, and nobody came nearer within 5 s. Who stands still on the plan cannot be told from a
 -- pallet.
 -- kind: exposure
 -- timing: pre
 -- let came_m:
-sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN 3 PRECEDING AND CURRENT ROW)
+sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)
 -- label:
-max(plan_return_m) OVER (episode ROWS BETWEEN 4 PRECEDING AND CURRENT ROW) < 2.3
-AND max(came_m) OVER (episode ROWS BETWEEN 25 PRECEDING AND CURRENT ROW) < 0.06
-AND step_index >= 4
+max(plan_return_m) OVER (episode ROWS BETWEEN {0.8 s} PRECEDING AND CURRENT ROW) < 2.3
+AND max(came_m) OVER (episode ROWS BETWEEN {5 s} PRECEDING AND CURRENT ROW) < 0.06
+AND step_index >= {0.8 s}

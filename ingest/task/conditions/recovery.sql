@@ -1,28 +1,32 @@
--- From a near collision (less than .15 m of room, or a bump) until there is room again (.3 m), at most
--- 2 s. Whether there was one is told as in near_collision, from this step and those before it only.
+-- From a near collision (less than `tight_clearance_m` of room, or a bump) until there is twice that
+-- room again, at most 2 s. Whether there was one is told as in near_collision, from this step and
+-- those before it only.
 -- timing: pre
 -- priority: 10
 -- uncertain: 0.2 to 0.8
 -- let room_m:
-least(clearance_m, 0.35)
+least(clearance_m, tight_clearance_m + 0.2)
 -- let before_m:
 coalesce(lag(room_m) OVER episode, room_m)
 -- let around_m:
-least((room_m + coalesce(lag(room_m, 2) OVER episode, 0.35)) / 2, before_m + 2 * lidar_noise_m)
+least((room_m + coalesce(lag(room_m, 2) OVER episode, tight_clearance_m + 0.2)) / 2, before_m + 2 * lidar_noise_m)
 -- let before_odds:
-2.7 * (0.15 - 0.75 * lidar_noise_m - 0.53 * before_m - 0.47 * around_m) / lidar_noise_m
+2.7 * (tight_clearance_m - 0.75 * lidar_noise_m - 0.53 * before_m - 0.47 * around_m) / lidar_noise_m
 -- let now_odds:
-2 * (0.15 - 0.87 * lidar_noise_m - least(
+2 * (tight_clearance_m - 0.87 * lidar_noise_m - least(
     room_m + 0.5 * lidar_noise_m,
     0.6 * room_m + 0.4 * least(before_m, room_m + 2 * lidar_noise_m))) / lidar_noise_m
 -- let near_odds:
 CASE WHEN bumped THEN 9 ELSE greatest(before_odds, now_odds) END
 -- let freed_ns:
-coalesce(max(CASE WHEN clearance_m > 0.31 AND NOT bumped THEN stamp_ns END) OVER episode, 0)
+coalesce(
+    max(CASE WHEN clearance_m > 2 * tight_clearance_m + 0.01 AND NOT bumped THEN stamp_ns END)
+        OVER episode,
+    0)
 -- let near_ns:
 max(CASE WHEN near_odds > 0 THEN stamp_ns END) OVER episode
 -- let latest_odds:
-max(CASE WHEN near_odds > -6 THEN near_odds END) OVER (episode ROWS BETWEEN 9 PRECEDING AND CURRENT ROW)
+max(CASE WHEN near_odds > -6 THEN near_odds END) OVER (episode ROWS BETWEEN {1.8 s} PRECEDING AND CURRENT ROW)
 -- let perhaps_ns:
 max(CASE WHEN near_odds > -6 THEN stamp_ns END) OVER episode
 -- label:

@@ -2,10 +2,11 @@
 
 A step's conditions are what was physically so over [t, t + 1), by the contract's names:
 
-- wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than .15 m/s (of a
-  profile's own robot that is slower than 1 m/s, by more than .15 of its fastest action);
-- near_collision: at t + 1 something was nearer than .15 m to the body, or the bumper was pressed;
-- recovery: after such an event until .3 m of room or 2 s, known at t;
+- wheel_slip: a wheel stood on a slippery patch and moved over the floor by more than the task's
+  `slip_limit_mps`;
+- near_collision: at t + 1 something was nearer to the body than the task's `tight_clearance_m`, or
+  the bumper was pressed;
+- recovery: after such an event until there was twice that room, or 2 s, known at t;
 - blocked_aisle: at t, pallets lay on the plan within `BLOCK_AHEAD_M` of the robot's middle.
 
 Exposures are what was so at t, whatever came of it:
@@ -43,12 +44,12 @@ def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
 
 
 _TEXTS, _EXPOSED = _texts(NAMES), _texts(EXPOSURES)
-NEAR_M, CLEAR_M, AFTERMATH_S = 0.15, 0.3, 2.0
+AFTERMATH_S = 2.0
 CLOSING_WITHIN_M, CLOSING_MPS = 2.0, 0.1
 VIEW_M = tuple(0.2 * step for step in range(1, 12))  # of the plan; the look-ahead's far end
 BLOCK_AHEAD = 6  # of them are just ahead: to 1.2 m
 REACH_M = VIEW_M[-1] + 1.5  # a pallet farther off than this is not in view
-BODY_MARGIN_M = 0.2  # how far beside the plan a pallet is still in the way
+MARGIN = 0.4  # of the body's width: how far beside the plan a pallet is still in the way
 
 
 class Truth(Stateful):
@@ -58,6 +59,8 @@ class Truth(Stateful):
 
     def __init__(self, task: Task, num_envs: int) -> None:
         self._period_s = task.control_period_s
+        self._near_m = task.rewards.tight_clearance_m
+        self._margin_m = MARGIN * task.body.width_m
         self.aftermath_s = np.zeros(num_envs)  # left of it; 0: none
         self.blocked = np.zeros(num_envs, np.bool_)  # at t
         self.traffic_gap_m = np.full((num_envs, AGENTS), np.inf)  # to each, at t; inf: not there
@@ -77,7 +80,7 @@ class Truth(Stateful):
         with_pallets = np.flatnonzero(gap < REACH_M)
         if len(with_pallets):
             ahead[with_pallets] = _blocked(
-                pose[with_pallets], plans_m[with_pallets], pallets[with_pallets]
+                pose[with_pallets], plans_m[with_pallets], pallets[with_pallets], self._margin_m
             )
         self.blocked[:] = ahead[:, :BLOCK_AHEAD].any(axis=1)
         gaps_m = simulation.traffic.gaps_m(simulation.middle(pose))
@@ -97,20 +100,20 @@ class Truth(Stateful):
 
     def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
         """All conditions (N,) of the step that ends now, as one text each."""
-        near = bumped | (clearance_m < NEAR_M)
+        near = bumped | (clearance_m < self._near_m)
         held = np.stack([self.blocked, near, self.aftermath_s > 0, slipped])  # as NAMES
         which = (held << np.arange(len(NAMES))[:, None]).sum(axis=0)
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
-        left[(clearance_m > CLEAR_M) & ~near] = 0.0
+        left[(clearance_m > 2 * self._near_m) & ~near] = 0.0
         self.aftermath_s = np.where(near, AFTERMATH_S, left)
         texts: NDArray[np.str_] = _TEXTS[which]
         return texts
 
 
-def _blocked(pose: F64, plans_m: F64, pallets: F64) -> Bools:
+def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
     """Whether a pallet lies within the robot's breadth of the plan at VIEW_M, (n, VIEW_M)."""
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), VIEW_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
-    half = pallet_half_m(pallets[:, None, :, 2]) + BODY_MARGIN_M
+    half = pallet_half_m(pallets[:, None, :, 2]) + margin_m
     return np.asarray((gap <= half).all(axis=-1).any(axis=-1), np.bool_)

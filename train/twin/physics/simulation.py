@@ -35,7 +35,6 @@ from restock.train.twin.physics.scenery import Scenery, quaternion, rotated
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
 BLOCK_S = 0.1
-SLIP_MPS = 0.15  # a wheel slips that moves so fast over the floor, at 1 m/s; a slower robot's less
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
@@ -105,8 +104,6 @@ class Simulation(Stateful):
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
-        fastest = float(np.abs(np.asarray(task.actions)[:, 0]).max())
-        self._slip_mps = SLIP_MPS * (min(fastest, 1.0) if robot.own else 1.0)
         self._wheels_m = robot.wheels_m
         self._wheel_qpos = np.array(self.handles.wheel_qpos)
         self._wheel_qvel = np.array(self.handles.wheel_qvel)
@@ -301,7 +298,7 @@ class Simulation(Stateful):
         return yaw_of(self.qpos[ids, 3:7])
 
     def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
-        """Whose wheel (n, W) is on a patch and moves over the floor by more than `_slip_mps`."""
+        """Whose wheel (n, W) is on a patch and moves over the floor by more than its task says."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
@@ -311,13 +308,13 @@ class Simulation(Stateful):
         rim = self._turning(ids) * self.body.radius_m[ids, None]
         if self._rollers is not None:  # across its free direction alone
             slip = np.abs(ground - self._rollers[:, 0] * aside - rim) / np.sqrt(2)
-            return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
+            return np.asarray((slippery & (slip > self.task.slip_limit_mps)).any(axis=1), np.bool_)
         if self.robot.steers:
             steering = self.qpos[np.ix_(ids, self._steering_qpos)]
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)
             aside[:, :2] -= rim[:, :2] * np.sin(steering)
         slip = np.hypot(rim - ground, aside)
-        return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
+        return np.asarray((slippery & (slip > self.task.slip_limit_mps)).any(axis=1), np.bool_)
 
     # -- sensing --------------------------------------------------------------------------------
 
