@@ -28,7 +28,8 @@ GAIN = 1.1  # times the transitions: what gives so many is worth a try
 OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
 OFTEN_INSIDE = 0.02
 MOVING, LEAST_MOVING = 0.2, 30  # of the fastest action; ticks
-NOISE_IN_LIMIT = 1.25  # slip is more than twice what the noise makes of a period's speed
+SLIP_OVER_M = 0.2  # as in wheel_slip and slippery_floor
+NOISE_IN_LIMIT = 1.25  # slip is more than twice the noise
 EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
 EVEN = 0.25  # of a control period
 UNEVEN = 4.0  # times the time that can be followed: worth a tick a period
@@ -98,20 +99,27 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
 
 def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     """The noise of poses over a control period, for limits of slip well above how far they and the
-    wheels differ, over two periods, at nine in ten of the ticks at which either moved."""
-    wheels_mps = steps.signals["wheel_speed_mps"]
+    wheels differ, over the steps of a window, at nine in ten of the ticks at which either moved."""
+    limits = task.condition_limits
+    fastest_mps, period_s = limits["fastest_mps"], limits["control_period_s"]
+    window = max(round(SLIP_OVER_M / (fastest_mps * period_s)), 1) + 1
+    wheels_mps, poses_mps = (steps.signals[f"{name}_speed_mps"] for name in ("wheel", "localised"))
+    ends = np.arange(window, len(wheels_mps))  # of windows of so many ticks, each with one before
     usable = np.array([problem == "" for problem in steps.problem], np.bool_)
-    follows = (np.diff(steps.segment) == 0) & usable[1:] & usable[:-1]
-    driven_mps = (wheels_mps[1:] + wheels_mps[:-1]) / 2
-    poses_mps = steps.signals["localised_speed_mps"][1:]
-    fastest_mps = max(abs(speed) for speed, _ in task.actions)
-    follows &= np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * fastest_mps
-    off_mps = driven_mps - poses_mps
-    off_mps[1:] = (off_mps[1:] + off_mps[:-1]) / 2
-    off_mps = np.abs(off_mps[follows])
-    if len(off_mps) < LEAST_MOVING or np.isnan(off_mps).any():
+    lost = np.cumsum(~usable)
+    ends = ends[
+        (steps.segment[ends] == steps.segment[ends - window])
+        & (lost[ends] == lost[ends - window])
+        & usable[ends - window]
+    ]
+    driven_mps = np.concatenate([wheels_mps[:1], (wheels_mps[1:] + wheels_mps[:-1]) / 2])
+    moved = np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * fastest_mps
+    sums_m = np.cumsum(np.where(usable, driven_mps - poses_mps, 0.0)) * period_s
+    ends = ends[moved[ends]]
+    if len(ends) < LEAST_MOVING:
         return None
-    return float(np.percentile(off_mps, 90)) * task.control_period_s / NOISE_IN_LIMIT
+    off_m = np.abs(sums_m[ends] - sums_m[ends - window])
+    return float(np.percentile(off_m, 90)) / (2 * NOISE_IN_LIMIT)
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:

@@ -17,7 +17,7 @@ whose probability lies within the condition's `uncertain` band is too near to ca
 
 Its limits may follow the robot: its SQL may name the profile's [noise], and `Task.condition_limits`
 (how near is near, how much is slip, the control period); a number of steps may be written as a
-time, `{1.6 s}`.
+time, `{1.6 s}`, or as the way of a robot at its highest speed, `{0.2 m}`.
 
 A condition is of one of two kinds. An **outcome** (the default) names what came of it, and gives a
 row its one `condition`. An **exposure** names the situation, whatever came of it: someone close by,
@@ -55,7 +55,7 @@ Kind = Literal["outcome", "exposure"]
 Expression = Literal["sql", "probability"]  # of a condition
 Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
-_TIME = re.compile(r"\{(\d*\.?\d+) s\}")
+_LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
 NO_LIDAR = "no lidar"  # why a condition is unknown
 
 
@@ -76,15 +76,16 @@ class Condition(Checked, frozen=True):
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
         """The condition of one robot: with those of the constants that its SQL names; its own win.
 
-        Where `control_period_s` is among them, times such as `{1.6 s}` become numbers of steps.
+        Where they are a robot's, times such as `{1.6 s}`, and ways such as `{0.2 m}` at its highest
+        speed, become numbers of steps.
         """
         made = self
-        if period_s := constants.get("control_period_s"):
+        if "control_period_s" in constants:
             made = msgspec.structs.replace(
                 self,
-                sql=_in_steps(self.sql, period_s),
-                probability=_in_steps(self.probability, period_s),
-                let={name: _in_steps(sql, period_s) for name, sql in self.let.items()},
+                sql=_in_steps(self.sql, constants),
+                probability=_in_steps(self.probability, constants),
+                let={name: _in_steps(sql, constants) for name, sql in self.let.items()},
             )
         words = made.words
         used = {name: value for name, value in constants.items() if name in words}
@@ -115,9 +116,11 @@ class Condition(Checked, frozen=True):
             )
 
 
-def _in_steps(sql: str, period_s: float) -> str:
-    """SQL with times as numbers of steps of so long: one or more."""
-    return _TIME.sub(lambda time: str(max(round(float(time[1]) / period_s), 1)), sql)
+def _in_steps(sql: str, constants: Mapping[str, float]) -> str:
+    """SQL with times, and ways at the robot's highest speed, as numbers of its steps, 1 or more."""
+    period_s = constants["control_period_s"]
+    a_step = {"s": period_s, "m": period_s * constants["fastest_mps"]}
+    return _LENGTH.sub(lambda found: str(max(round(float(found[1]) / a_step[found[2]]), 1)), sql)
 
 
 def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:

@@ -103,8 +103,11 @@ class Task(Checked, frozen=True):
     @property
     def slip_limit_mps(self) -> float:
         """How fast wheels move over the floor that slip."""
-        fastest = max(abs(speed) for speed, _ in self.actions)
-        return SLIP_MPS * min(fastest or 1.0, 1.0)
+        return SLIP_MPS * min(self._fastest_mps, 1.0)
+
+    @property
+    def _fastest_mps(self) -> float:
+        return max(abs(speed) for speed, _ in self.actions) or 1.0
 
     @property
     def condition_limits(self) -> dict[str, float]:
@@ -113,6 +116,7 @@ class Task(Checked, frozen=True):
             "tight_clearance_m": self.rewards.tight_clearance_m,
             "body_width_m": self.body.width_m,
             "slip_limit_mps": self.slip_limit_mps,
+            "fastest_mps": self._fastest_mps,
             "control_period_s": self.control_period_s,
         }
 
@@ -127,6 +131,7 @@ STAND_IN_LIMITS = {  # `condition_limits` of the stand-in
     "tight_clearance_m": 0.15,
     "body_width_m": 0.5,
     "slip_limit_mps": SLIP_MPS,
+    "fastest_mps": 1.0,
     "control_period_s": 0.2,
 }
 

@@ -1,24 +1,32 @@
 -- The wheels and the world disagree by more than the robot's `slip_limit_mps` (.15 m/s, of its
--- fastest action where that is below 1 m/s) and what the localiser's noise adds to it, and by more than
--- that noise makes alone: how far the wheels turned against how far the poses lie apart, over two control periods before and
--- two after; the turn by the wheels against the gyroscope; and the way sideways. A step near the
--- limit holds where one within two steps is clear. Known only after the fact, so it is `post`.
+-- fastest action where that is below 1 m/s) and what the localiser's noise adds to it, and by more
+-- than that noise makes alone: how far the wheels turned against how far the poses lie apart, in the
+-- time in which it drives .2 m, and in that after it; the turn by the wheels against the gyroscope; and
+-- the way sideways. A step near the limit holds where one within two steps is clear. Known only after
+-- the fact, so it is `post`.
 -- Weights: a logistic regression over development logs; `benchmarks/labels.py` measures what they give.
 -- timing: post
 -- priority: 30
 -- uncertain: 0.2 to 0.8
 -- let pose_noise_mps:
-localiser_noise_m / control_period_s
+2 * localiser_noise_m / (({0.2 m} + 1) * control_period_s)
 -- let over_mps:
 coalesce((wheel_speed_mps + lag(wheel_speed_mps) OVER episode) / 2 - localised_speed_mps, 0)
+-- let now_mps:
+sum(over_mps) OVER (episode ROWS BETWEEN CURRENT ROW AND {0.2 m} FOLLOWING) / ({0.2 m} + 1)
+-- let then_mps:
+coalesce(sum(over_mps) OVER (episode ROWS BETWEEN {0.2 m} FOLLOWING AND {0.4 m} FOLLOWING), 0)
+    / ({0.4 m} - {0.2 m} + 1)
+-- let sideways_mps:
+coalesce(
+    sum(localised_lateral_mps) OVER (episode ROWS BETWEEN {0.2 m} FOLLOWING AND {0.4 m} FOLLOWING),
+    0)
+    / ({0.4 m} - {0.2 m} + 1)
 -- let turn_radps:
 coalesce(abs(wheel_yaw_rate_radps - gyro_yaw_rate_radps), 0)
 -- let slip_mps:
-0.23 * abs(over_mps + coalesce(lead(over_mps) OVER episode, 0))
-+ 0.27 * abs(coalesce(lead(over_mps) OVER episode, 0) + coalesce(lead(over_mps, 2) OVER episode, 0))
+0.46 * abs(now_mps) + 0.54 * abs(then_mps) + 0.24 * abs(sideways_mps)
 + 0.46 * body_width_m * greatest(turn_radps, lead(turn_radps) OVER episode)
-+ 0.12 * abs(coalesce(lead(localised_lateral_mps) OVER episode, 0)
-    + coalesce(lead(localised_lateral_mps, 2) OVER episode, 0))
 -- let limit_mps:
 greatest(slip_limit_mps + 0.8 * pose_noise_mps, 2 * pose_noise_mps)
 -- let odds:
