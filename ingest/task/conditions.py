@@ -326,7 +326,10 @@ def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> 
     for name, sql in (*condition.let.items(), ("", getattr(condition, which))):
         if reason := refusal(sql, condition.timing):
             where = f"`let` {name!r} of condition {condition.name!r}" if name else None
-            raise ConfigError(reason, where=where or _where(condition, which))
+            curly = (
+                "in curly brackets are times, {1.6 s}, and ways, {0.2 m}" if "{" in sql else None
+            )
+            raise ConfigError(reason, where=where or _where(condition, which), remedy=curly)
 
 
 def _where(condition: Condition, which: Expression) -> str:

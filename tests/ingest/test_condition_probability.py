@@ -150,3 +150,24 @@ def test_rows_from_before_there_were_probabilities_get_them_when_labelled_again(
         assert store.sql(query).fetchall() == [(len(rows), len(rows), len(rows))]
         ((told,),) = store.sql("SELECT map_keys(probabilities) FROM transitions LIMIT 1").fetchall()
         assert set(told) <= set(shipped())
+
+
+OWN = '''
+[[condition]]
+name = "tight"
+timing = "pre"
+sql = """
+min(clearance_m) OVER (episode ROWS BETWEEN {{{0}}} PRECEDING AND CURRENT ROW)
+< tight_clearance_m"""
+'''
+
+
+def test_a_condition_of_ones_own_may_name_limits_and_write_times() -> None:
+    profile = parse_profile(WAREHOUSE + OWN.format("1 s"), where="here")
+    tight = profile.conditions[-1]
+    assert "ROWS BETWEEN 5 PRECEDING" in tight.sql
+    assert tight.constants == {"tight_clearance_m": 0.15}
+    carried = read_profile_toml(profile_toml(profile), where="its text")
+    assert carried.labels_version == profile.labels_version
+    with pytest.raises(ConfigError, match=r"(?s)tight.*\{1\.6 s\}"):
+        parse_profile(WAREHOUSE + OWN.format("1 min"), where="here")
