@@ -279,7 +279,7 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
     said = [(row["name"], row["unit"], row["type"], row["messages"]) for row in rows]
     assert said == [
         ("left_radps", "rad/s", "number", 83),
-        ("beams_m", "m", "list", 777),
+        ("beams_m", "m", "list", 779),
         ("battery_v", "V", "number", 38),
     ]
 
