@@ -21,6 +21,7 @@ from restock.train.run.run import Run
 
 CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
 SHARES = dict(zip(CONDITIONS, (0.6, 0.15, 0.1, 0.05, 0.1), strict=True))
+FEW = dict.fromkeys(("wheel_slip", "near_collision", "recovery"), 30)  # rows held out
 
 
 def make_run(
@@ -35,7 +36,7 @@ def make_run(
     quota_met: float = 1.0,
     agreement: Mapping[str, float] | None = None,
     unexplained: Mapping[str, float] | None = None,
-    explained: float | None = 0.8,
+    explained: float | Mapping[str, float] | None = 0.8,
     strata: bool = True,  # named as the conditions are; else there is one of all rows
     until: int | None = None,  # the window in which the symptoms end
     actions: Mapping[str, tuple[float, float]] | None = None,  # of `turn`: wanted, of the logs
@@ -63,7 +64,9 @@ def make_run(
                         "rows_met": round(SHARES[name] * 1000),
                         "td_abs_mean": unseen,
                         "td_online_abs_mean": unseen * (clock if ill else 1.0),
-                        "explained": explained,
+                        "explained": explained.get(name, 0.8)
+                        if isinstance(explained, Mapping)
+                        else explained,
                         "q_abs_mean": 1.0,
                         "q_lag": lag if ill else 0.05,
                         "logs_agreement": (agreement or {}).get(name, 0.8),
@@ -184,6 +187,9 @@ def action_rows(
         ({"explained": 0.01}, "DIVERGENCE"),
         ({"explained": 0.01, "lag": 0.9}, "TARGET"),
         ({"explained": None}, "HEALTHY"),  # a run from before it was kept
+        # Robots that stand give targets that hardly vary, and a share of any size below 0.
+        ({"explained": {"nominal": 0.7, "blocked_aisle": -9.0}, "held_out": FEW}, "HEALTHY"),
+        ({"explained": {"nominal": 0.1, "blocked_aisle": 0.1}, "held_out": FEW}, "DIVERGENCE"),
         ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
         ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
         ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag

@@ -320,7 +320,10 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     ]
     gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
     weight = sum(row["evaluation_rows"] for row in known_well)
-    known = [row["explained"] for row in judged or known_well if row["explained"] is not None]
+    # Less than nothing counts as nothing: where robots stand, targets hardly vary, and a share of
+    # that is of any size.
+    told = [row["explained"] for row in judged or known_well if row["explained"] is not None]
+    known = [max(share, 0.0) for share in told]
 
     def mean(name: str) -> float:
         return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)
