@@ -197,8 +197,8 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
             return []
         return [
             "[noise]",
-            f"localiser_m = {noise_m:.2g}  # by so much poses and wheels differ here in a control"
-            " period; less would be taken for slip",
+            f"localiser_m = {noise_m:.2g}  # poses and wheels differ by more than the default"
+            f" {Noise().localiser_m:g} allows for: less would be taken for slip",
             "",
         ]
     apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)

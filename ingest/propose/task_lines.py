@@ -27,6 +27,7 @@ LEAST_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 
 def task_lines(seen: Evidence, trial: Trial) -> list[str]:
+    """The [task] table and those in it, with comments at what is a guess."""
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
