@@ -51,8 +51,8 @@ from restock.ingest.task.condition_files import shipped, with_files
 from restock.ingest.task.conditions import Condition, Kind, labels_version, of_kind
 from restock.ingest.task.hindsight import GoalRules, GoalSource
 from restock.ingest.task.limiter import Limiter
-from restock.ingest.task.noise import Noise
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
+from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Task
 from restock.toml import Checked, parse_toml, read_toml, typed
 

@@ -27,7 +27,7 @@ from restock.ingest.propose.task_lines import actions_of, task_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import unseen
-from restock.ingest.task.noise import Noise
+from restock.ingest.task.signals import Noise
 
 
 def profile_lines(

@@ -29,7 +29,7 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import Condition, Kind
-from restock.ingest.task.noise import Noise
+from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import STAND_IN_LIMITS
 
 LARGEST_BYTES = 100_000  # of a condition's file

@@ -5,16 +5,20 @@ topics fill them; the twin fills them from MuJoCo. Everything after this point (
 store) sees only signals, and so cannot tell a log from a simulation.
 
 `Signals` maps a signal's name to an array whose leading axis is the step (in a log) or the
-environment (in the twin).
+environment (in the twin). `Noise` says how much the readings behind them vary.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
+
+from restock.toml import Checked
 
 Signals = dict[str, NDArray[Any]]
 
@@ -123,3 +127,21 @@ def yaw_of(
     """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
     with np.errstate(over="ignore", invalid="ignore"):  # NaN stays NaN
         return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), np.float64)
+
+
+class Noise(Checked, frozen=True):
+    """The `[noise]` of a profile: what the sensors' readings vary by, for probabilities.
+
+    Standard deviations. The SQL of conditions names them as `lidar_noise_m`, and so on.
+    """
+
+    lidar_m: Annotated[float, Meta(gt=0)] = 0.015  # standard deviation of a range
+    localiser_m: Annotated[float, Meta(gt=0)] = 0.01  # of the distance between two poses, per axis
+    wheels_mps: Annotated[float, Meta(gt=0)] = 0.003  # of the wheel speed
+    gyro_radps: Annotated[float, Meta(gt=0)] = 0.01  # of the yaw rate, including bias
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Each by the name that SQL has for it."""
+        named = msgspec.structs.asdict(self)
+        return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}

@@ -24,8 +24,8 @@ from restock.ingest.task.conditions import (
     probabilities,
     too_near_to_call,
 )
-from restock.ingest.task.noise import Noise
 from restock.ingest.task.schema import COVERAGE, steps_schema
+from restock.ingest.task.signals import Noise
 from restock.replay.store.store import Store
 
 FILE = """-- Fast, for a while.

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from restock.errors import ConfigError
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
-from restock.ingest.task.noise import Noise
 from restock.ingest.task.schema import SIGNAL_COLUMNS
+from restock.ingest.task.signals import Noise
 
 SHIPPED = list(shipped().values())
 
