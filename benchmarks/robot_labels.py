@@ -75,21 +75,21 @@ def driven(profile: Profile, seed: int, steps: int) -> tuple[pa.Table, list[froz
     env.reset(seed=seed)
     driver = PlannerFollower(epsilon=RANDOM, seed=seed)
     episode = np.arange(ROBOTS) * steps  # of each robot; one episode has a step at least
-    signals, episodes, truth = [], [], []
+    index = np.zeros(ROBOTS, np.int64)  # in that episode
+    signals, episodes, indices, truth = [], [], [], []
     for _ in range(steps):
         signals.append({name: env.signals[name].copy() for name in SIGNALS})
-        episodes.append(episode.copy())
+        episodes.append(episode)
+        indices.append(index)
         action, _ = driver.act(env, env.observation)
         _, _, terminated, truncated, info = env.step(action)
         both = zip(info["true_condition"], info["true_exposure"], strict=True)
         truth += [true_names(str(what)) | true_names(str(exposed)) for what, exposed in both]
-        episode += terminated | truncated
+        done = terminated | truncated
+        episode, index = episode + done, np.where(done, 0, index + 1)
     columns = {name: np.concatenate([row[name] for row in signals]) for name in SIGNALS}
-    step = np.repeat(np.arange(steps), ROBOTS)
-    of = np.concatenate(episodes)
-    starts = {int(number): int(step[of == number].min()) for number in np.unique(of)}
-    index = step - np.array([starts[int(number)] for number in of])
-    return label_table(columns, of, index, pa.table({})), truth
+    table = label_table(columns, np.concatenate(episodes), np.concatenate(indices), pa.table({}))
+    return table, truth
 
 
 def _text(value: Any) -> str:

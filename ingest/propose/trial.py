@@ -21,6 +21,7 @@ from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
 
 MUCH = 0.1  # of the ticks: what costs so many is worth a word
@@ -28,7 +29,7 @@ GAIN = 1.1  # times the transitions: what gives so many is worth a try
 OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
 OFTEN_INSIDE = 0.02
 MOVING, LEAST_MOVING = 0.2, 30  # of the fastest action; ticks
-SLIP_OVER_M = 0.2  # as in wheel_slip and slippery_floor
+SLIP_OVER = "{0.2 m}"  # of driving, as in wheel_slip and slippery_floor
 NOISE_IN_LIMIT = 1.25  # slip is more than twice the noise
 EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
 EVEN = 0.25  # of a control period
@@ -101,25 +102,18 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     """The noise of poses over a control period, for limits of slip well above how far they and the
     wheels differ, over the steps of a window, at nine in ten of the ticks at which either moved."""
     limits = task.condition_limits
-    fastest_mps, period_s = limits["fastest_mps"], limits["control_period_s"]
-    window = max(round(SLIP_OVER_M / (fastest_mps * period_s)), 1) + 1
+    window = int(in_steps(SLIP_OVER, limits)) + 1
     wheels_mps, poses_mps = (steps.signals[f"{name}_speed_mps"] for name in ("wheel", "localised"))
-    ends = np.arange(window, len(wheels_mps))  # of windows of so many ticks, each with one before
-    usable = np.array([problem == "" for problem in steps.problem], np.bool_)
-    lost = np.cumsum(~usable)
-    ends = ends[
-        (steps.segment[ends] == steps.segment[ends - window])
-        & (lost[ends] == lost[ends - window])
-        & usable[ends - window]
-    ]
     driven_mps = np.concatenate([wheels_mps[:1], (wheels_mps[1:] + wheels_mps[:-1]) / 2])
-    moved = np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * fastest_mps
-    sums_m = np.cumsum(np.where(usable, driven_mps - poses_mps, 0.0)) * period_s
-    ends = ends[moved[ends]]
+    moved = np.maximum(np.abs(driven_mps), np.abs(poses_mps)) > MOVING * limits["fastest_mps"]
+    off_m = np.where(steps.follows, driven_mps - poses_mps, 0.0) * task.control_period_s
+    summed_m, breaks = np.cumsum(off_m), np.cumsum(~steps.follows)
+    ends = np.arange(window, len(steps))  # of windows of so many ticks, each after one more
+    ends = ends[(breaks[ends] == breaks[ends - window]) & moved[ends]]
     if len(ends) < LEAST_MOVING:
         return None
-    off_m = np.abs(sums_m[ends] - sums_m[ends - window])
-    return float(np.percentile(off_m, 90)) / (2 * NOISE_IN_LIMIT)
+    apart_m = np.abs(summed_m[ends] - summed_m[ends - window])
+    return float(np.percentile(apart_m, 90)) / (2 * NOISE_IN_LIMIT)
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:

@@ -83,9 +83,9 @@ class Condition(Checked, frozen=True):
         if "control_period_s" in constants:
             made = msgspec.structs.replace(
                 self,
-                sql=_in_steps(self.sql, constants),
-                probability=_in_steps(self.probability, constants),
-                let={name: _in_steps(sql, constants) for name, sql in self.let.items()},
+                sql=in_steps(self.sql, constants),
+                probability=in_steps(self.probability, constants),
+                let={name: in_steps(sql, constants) for name, sql in self.let.items()},
             )
         words = made.words
         used = {name: value for name, value in constants.items() if name in words}
@@ -116,7 +116,7 @@ class Condition(Checked, frozen=True):
             )
 
 
-def _in_steps(sql: str, constants: Mapping[str, float]) -> str:
+def in_steps(sql: str, constants: Mapping[str, float]) -> str:
     """SQL with times, and ways at the robot's highest speed, as numbers of its steps, 1 or more."""
     period_s = constants["control_period_s"]
     a_step = {"s": period_s, "m": period_s * constants["fastest_mps"]}

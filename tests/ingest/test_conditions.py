@@ -14,10 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import ConfigError
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Noise
+from restock.ingest.task.task import STAND_IN_LIMITS
 
 SHIPPED = list(shipped().values())
 
@@ -139,6 +141,10 @@ SMALL = {  # of a robot of .2 m/s that is .15 m wide, and decides ten times a se
 def held_by(constants: dict[str, float], table: pa.Table, name: str) -> list[int]:
     made = (shipped(constants) | shipped(constants, "exposure"))[name]
     return np.flatnonzero(label(table, [made])[name]).tolist()
+
+
+def test_the_default_limits_are_those_of_the_stand_in():
+    assert load_profile("warehouse_amr").task.condition_limits == STAND_IN_LIMITS
 
 
 def test_how_near_is_near_follows_the_robot():

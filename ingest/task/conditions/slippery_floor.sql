@@ -1,6 +1,7 @@
 -- A slippery patch is underfoot: up to now, without a look ahead, the wheels turned more than the poses
--- and the gyroscope moved, over .2 m of its fastest drive. It holds on for a second. Of a patch that is crossed without slip there is
--- no sign: this sees less than what lies on the floor, and sooner than the outcome `wheel_slip`.
+-- and the gyroscope moved, over the time in which the robot drives .2 m. It holds on for a second. Of a
+-- patch that is crossed without slip there is no sign: this sees less than what lies on the floor, and
+-- sooner than the outcome `wheel_slip`.
 -- kind: exposure
 -- timing: pre
 -- let pose_noise_mps:

@@ -104,6 +104,7 @@ class Simulation(Stateful):
         self.batch = _batch(physics)(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
+        self._slip_mps = task.slip_limit_mps
         self._wheels_m = robot.wheels_m
         self._wheel_qpos = np.array(self.handles.wheel_qpos)
         self._wheel_qvel = np.array(self.handles.wheel_qvel)
@@ -298,7 +299,7 @@ class Simulation(Stateful):
         return yaw_of(self.qpos[ids, 3:7])
 
     def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
-        """Whose wheel (n, W) is on a patch and moves over the floor by more than its task says."""
+        """Whose wheel (n, W) is on a patch and moves over the floor faster than the limit."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
@@ -308,13 +309,13 @@ class Simulation(Stateful):
         rim = self._turning(ids) * self.body.radius_m[ids, None]
         if self._rollers is not None:  # across its free direction alone
             slip = np.abs(ground - self._rollers[:, 0] * aside - rim) / np.sqrt(2)
-            return np.asarray((slippery & (slip > self.task.slip_limit_mps)).any(axis=1), np.bool_)
+            return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
         if self.robot.steers:
             steering = self.qpos[np.ix_(ids, self._steering_qpos)]
             ground[:, :2] -= rim[:, :2] * (np.cos(steering) - 1)
             aside[:, :2] -= rim[:, :2] * np.sin(steering)
         slip = np.hypot(rim - ground, aside)
-        return np.asarray((slippery & (slip > self.task.slip_limit_mps)).any(axis=1), np.bool_)
+        return np.asarray((slippery & (slip > self._slip_mps)).any(axis=1), np.bool_)
 
     # -- sensing --------------------------------------------------------------------------------
 
