@@ -171,10 +171,24 @@ def test_how_much_is_slip_follows_the_robot_and_its_localisers_noise():
 
 def test_times_are_in_steps_of_the_robot():
     came = changed(0.3, 0.0, 40, slice(8, 9))
-    for period_s, last in ((0.2, 16), (0.1, 24), (0.5, 11), (3.0, 10)):  # .6 s and 1 s, in steps
+    for period_s, last in ((0.2, 16), (0.1, 26), (0.5, 11), (3.0, 9)):  # .8 s and 1 s, in steps
         task = Noise().constants | SMALL | {"control_period_s": period_s}
         held = held_by(task, steps(40, came_nearer_m=came), "closing_traffic")
         assert held == list(range(8, last + 1))
+
+
+@pytest.mark.parametrize("period_s", [0.2, 0.1, 0.05])
+def test_who_walks_up_is_seen_whatever_the_control_period(period_s: float):
+    robot = Noise().constants | STAND_IN_LIMITS | {"control_period_s": period_s}
+    begins, ends = round(4 / period_s), round(6 / period_s)
+    for walks_mps, seen in ((0.5, True), (0.1, False)):  # .1 m/s: the noise of two ranges
+        came = changed(walks_mps * period_s, 0.0, 2 * ends, slice(begins, ends))
+        held = held_by(robot, steps(2 * ends, came_nearer_m=came), "closing_traffic")
+        if seen:
+            assert begins <= held[0] <= begins + 0.5 / period_s
+            assert set(range(held[0], ends)) <= set(held)
+        else:
+            assert held == []
 
 
 values = st.floats(-2, 4, width=32)

@@ -17,8 +17,10 @@ CASE WHEN route_remaining_m > 0 THEN -route_remaining_m ELSE
 END
 -- let at_m:
 driven_m + ahead_m
+-- let came_lately_m:
+sum(came_nearer_m) OVER (episode ROWS BETWEEN {0.2 s} - 1 PRECEDING AND CURRENT ROW)
 -- let came_m:
-sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)
+sum(greatest(came_lately_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.8 s} - 1 PRECEDING AND CURRENT ROW) / {0.2 s}
 -- let moved_m:
 least(abs(at_m - coalesce(lag(at_m, {1.6 s}) OVER episode, first_value(at_m) OVER episode)), 0.6)
 -- let bend_rad:

@@ -4,8 +4,10 @@
 -- pallet.
 -- kind: exposure
 -- timing: pre
+-- let came_lately_m:
+sum(came_nearer_m) OVER (episode ROWS BETWEEN {0.2 s} - 1 PRECEDING AND CURRENT ROW)
 -- let came_m:
-sum(greatest(came_nearer_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.6 s} PRECEDING AND CURRENT ROW)
+sum(greatest(came_lately_m - 2 * lidar_noise_m, 0)) OVER (episode ROWS BETWEEN {0.8 s} - 1 PRECEDING AND CURRENT ROW) / {0.2 s}
 -- label:
 max(plan_return_m) OVER (episode ROWS BETWEEN {0.8 s} PRECEDING AND CURRENT ROW) < 2.3
 AND max(came_m) OVER (episode ROWS BETWEEN {5 s} PRECEDING AND CURRENT ROW) < 0.06
