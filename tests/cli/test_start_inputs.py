@@ -18,6 +18,7 @@ from restock.cli.start import stages
 from restock.cli.start.decisions import (
     floor_settings,
     missions_unseen,
+    possible_kinds,
     practice_settings,
     updates_settings,
 )
@@ -297,7 +298,9 @@ def test_a_robot_without_a_lidar_is_not_sent_into_blocked_aisles(
     profile.write_text(text)
     assert load_profile(profile).task.lidar is lidar
     to, floor = Settings((), tmp_path, profile=profile), {"episodes": list(DEFAULT_CONDITIONS)}
-    conditions = [one for one in floor_settings(to, floor) if one.startswith("env.conditions")]
+    kinds = possible_kinds(to, floor)
+    assert kinds == [kind for kind in DEFAULT_CONDITIONS if lidar or kind != "blocked_aisle"]
+    conditions = [one for one in floor_settings(to, kinds) if one.startswith("env.conditions")]
     assert bool(conditions) is not lidar
     assert not any("blocked_aisle" in one for one in conditions)
     assert (missions_unseen(to, floor) is None) is lidar

@@ -22,8 +22,8 @@ from support.long import one_in
 
 IMAGE_BYTES = 400_000
 FEW, MANY = 10, 250  # images
-# Of growth, where the larger recording holds 96 MB more. What is read ahead, some 25 MB however large
-# the recording (the same with 400 MB), differs by an allocation or two.
+# Of growth, where the larger recording holds 96 MB more. What is read ahead, some 25 MB however
+# large the recording (the same with 400 MB), differs by an allocation or two.
 ALLOWED_MB = 48
 
 # Ingests each recording in turn, and says the peak of this process' memory after each.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,21 +160,15 @@ def no_ways(to: Settings, floor: Document) -> str | None:
     return None
 
 
-def floor_settings(to: Settings, document: Document) -> list[str]:
-    """Train on that floor, on the kinds of episode that it has room for and that can be done."""
+def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
+    """Train on that floor, on these kinds of episode; none: all."""
     from restock.toml import toml_value
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 
     settings = [f"env.layouts={to.floor}"]
-    fitting = document.get("episodes", [])
-    unseen = {BLOCKED} if missions_unseen(to, document) else set()
-    kinds = {
-        name: share
-        for name, share in DEFAULT_CONDITIONS.items()
-        if name in fitting and name not in unseen
-    }
-    if fitting and len(kinds) < len(DEFAULT_CONDITIONS):
-        settings.append(f"env.conditions={toml_value(kinds)}")
+    shares = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in kinds}
+    if kinds and len(shares) < len(DEFAULT_CONDITIONS):
+        settings.append(f"env.conditions={toml_value(shares)}")
     return settings
 
 
@@ -183,6 +178,12 @@ def missions_unseen(to: Settings, document: Document) -> str | None:
     if task is None or task.lidar or BLOCKED not in document.get("episodes", []):
         return None
     return "no missions with blocked aisles: without a lidar, a robot finds one by driving into it"
+
+
+def possible_kinds(to: Settings, document: Document) -> list[str]:
+    """The kinds of episode that the floor has room for and that the robot can do."""
+    unseen = {BLOCKED} if missions_unseen(to, document) else set()
+    return [kind for kind in document.get("episodes", []) if kind not in unseen]
 
 
 def logs_alone_settings(coverage: Document) -> list[str]:
@@ -260,6 +261,7 @@ __all__ = [
     "no_room",
     "no_ways",
     "of_other_kinds",
+    "possible_kinds",
     "practice_settings",
     "robot_line",
     "several_kinds",

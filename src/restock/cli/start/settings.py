@@ -15,6 +15,7 @@ class Settings:
     profile: Path | str | None = None  # None: the one of the robot that comes with Restock
     seconds: float = 150.0  # of training
     episodes: int = 20  # of evaluation, per kind, policy and perturbation
+    kinds: tuple[str, ...] = ()  # of its missions; none: all that the floor has room for
     device: str = "cpu"
     mixture: str = "coverage"
     typestore: str | None = None
@@ -57,6 +58,12 @@ class Settings:
     @property
     def floor(self) -> Path:
         return self.out / "floor.toml"
+
+    @property
+    def of_each_kind(self) -> str:
+        """How many episodes to evaluate on, as `restock eval --episodes` takes it."""
+        counts = ",".join(f"{kind}={self.episodes}" for kind in self.kinds)
+        return counts or str(self.episodes)
 
     @property
     def recordings(self) -> tuple[Path, ...]:

@@ -299,7 +299,7 @@ def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
         "The kept checkpoint, the scripted planner and a random policy, clean and with less"
         " friction and more latency than in training.",
         [
-            *("eval", str(to.run), "--episodes", str(to.episodes), *cloned),
+            *("eval", str(to.run), "--episodes", to.of_each_kind, *cloned),
             *(("--baseline", "cloned") if goal else ()),
         ],
         outcome=outcomes.driven,
@@ -314,7 +314,7 @@ def evaluate_on_ways(to: Settings) -> Stage:
         "Evaluate on the routes of the logs",
         "Start and goal of the logged episodes that the panel holds out.",
         [
-            *("eval", str(to.run), "--episodes", str(to.episodes), "--missions", "logged"),
+            *("eval", str(to.run), "--episodes", to.of_each_kind, "--missions", "logged"),
             *("--policies", "agent,cloned,planner", "--perturbations", "none"),
         ],
         outcome=outcomes.driven_on_ways,

@@ -20,6 +20,7 @@ from restock.cli.start.decisions import (
     no_room,
     no_ways,
     of_other_kinds,
+    possible_kinds,
     practice_settings,
     robot_line,
     several_kinds,
@@ -196,9 +197,11 @@ class Way:
             )
         settings = practice_settings(to.profile)
         if floor.good:
-            settings += floor_settings(to, floor.document)
+            kinds = possible_kinds(to, floor.document)
+            settings += floor_settings(to, kinds)
             if (unseen := missions_unseen(to, floor.document)) is not None:
                 self._warn(unseen)
+                to = replace(to, kinds=tuple(kinds))
         gap, fitted = self._fit()
         if fitted:
             settings.append(f"env.perturbation={to.fitted}")
