@@ -3,6 +3,10 @@
 A store keeps no goal, but in each row how far it was and, once within reach of the far look-ahead
 point, where. Where the robot never came that near, the distances from along its way tell it,
 unless it hardly moved aside. What is not told, and what the floor has no way for, is counted.
+
+Odometry begins anew with each start of the robot, so recordings may have frames of their own: those
+whose poses do not lie on the floor are in another than the floor's, and none of their ways is one
+of it.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.train.evaluation.off_policy.dataset import held_out_of, panel_store
+from restock.train.twin.floors.cells import on_free_floor
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
 from restock.train.twin.floors.planner import Planner
@@ -32,9 +37,21 @@ HELD_OUT, EVERY = "logged", "logged:all"
 AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says
 RESIDUAL_M = 0.1  # of a goal by distances
 ASIDE_M = 0.3  # that the way must leave a straight line by, for distances to tell a goal
+PLACED = 0.8  # of a recording's poses, on free floor: they are in the floor's frame
 NO_GOAL = "the rows do not contain the goal's position"
 NO_WAY = "the goal cannot be reached on this floor: it is inside a wall, outside, or enclosed"
 AT_GOAL = "it starts at its goal"
+OTHER_FRAME = "its recording's poses are in another frame than this floor"
+
+
+@dataclass(frozen=True)
+class LoggedWays:
+    """Start pose and goal of episodes, in the frame of their logs."""
+
+    ways: Sequence[Way]
+    recordings: Sequence[str]  # of each way, its recording's id
+    places_m: Mapping[str, F64]  # (N, 2) by recording: where the robot was
+    logged: int  # episodes that were looked at
 
 
 @dataclass(frozen=True)
@@ -76,16 +93,21 @@ def logged_missions(
         held_out = len(ids) > 0 and not every
         if not held_out:
             ids = np.union1d(ids, np.asarray(panel.meta_column("transition_id"), np.int64))
-        ways, count = logged_ways(store.connection, ids, panel.task)
+        found = logged_ways(store.connection, ids, panel.task)
     source = (
         "episodes that the panel holds out"
         if held_out
         else "logged episodes, most of which were trained on"
     )
-    planner, left_out = Planner(floor), Counter({NO_GOAL: count - len(ways)})
+    planner, left_out = Planner(floor), Counter({NO_GOAL: found.logged - len(found.ways)})
+    elsewhere = _in_other_frames(found.places_m, floor)
     drivable = []
-    for way in _in_frame(ways, floor):
-        why = _undrivable(way, floor, planner, panel.task.goal_radius_m)
+    for way, recording in zip(_in_frame(found.ways, floor), found.recordings, strict=True):
+        why = (
+            OTHER_FRAME
+            if recording in elsewhere
+            else _undrivable(way, floor, planner, panel.task.goal_radius_m)
+        )
         if why is None:
             drivable.append(way)
         else:
@@ -101,7 +123,7 @@ def logged_missions(
     made = LoggedMissions(
         {kind: some for kind, some in specs.items() if some},
         len(drivable),
-        count,
+        found.logged,
         source,
         {why: number for why, number in left_out.items() if number},
         {
@@ -120,25 +142,25 @@ def logged_missions(
     return made
 
 
-def logged_ways(
-    connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task
-) -> tuple[list[Way], int]:
-    """Start pose and goal of each episode with some of these rows, in the logs' frame, where the
-    rows tell it; and how many episodes there are."""
+def logged_ways(connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task) -> LoggedWays:
+    """The ways of the episodes with some of these rows, where the rows tell them."""
     query = (files("restock.train.evaluation") / "logged_ways.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         columns = connection.sql(query).fetchnumpy()
+    recordings = np.asarray(columns.pop("recording_id"), str)
     names = np.asarray(columns.pop("episode_id"), str)
     first = np.flatnonzero(names[1:] != names[:-1]) + 1
     rows = np.stack([np.asarray(column, np.float64) for column in columns.values()], axis=-1)
-    ways = []
-    episodes = np.split(rows, first) if len(rows) else []
-    for of_episode in episodes:
-        goal = goal_of(of_episode, task.far_m)
-        if goal is not None and np.isfinite(of_episode[0, :3]).all():
-            x, y, yaw = of_episode[0, :3].tolist()
+    ways, of = [], []
+    for begin, episode in zip([0, *first], np.split(rows, first), strict=True):
+        goal = goal_of(episode, task.far_m) if len(episode) else None
+        if goal is not None and np.isfinite(episode[0, :3]).all():
+            x, y, yaw = episode[0, :3].tolist()
             ways.append((x, y, yaw, float(goal[0]), float(goal[1])))
-    return ways, len(episodes)
+            of.append(str(recordings[begin]))
+    known = np.isfinite(rows[:, :2]).all(axis=1)
+    places = {str(one): rows[known & (recordings == one), :2] for one in np.unique(recordings)}
+    return LoggedWays(ways, of, places, len(first) + 1 if len(rows) else 0)
 
 
 def goal_of(rows: F64, far_m: float) -> F64 | None:
@@ -168,6 +190,16 @@ def goal_of(rows: F64, far_m: float) -> F64 | None:
     goal, *_ = np.linalg.lstsq(2 * centred, square - square.mean(), rcond=None)
     residual = np.abs(np.hypot(*(place - goal).T) - distance)
     return np.asarray(goal) if float(residual.max()) <= RESIDUAL_M else None
+
+
+def _in_other_frames(places_m: Mapping[str, F64], floor: Warehouse) -> set[str]:
+    """The recordings whose poses mostly lie off a floor."""
+    return {
+        recording
+        for recording, places in places_m.items()
+        if len(places)
+        and on_free_floor(floor, into_frame(places, floor.map_origin)).mean() < PLACED
+    }
 
 
 def _in_frame(ways: Sequence[Way], floor: Warehouse) -> list[Way]:
@@ -205,4 +237,12 @@ def _seed(way: Way) -> int:
     return zlib.crc32(np.asarray(way, np.float64).tobytes()) >> 1
 
 
-__all__ = ["EVERY", "HELD_OUT", "LoggedMissions", "goal_of", "logged_missions", "logged_ways"]
+__all__ = [
+    "EVERY",
+    "HELD_OUT",
+    "LoggedMissions",
+    "LoggedWays",
+    "goal_of",
+    "logged_missions",
+    "logged_ways",
+]
