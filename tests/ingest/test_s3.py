@@ -51,6 +51,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return command
 
 
+@pytest.mark.long
 def test_every_verb_of_a_store_takes_the_address(place, tmp_path, run):
     bag = ROOT / "sample_logs" / "amr_tuesday"
     code, said, _ = run("ingest", bag, "--store", place)

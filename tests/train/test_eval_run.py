@@ -64,6 +64,7 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(
     assert "has no room for episodes of nominal" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_evaluations_add_up_and_the_newest_floors_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,9 @@ from tianshou.data import Batch
 from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
 
 
+pytestmark = pytest.mark.long  # half a minute to import, train and fill
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> TrainedBuffer:
     return trained_tianshou(tmp_path_factory.mktemp("tianshou"))
