@@ -27,7 +27,6 @@ from tianshou.data import Batch
 
 from restock.train.libraries.tianshou_buffer import MixtureVectorReplayBuffer
 
-
 pytestmark = pytest.mark.long  # half a minute to import, train and fill
 
 
