@@ -257,6 +257,28 @@ def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)
 
 
+def for_few_clusters(
+    interval: ConfidenceInterval, clusters: int, confidence: float = 0.95
+) -> ConfidenceInterval:
+    """The percentile interval of a bootstrap over C clusters, with its ends moved outwards.
+
+    That interval is too narrow where C is small: a draw's variance is (C - 1) / C of the true one,
+    and the spread is itself estimated. So its ends are moved away from the value, by Student's t
+    with C - 1 degrees of freedom over the normal's quantile, times sqrt(C / (C - 1)).
+    """
+    from scipy.stats import t
+
+    if clusters < 2:
+        return ConfidenceInterval(interval.value, float("nan"), float("nan"))
+    normal = NormalDist().inv_cdf(0.5 + confidence / 2)
+    factor = float(t.ppf(0.5 + confidence / 2, clusters - 1)) / normal
+    factor *= math.sqrt(clusters / (clusters - 1))
+    low, high = (
+        interval.value + factor * (end - interval.value) for end in (interval.low, interval.high)
+    )
+    return ConfidenceInterval(interval.value, low, high)
+
+
 def clustered_quantiles(
     values: NDArray[Any],
     cluster: NDArray[Any],

@@ -8,10 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from restock.stats import (
+    ConfidenceInterval,
     bootstrap,
+    cluster_counts,
     clustered_quantiles,
     clustered_ratio,
     difference_of_arms,
+    for_few_clusters,
     holm,
     improvement_of_arms,
     iqm,
@@ -185,6 +188,28 @@ def test_one_run_of_an_arm_has_no_interval() -> None:
     found = difference_of_arms(np.zeros((1, 5)), np.ones((3, 5)))
     assert found.value == 1.0
     assert np.isnan([found.low, found.high]).all()
+
+
+@pytest.mark.parametrize("clusters", [5, 8])
+def test_few_clusters_get_intervals_that_cover_what_they_say(clusters: int) -> None:
+    rng, covered = np.random.default_rng(clusters), {"percentile": 0, "widened": 0}
+    repeats = 1000
+    for values in rng.normal(0.0, 1.0, (repeats, clusters)):
+        counts = cluster_counts(clusters, 400, rng)
+        found = ConfidenceInterval(
+            float(values.mean()), *percentiles(counts @ values / counts.sum(axis=1))
+        )
+        for name, one in (("percentile", found), ("widened", for_few_clusters(found, clusters))):
+            covered[name] += one.low <= 0.0 <= one.high
+    assert covered["percentile"] < 0.91 * repeats
+    assert 0.93 * repeats < covered["widened"] < 0.97 * repeats
+
+
+def test_one_cluster_says_nothing_and_many_change_little() -> None:
+    found = ConfidenceInterval(1.0, 0.5, 2.0)
+    assert np.isnan([for_few_clusters(found, 1).low, for_few_clusters(found, 1).high]).all()
+    many = for_few_clusters(found, 10_000)
+    assert (many.low, many.high) == pytest.approx((0.5, 2.0), abs=1e-3)
 
 
 def test_holm_against_a_worked_example() -> None:

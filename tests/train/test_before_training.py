@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -22,9 +23,13 @@ from restock.ingest.store.writer import StoreWriter
 from restock.stats import ConfidenceInterval
 from restock.train.comparison.diagnose import Cause, Diagnosis
 from restock.train.comparison.rows_verdict import with_rows
+from restock.train.diagnosis.answers import GAIN, Answer
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
+from restock.train.diagnosis.causes import findings
+from restock.train.diagnosis.evidence import judged
 from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.gap_evidence import gap_evidence, untrusted
+from restock.train.diagnosis.relations import ACTION_TURN, RELATIONS
 from restock.train.diagnosis.twin_rows import drive_twin
 from restock.train.diagnosis.values import values
 from restock.train.twin.calibration.twin_gap import (
@@ -152,6 +157,23 @@ def test_a_sensor_is_told_from_the_actions(logs: FedRows, twin: FedRows) -> None
     (finding,) = diagnose_rows(_degrees(logs), twin).findings
     assert finding.cause == "SENSOR_SCALED"
     assert "degrees in place of radians" in finding.text
+
+
+@pytest.mark.parametrize(("high", "named"), [(-0.9, "MIRRORED"), (0.5, "MIXED")])
+def test_only_what_surely_has_the_opposite_sign_is_called_mirrored(high: float, named: str) -> None:
+    answers = []
+    for relation in RELATIONS:
+        off = relation.x == ACTION_TURN
+        value, most = (-1.5, high) if off else (1.0, 1.1)
+        gain = judged(
+            f"gain: {relation.name}", "", "ratio", ConfidenceInterval(value, value - 2, most),
+            logs=value, twin=1.0, least=1 / GAIN, most=GAIN, logs_rows=600,
+        )  # fmt: skip
+        assert gain.off is off
+        answers.append(Answer(relation, (gain,), value, 0.0))
+    (found,) = findings(answers, [], [], TASK)
+    assert found.cause == f"ACTIONS_{named}"
+    assert not re.search(r"[2-9]\d\d%|1[1-9]\d%", found.text)  # no share above 1
 
 
 def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:

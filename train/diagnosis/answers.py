@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from restock.arrays import F64
-from restock.stats import ConfidenceInterval, percentiles
+from restock.stats import ConfidenceInterval
 from restock.train.diagnosis.evidence import Comparison, judged, not_run
 from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.relations import RELATIONS, Relation
-from restock.train.diagnosis.response import Response, difference_of, ratio_of
+from restock.train.diagnosis.response import Response, difference_of, interval_of, ratio_of
 
 GAIN = 1.2  # of logs over the twin's, or its inverse
 NOISY_GAIN = 2.0  # of relations that are no measurement of the same thing
@@ -72,12 +72,14 @@ def _answer(
     most, most_left = (
         (GAIN, UNEXPLAINED) if relation.gain is not None else (NOISY_GAIN, NOISY_UNEXPLAINED)
     )
-    gain = ratio_of(found.gains, expected.gains, (found.gain, expected.gain))
-    delay = difference_of(found.delays, expected.delays, (found.delay, expected.delay))
+    fewer = min(found.clusters, expected.clusters)
+    gain = ratio_of(found.gains, expected.gains, (found.gain, expected.gain), fewer)
+    delay = difference_of(found.delays, expected.delays, (found.delay, expected.delay), fewer)
     left = difference_of(
         found.unexplained_draws,
         expected.unexplained_draws,
         (found.unexplained, expected.unexplained),
+        fewer,
     )
     timed = len(relation.lags) > 1 and abs(gain.value) > _KNOWN_GAIN
     compared = [
@@ -103,8 +105,9 @@ def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
     if relation.gain is None:
         row = not_run(f"gain: {name}", what, "no twin to compare with")
         return Answer(relation, (row,), float("nan"), 0.0)
-    gain = ConfidenceInterval(found.gain / relation.gain, *percentiles(found.gains / relation.gain))
-    delay = ConfidenceInterval(found.delay, *percentiles(found.delays))
+    of_unit = found.gain / relation.gain, found.gains / relation.gain
+    gain = interval_of(*of_unit, found.clusters)
+    delay = interval_of(found.delay, found.delays, found.clusters)
     made = [
         judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
                least=1 / GAIN, most=GAIN, logs_rows=found.rows),

@@ -159,26 +159,27 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     key = _KEYS[end]
     gain = 1 / scale if scale else float("inf")
     if is_action and gain < 1 / GAIN:
-        if gain < -1 / GAIN:
+        surely = _surely_reversed(off)
+        if surely and gain < -1 / GAIN:
             return _mirrored(end, evidence)
-        share = (1 - gain) / 2
+        share = (1 - (gain if surely else max(gain, 0))) / 2
         return Finding(
             "ACTIONS_MIXED",
             f"the logs' {end} explains only {max(gain, 0):.0%} of the expected motion, as if it "
             f"had the opposite sign in {share:.0%} of the rows, or belonged to other rows in "
-            f"{1 - gain:.0%}",
+            f"{min(1 - gain, 1):.0%}",
             f"check some recordings one by one: {key} may be right in some and wrong in others "
             "(robots, firmware), or actions may belong to other rows",
             evidence,
         )
-    if not 1 / GAIN <= scale <= GAIN and scale < 0:
+    if scale < 0 and _surely_reversed(off):
         return Finding(
             "SENSOR_MIRRORED",
             f"the logs' {end} has the opposite sign ({scale:+.2f} of the other signals)",
             f"change the sign of {key} in the profile (or its frame of reference)",
             evidence,
         )
-    if not 1 / GAIN <= scale <= GAIN:
+    if scale > 0 and not 1 / GAIN <= scale <= GAIN:
         unit = next((name for (low, high), name in _UNITS if low <= scale <= high), "")
         unit = unit or next(
             (f"the inverse of {name}" for (low, high), name in _UNITS if low <= 1 / scale <= high),
@@ -213,6 +214,14 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         f"check {key} for values of other rows, outliers or heavy noise",
         evidence,
     )
+
+
+def _surely_reversed(off: Sequence[Answer]) -> bool:
+    """Whether every gain that is off is below 0 with its whole interval: noise has either sign."""
+    gains = [
+        row for one in off for row in one.comparisons if row.off and row.check.startswith("gain")
+    ]
+    return bool(gains) and all(row.high is not None and row.high < 0 for row in gains)
 
 
 def _mirrored(end: str, evidence: tuple[str, ...]) -> Finding:

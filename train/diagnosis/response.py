@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.stats import ConfidenceInterval, cluster_counts, percentiles
+from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, percentiles
 
 RESAMPLES = 200
 FEWEST_CLUSTERS = 5
@@ -76,22 +76,31 @@ def fit_response(
     )  # fmt: skip
 
 
-def ratio_of(above: F64, below: F64, at: tuple[float, float]) -> ConfidenceInterval:
-    """A ratio of two statistics with independent draws (R,) each, and the values `at`."""
+def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
+    """A ratio of two statistics with independent draws (R,) each, and the values `at`.
+
+    `clusters` are those of the one that has fewer.
+    """
     bottom = np.where(np.abs(below) > 1e-9, below, np.nan)
-    return _interval(at[0] / at[1] if at[1] else float("nan"), above / bottom)
+    return interval_of(at[0] / at[1] if at[1] else float("nan"), above / bottom, clusters)
 
 
-def difference_of(first: F64, second: F64, at: tuple[float, float]) -> ConfidenceInterval:
-    """A difference of two statistics with independent draws (R,) each, and the values `at`."""
-    return _interval(at[0] - at[1], first - second)
+def difference_of(
+    first: F64, second: F64, at: tuple[float, float], clusters: int
+) -> ConfidenceInterval:
+    """A difference of two statistics with independent draws (R,) each, and the values `at`.
+
+    `clusters` are those of the one that has fewer.
+    """
+    return interval_of(at[0] - at[1], first - second, clusters)
 
 
-def _interval(value: float, draws: NDArray[np.float64]) -> ConfidenceInterval:
+def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> ConfidenceInterval:
+    """That of a statistic with draws (R,) over so many clusters; NaN where it is not known."""
     finite = draws[np.isfinite(draws)]
     if not len(finite) or not np.isfinite(value):
         return ConfidenceInterval(value, float("nan"), float("nan"))
-    return ConfidenceInterval(value, *percentiles(finite))
+    return for_few_clusters(ConfidenceInterval(value, *percentiles(finite)), clusters)
 
 
 def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
@@ -99,4 +108,4 @@ def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
     return np.stack([np.where(known, x[row], np.nan) for row, known in before], axis=1)
 
 
-__all__ = ["Response", "difference_of", "fit_response", "lagged", "ratio_of"]
+__all__ = ["Response", "difference_of", "fit_response", "interval_of", "lagged", "ratio_of"]
