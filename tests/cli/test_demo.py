@@ -10,6 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.text import Text
+from support.panels import panel_of
+from support.stores import recording_transitions
 
 from restock import cli
 from restock.cli.start import stages
@@ -49,6 +51,25 @@ def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
     differing = {flag for flag in first if first[flag] != second[flag]}
     assert differing == {"--panel", "--out"}
     assert {"practice.rule=success", "seed=3"} <= {*stage.command} & {*stage.beside}
+
+
+@pytest.mark.parametrize("drivers", [["operator", "planner"], ["joystick", "planner"]])
+def test_the_policy_from_the_logs_alone_imitates_whom_there_is(
+    tmp_path: Path, drivers: list[str]
+) -> None:
+    to = Settings(("logs",), tmp_path)
+    rows = recording_transitions(1)
+    at = rows.schema.get_field_index("behaviour_policy")
+    names = pa.array([drivers[row % 2] for row in range(len(rows))])
+    rows = rows.set_column(at, "behaviour_policy", names.cast(rows.schema.field(at).type))
+    panel_of(rows, "[each_condition]\nshare = 'natural'\n", to.panel)
+    decided = stages.train_on_logs(to).decided
+    assert decided is not None
+    command = decided()
+    assert command is not None
+    assert "teacher.source=logs" in command
+    named = [word for word in command if word.startswith("teacher.policies")]
+    assert named == ([] if "operator" in drivers else ['teacher.policies=["joystick", "planner"]'])
 
 
 def test_the_run_that_is_behind_goes_on_until_both_have_driven_as_much(tmp_path: Path) -> None:

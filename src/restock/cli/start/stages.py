@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,17 +248,33 @@ def even_out(to: Settings) -> Stage:
 
 def train_on_logs(to: Settings) -> Stage:
     """The policy before fine-tuning: of the same panel, and never in the twin."""
-    settings = ("env.twin=false", "teacher.source=none", f"schedule.offline_updates={UPDATES}")
-    return Stage(
-        "logs-alone",
-        "Before fine-tuning: a policy from the logs alone",
-        f"{UPDATES:,} updates on the panel; nothing is driven.",
-        [
+    settings = ["env.twin=false", "teacher.source=logs", f"schedule.offline_updates={UPDATES}"]
+
+    def command(settings: Sequence[str]) -> list[str]:
+        return [
             *("train", "--panel", str(to.panel), "--out", str(to.logs_alone)),
             *("--device", to.device),
             *(word for setting in settings for word in ("--set", setting)),
-        ],
+        ]
+
+    def decided() -> list[str]:
+        from restock.replay.panel.panel import Panel
+        from restock.toml import toml_value
+        from restock.train.dqn.config import TeacherConfig
+
+        drivers = set(Panel.open(to.panel).meta_column("behaviour_policy")) - {None}
+        if drivers.isdisjoint(TeacherConfig().policies):  # then everybody is imitated
+            return command([*settings, f"teacher.policies={toml_value(sorted(drivers))}"])
+        return command(settings)
+
+    return Stage(
+        "logs-alone",
+        "Before fine-tuning: a policy from the logs alone",
+        f"{UPDATES:,} updates on the panel, by Q among the actions that its good drivers would"
+        " plausibly take; nothing is driven in the twin.",
+        command(settings),
         writes=(to.logs_alone,),
+        decided=decided,
     )
 
 
