@@ -44,8 +44,8 @@ def ways_to_evaluate(
     """The ways of its logs that a run's evaluations drive on these floors; None: drawn missions.
 
     Raises:
-        ConfigError: ways are asked for, and there are no logs, no goal, several floors, or none of
-            them can be driven.
+        ConfigError: ways are asked for, and there are no logs, no goal, or none of them can be
+            driven.
     """
     chosen, kinds = config.evaluation, list(config.env.conditions)
     if chosen.missions == "drawn" or not config.env.twin:
@@ -56,14 +56,12 @@ def ways_to_evaluate(
         why = "the run does not learn from logs"
     elif panel.task.goal == "none":
         why = "the task has no goal"
-    elif len(floors) > 1:
-        why = f"needs one floor, that of the logs; got {len(floors)}"
     if panel is None or why is not None:
         raise ConfigError(
             str(why), where="evaluation.missions", remedy='leave it out, or set "drawn"'
         )
     every = chosen.missions == EVERY
-    specs = logged_missions(panel, floors[0], kinds, every=every).specs
+    specs = logged_missions(panel, floors, kinds, every=every).specs
     fitting = [kind for kind in kinds if kind in specs]
     most = min(max(len(specs[kind]) for kind in fitting), chosen.episodes)
     return [specs[kind][at] for at in range(most) for kind in fitting if at < len(specs[kind])]

@@ -94,17 +94,17 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
 
 
 def test_held_out_ways_are_missions_and_what_the_floor_lacks_is_counted(panel: Panel) -> None:
-    made = logged_missions(panel, FLOOR, ("nominal", "wheel_slip"), every=True)
+    made = logged_missions(panel, (FLOOR,), ("nominal", "wheel_slip"), every=True)
     assert made.logged == 36
     assert made.ways == 12
     assert sum(made.left_out.values()) == 24
-    assert "24 not: its recording's poses are in another frame than this floor" in made.text
+    assert "24 not: its recording's poses are in another frame than the floor" in made.text
     for spec in made.specs["nominal"]:
         assert spec.way is not None
         ends = np.array(spec.way)
         assert np.hypot(*(STARTS - ends[:2]).T).min() < 0.01
         assert np.hypot(*(STARTS - ends[3:]).T).min() < 0.01
-    held_out = logged_missions(panel, FLOOR, ("nominal",))
+    held_out = logged_missions(panel, (FLOOR,), ("nominal",))
     assert "that the panel holds out" in held_out.text
     assert 0 < held_out.logged < 36
 
@@ -112,15 +112,24 @@ def test_held_out_ways_are_missions_and_what_the_floor_lacks_is_counted(panel: P
 def test_start_says_why_no_route_of_the_logs_can_be_driven(panel: Panel) -> None:
     to = Settings((), panel.path.parent)
     write_floor(FLOOR, to.floor)
-    assert no_ways(to, {"frame": "map"}) is None
+    assert no_ways(to) is None
     to.floor.unlink()
     write_floor(replace(FLOOR, map_origin=(900.0, 0.0, 0.0)), to.floor)
-    note = "by monday.mcap, of 2 recordings in the store"
-    why = no_ways(to, {"frame": "odom", "notes": [note]})
+    why = no_ways(to)
     to.floor.unlink()
     assert why is not None
     assert "0 of " in why
-    assert why.endswith("(the floor has its frame, odom, from one recording)")
+    assert "its recording's poses are in another frame than the floor" in why
+
+
+def test_each_way_is_a_mission_of_the_floor_that_its_recordings_poses_lie_on(panel: Panel) -> None:
+    away = replace(FLOOR, name="away", map_origin=(300.0, 300.0, 0.0))
+    made = logged_missions(panel, (FLOOR, away), ("nominal",), every=True)
+    assert made.ways == 24
+    layouts = [spec.layout for spec in made.specs["nominal"]]
+    assert layouts == [FLOOR.name] * 12 + ["away"] * 12
+    ends = np.array([spec.way for spec in made.specs["nominal"]])
+    np.testing.assert_allclose(ends[:12], ends[12:], atol=2e-3)
 
 
 def test_eval_drives_the_ways_of_the_logs(
@@ -142,8 +151,10 @@ def test_eval_drives_the_ways_of_the_logs(
         assert np.hypot(*(STARTS - place).T).min() <= TASK.goal_radius_m + 0.1
     assert main([*line, "--missions", "mine"]) == 2
     assert "choose from drawn, logged, logged:all" in capsys.readouterr().err
-    assert main([*line, "--missions", "logged", "--layouts", "generated:test:2"]) == 2
-    assert "needs one floor, that of the logs; got 2" in capsys.readouterr().err
+    away = replace(FLOOR, name="away", map_origin=(900.0, 0.0, 0.0))
+    write_floor(away, tmp_path / "away.toml")
+    assert main([*line, "--missions", "logged", "--layouts", str(tmp_path / "away.toml")]) == 2
+    assert "0 of " in capsys.readouterr().err
     without = kept_run(tmp_path / "without")
     assert main(["eval", str(without), "--missions", "logged"]) == 2
     assert "did not learn from logs" in capsys.readouterr().err
@@ -160,7 +171,7 @@ def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
     line += ["--set", "env.conditions={nominal=1.0}", "--env-steps", "40"]
     assert main([*line, "--out", str(tmp_path / "run")]) == 0
     driven = read_table(tmp_path / "run" / "evaluations.parquet").to_pylist()
-    made = logged_missions(panel, FLOOR, ("nominal",))
+    made = logged_missions(panel, (FLOOR,), ("nominal",))
     ways = {spec.seed for spec in made.specs["nominal"][:2]}
     assert {row["episode_seed"] for row in driven} == ways
     (_, said) = plan_evaluation(tmp_path / "run", missions="logged").warnings
@@ -170,7 +181,8 @@ def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
 def test_a_run_on_another_floor_cannot_evaluate_on_them(
     panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = ["--set", "env.layouts=generated:train:3", "--out", str(tmp_path / "other")]
+    write_floor(replace(FLOOR, name="away", map_origin=(900.0, 0.0, 0.0)), tmp_path / "away.toml")
+    other = [f"--set=env.layouts={tmp_path / 'away.toml'}", "--out", str(tmp_path / "other")]
     assert main([*LOGGED_TRAINING, "--panel", str(panel.path), *other]) == 2
-    assert "evaluation.missions: needs one floor, that of the logs" in capsys.readouterr().err
+    assert "poses are in another frame than the floor" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()

@@ -222,7 +222,7 @@ def _missions(
     """Those of the logs where they are asked for.
 
     Raises:
-        ConfigError: no such missions, no logs, several floors, or none of them can be driven.
+        ConfigError: no such missions, no logs, or none of them can be driven.
     """
     if named == DRAWN:
         return None
@@ -234,13 +234,7 @@ def _missions(
         raise ConfigError("the run did not learn from logs", where=where, remedy="leave it out")
     if panel.task.goal == "none":
         raise ConfigError("the task has no goal", where=where, remedy="leave it out")
-    if len(floors) > 1:
-        raise ConfigError(
-            f"needs one floor, that of the logs; got {len(floors)}",
-            where=where,
-            remedy="give one with --layouts",
-        )
-    return logged_missions(panel, floors[0], kinds, every=named == EVERY)
+    return logged_missions(panel, floors, kinds, every=named == EVERY)
 
 
 def _limits(run: Run, named: str) -> Limits:

@@ -4,9 +4,8 @@ A store keeps no goal, but in each row how far it was and, once within reach of 
 point, where. Where the robot never came that near, the distances from along its way tell it,
 unless it hardly moved aside. What is not told, and what the floor has no way for, is counted.
 
-Odometry begins anew with each start of the robot, so recordings may have frames of their own: those
-whose poses do not lie on the floor are in another than the floor's, and none of their ways is one
-of it.
+Recordings may each have a frame of their own. A recording's ways are missions of the floor that its
+poses lie on, of those that there are.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.train.evaluation.off_policy.dataset import held_out_of, panel_store
-from restock.train.twin.floors.cells import on_free_floor
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
+from restock.train.twin.floors.placed import placed_on
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import EpisodeSpec, Way, draw_episode
 
@@ -37,11 +36,10 @@ HELD_OUT, EVERY = "logged", "logged:all"
 AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says
 RESIDUAL_M = 0.1  # of a goal by distances
 ASIDE_M = 0.3  # that the way must leave a straight line by, for distances to tell a goal
-PLACED = 0.8  # of a recording's poses, on free floor: they are in the floor's frame
 NO_GOAL = "the rows do not contain the goal's position"
-NO_WAY = "the goal cannot be reached on this floor: it is inside a wall, outside, or enclosed"
+NO_WAY = "the goal cannot be reached on the floor: it is inside a wall, outside, or enclosed"
 AT_GOAL = "it starts at its goal"
-OTHER_FRAME = "its recording's poses are in another frame than this floor"
+OTHER_FRAME = "its recording's poses are in another frame than the floor"
 
 
 @dataclass(frozen=True)
@@ -77,15 +75,15 @@ class LoggedMissions:
 
 
 def logged_missions(
-    panel: Panel, floor: Warehouse, kinds: Sequence[str], *, every: bool = False
+    panel: Panel, floors: Sequence[Warehouse], kinds: Sequence[str], *, every: bool = False
 ) -> LoggedMissions:
-    """The ways of the episodes that a panel holds out, as missions on a floor of the same frame.
+    """The ways of the episodes that a panel holds out, as missions on floors of their frames.
 
     Args:
         every: those that were trained on too; also where nothing is held out.
 
     Raises:
-        ConfigError: none of them can be driven on this floor.
+        ConfigError: none of them can be driven on these floors.
         StoreError, PanelError: the logs are no longer there.
     """
     with panel_store(panel) as store:
@@ -99,24 +97,33 @@ def logged_missions(
         if held_out
         else "logged episodes, most of which were trained on"
     )
-    planner, left_out = Planner(floor), Counter({NO_GOAL: found.logged - len(found.ways)})
-    elsewhere = _in_other_frames(found.places_m, floor)
-    drivable = []
-    for way, recording in zip(_in_frame(found.ways, floor), found.recordings, strict=True):
-        why = (
-            OTHER_FRAME
-            if recording in elsewhere
-            else _undrivable(way, floor, planner, panel.task.goal_radius_m)
-        )
+    placed = {
+        recording: next((floor for floor in floors if placed_on(floor, places)), None)
+        for recording, places in found.places_m.items()
+    }
+    planner = {floor.name: Planner(floor) for floor in floors}
+    left_out = Counter({NO_GOAL: found.logged - len(found.ways)})
+    drivable: list[tuple[Warehouse, Way]] = []
+    for logged, recording in zip(found.ways, found.recordings, strict=True):
+        floor = placed[recording]
+        if floor is None:
+            left_out[OTHER_FRAME] += 1
+            continue
+        way = _in_frame(logged, floor)
+        why = _undrivable(way, floor, planner[floor.name], panel.task.goal_radius_m)
         if why is None:
-            drivable.append(way)
+            drivable.append((floor, way))
         else:
             left_out[why] += 1
+    several = len(floors) > 1
     specs: dict[str, list[EpisodeSpec]] = {
         kind: [
             spec
-            for spec in (EpisodeSpec(kind, _seed(way), way=way) for way in drivable)
-            if _has_room(spec, floor, planner)
+            for floor, way in drivable
+            for spec in (
+                EpisodeSpec(kind, _seed(way), layout=floor.name if several else None, way=way),
+            )
+            if _has_room(spec, floor, planner[floor.name])
         ]
         for kind in kinds
     }
@@ -135,7 +142,7 @@ def logged_missions(
     if not made.specs:
         raise ConfigError(
             made.text,
-            where=f"--missions, {floor.name}",
+            where=f"--missions, {', '.join(floor.name for floor in floors)}",
             remedy=f"give --missions {EVERY}, a floor in the frame of the logs (`restock twin "
             "layout --from STORE`), or leave out --missions",
         )
@@ -192,24 +199,12 @@ def goal_of(rows: F64, far_m: float) -> F64 | None:
     return np.asarray(goal) if float(residual.max()) <= RESIDUAL_M else None
 
 
-def _in_other_frames(places_m: Mapping[str, F64], floor: Warehouse) -> set[str]:
-    """The recordings whose poses mostly lie off a floor."""
-    return {
-        recording
-        for recording, places in places_m.items()
-        if len(places)
-        and on_free_floor(floor, into_frame(places, floor.map_origin)).mean() < PLACED
-    }
-
-
-def _in_frame(ways: Sequence[Way], floor: Warehouse) -> list[Way]:
-    if not ways:
-        return []
-    of = np.asarray(ways, np.float64)
-    start, goal = (into_frame(of[:, part], floor.map_origin) for part in (slice(2), slice(3, 5)))
-    yaw = of[:, 2] - floor.map_origin[2]
-    moved = np.column_stack([start, yaw, goal]).round(3).tolist()
-    return [(row[0], row[1], row[2], row[3], row[4]) for row in moved]
+def _in_frame(way: Way, floor: Warehouse) -> Way:
+    """A way of the logs in a floor's own frame."""
+    of = np.asarray(way, np.float64)
+    ends = into_frame(np.stack([of[:2], of[3:5]]), floor.map_origin)
+    x, y, goal_x, goal_y = ends.ravel().round(3).tolist()
+    return x, y, round(float(of[2] - floor.map_origin[2]), 3), goal_x, goal_y
 
 
 def _undrivable(way: Way, floor: Warehouse, planner: Planner, radius_m: float) -> str | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from restock.arrays import F64, Bools, Ints
+from restock.arrays import Bools, Ints
 from restock.train.twin.floors.layout import AisleSegment, Axis, Rect, Warehouse
 
 Cells = Bools  # (X, Y)
@@ -46,15 +46,6 @@ def cells_of(floor: Warehouse, cell_m: float) -> Cells:
         inside_x = (rack.x_min <= x) & (x <= rack.x_max)
         inside_y = (rack.y_min <= y) & (y <= rack.y_max)
         free &= ~(inside_x[:, None] & inside_y[None, :])
-    return free
-
-
-def on_free_floor(floor: Warehouse, places_m: F64) -> Bools:
-    """Which places (N, 2) lie on a floor and in none of its racks, (N,)."""
-    x, y = places_m.T
-    free: Bools = (x >= 0) & (x <= floor.width_m) & (y >= 0) & (y <= floor.depth_m)
-    for rack in floor.racks:
-        free &= ~((rack.x_min <= x) & (x <= rack.x_max) & (rack.y_min <= y) & (y <= rack.y_max))
     return free
 
 

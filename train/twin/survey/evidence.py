@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,18 +37,20 @@ class Evidence:
     footprint: Footprint | None = None
     scans: list[PlacedScans] = field(default_factory=list)  # by one clock, and by another
     notes: list[str] = field(default_factory=list)
+    each_m: Mapping[str, F64] = field(default_factory=dict)  # of a store's recordings, (N, 2)
 
 
 def gather(
     path: Path,
     *,
+    stored_recording: str | None = None,
     map_yaml: Path | None,
     with_map: bool,
     with_scans: bool,
     profile: Profile | None,
     typestore: str | None,
 ) -> Evidence:
-    """What a recording has, or the recording of a store with the most rows.
+    """What a recording has, or one of a store: `stored_recording`, or that with the most rows.
 
     `with_map`: a map that is none is an error, and scans are not needed where there is one;
     without, it is left aside. `with_scans`: scans are read where they are needed.
@@ -61,11 +63,12 @@ def gather(
     notes: list[str] = []
     file, stored = path, None
     if is_store(path):
-        stored = stored_drive(path)
+        stored = stored_drive(path, stored_recording)
         profile, notes = profile or stored.profile, stored.notes
         if stored.recording is None:
             known = None if map_yaml is None else (read_grid(map_yaml), str(map_yaml))
-            return Evidence(stored.poses, known, _of_profile(profile), notes=notes)
+            size = _of_profile(profile)
+            return Evidence(stored.poses, known, size, notes=notes, each_m=stored.each_m)
         file = stored.recording
     with open_recording(file, typestore=typestore, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
@@ -77,7 +80,7 @@ def gather(
         scans: list[PlacedScans] = []
         if with_scans and poses is not None and not (with_map and known):
             scans = placed_scans(recording, poses, profile, size)
-    return Evidence(poses, known, size, scans, notes)
+    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.each_m)
 
 
 def _lies_on(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:

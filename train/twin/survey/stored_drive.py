@@ -1,4 +1,4 @@
-"""What a store has of its drives for a survey: the poses of its rows, and where recordings lie.
+"""What a store has of a drive for a survey: the poses of its rows, and where its recording lies.
 
 A store keeps no maps, and of scans the clearance in a few sectors alone: both are read from the
 recording that the rows came from, where it is still there.
@@ -6,12 +6,15 @@ recording that the rows came from, where it is still there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from restock.arrays import F64
 from restock.errors import RestockError, StoreError
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.replay.store.store import Store
@@ -25,7 +28,7 @@ _POSES = (
 
 @dataclass(frozen=True)
 class StoredDrive:
-    """The drive of a store with the most rows, and whose poses they are."""
+    """The drive of one recording of a store, and whose poses they are."""
 
     poses: Poses
     everywhere: (
@@ -33,14 +36,18 @@ class StoredDrive:
     )
     recording: Path | None  # where it lies; None where it is no longer there
     profile: Profile | None  # that its rows were made by
+    each_m: Mapping[str, F64]  # (N, 2) places of every recording by that profile, by its source
     notes: list[str] = field(default_factory=list)
 
 
-def stored_drive(path: Path) -> StoredDrive:
+def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
     """The recording with the most rows, of those that are still there if any is.
 
+    Args:
+        recording: which one instead: its id, or its file's name or the end of its path.
+
     Raises:
-        StoreError: the store is empty, or cannot be read.
+        StoreError: the store is empty, cannot be read, or has no such recording or several.
     """
     sql = (files("restock.train.twin.survey") / "stored_drive.sql").read_text(encoding="utf-8")
     with Store(str(path)) as store:
@@ -48,17 +55,43 @@ def stored_drive(path: Path) -> StoredDrive:
         if not rows:
             raise StoreError("no transitions", where=str(path), remedy="ingest recordings into it")
         there = [row for row in rows if row[1] and Path(row[1]).exists()]
+        if recording is not None:
+            there = [_named(recording, rows, str(path))]
         identity, source, toml, _ = (there or rows)[0]
-        alike = [row[0] for row in rows if row[2] == toml]
+        alike = [row for row in rows if row[2] == toml]
+        said = f"poses of the rows of {len(alike)} recordings"
+        everywhere = _poses(store, [row[0] for row in alike], said)
+        of_each = {row[1] or row[0]: _poses(store, [row[0]], "") for row in alike}
         poses = _poses(store, [identity], f"poses of the rows of {source}")
-        everywhere = _poses(store, alike, f"poses of the rows of {len(alike)} recordings")
     notes = []
-    if not there:
+    if not source or not Path(source).exists():
         notes.append(f"{source} no longer exists: its map and its scans cannot be read")
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
-    return StoredDrive(
-        poses, everywhere, Path(source) if there else None, _profile(toml, source), notes
+    file = Path(source) if source and Path(source).exists() else None
+    each_m = {name: one.places_m for name, one in of_each.items()}
+    return StoredDrive(poses, everywhere, file, _profile(toml, source), each_m, notes)
+
+
+def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
+    """The one row of the recordings that this names.
+
+    Raises:
+        StoreError: none, or several.
+    """
+    end = Path(recording).parts
+    found = [
+        row
+        for row in rows
+        if row[0] == recording or (row[1] and Path(row[1]).parts[-len(end) :] == end)
+    ]
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(str(row[1] or row[0]) for row in (found or rows)[:8])
+    raise StoreError(
+        f"{'several recordings are' if found else 'no recording is'} {recording!r}",
+        where=where,
+        remedy=f"give the path or the id of one of {names}",
     )
 
 

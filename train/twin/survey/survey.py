@@ -17,6 +17,7 @@ from scipy import ndimage
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.evidence.footprint import Footprint
+from restock.replay.store.store import is_store
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
@@ -25,6 +26,7 @@ from restock.train.twin.floors.occupancy_grid import (
     floor_of_grid,
     out_of_frame,
 )
+from restock.train.twin.floors.placed import placed_on
 from restock.train.twin.survey.directions import along_walls
 from restock.train.twin.survey.driven_corridor import driven_corridor
 from restock.train.twin.survey.evidence import Evidence, gather
@@ -58,6 +60,7 @@ class Surveyed:
     poses: Poses | None = None
     agreement: float | None = None  # of walls with those of the map that is there too
     notes: list[str] = field(default_factory=list)
+    elsewhere: list[str] = field(default_factory=list)  # a store's recordings of other frames
 
     def facts(self) -> dict[str, Any]:
         """Plain values, for people and JSON."""
@@ -71,6 +74,8 @@ class Surveyed:
             "robot": f"{self.footprint.length_m:.2f} x {self.footprint.width_m:.2f} m,"
             f" {self.footprint.source}",
         }
+        if self.elsewhere:
+            values["elsewhere"] = self.elsewhere
         if self.agreement is not None:
             values["walls_iou_with_map"] = round(self.agreement, 3)
         if self.poses is not None:
@@ -86,16 +91,18 @@ class Surveyed:
 def survey(
     path: Path,
     *,
+    recording: str | None = None,
     map_yaml: Path | None = None,
     by: Source | None = None,
     profile: Profile | None = None,
     footprint: Footprint | None = None,
     typestore: str | None = None,
 ) -> Surveyed:
-    """The floor that a recording shows, or the recording of a store with the most rows.
+    """The floor that a recording shows, or one of a store.
 
     Args:
         path: of the recording or store.
+        recording: of a store, by its id or the end of its path; None: the one with the most rows.
         map_yaml: the map that its robot localised in, in place of one in the recording.
         by: what to make the floor from; None: the first of map, scans and corridor that is there.
         profile: says which topics are the pose and the scan, and how large the robot is; of a
@@ -106,10 +113,16 @@ def survey(
     Raises:
         RecordingError: it cannot be read, or holds nothing that a floor can be made from.
         ConfigError: the map is none, or not of these poses; or no floor for this robot.
-        StoreError: the store is empty, or cannot be read.
+        StoreError: the store is empty, cannot be read, or has no such recording.
     """
+    if recording is not None and not is_store(path):
+        raise ConfigError(
+            "a recording is chosen of a store, and this is none", where=str(path),
+            remedy="leave it out, or give the store",
+        )  # fmt: skip
     evidence = gather(
         path,
+        stored_recording=recording,
         map_yaml=map_yaml,
         with_map=by in (None, "map"),
         with_scans=by in (None, "scans"),
@@ -126,15 +139,21 @@ def survey(
         agreement = walls_agreement(grid, evidence.known[0])
     made = floor_of_grid(
         grid,
-        name=path.stem,
+        name=path.stem if recording is None else f"{path.stem}: {Path(recording).stem}",
         where=f"{path}, {source}",
         room_m=round(body.width_m / 2 + MARGIN_M, 3),
         turn_m=_turn_m(body),
         visited_m=None if poses is None else poses.places_m,
     )
-    return Surveyed(
-        with_zones(made.floor), made.grid, how, source, body, poses, agreement, notes + made.notes
-    )
+    floor = with_zones(made.floor)
+    elsewhere = [name for name, places in evidence.each_m.items() if not placed_on(floor, places)]
+    notes += made.notes
+    if elsewhere:
+        notes.append(
+            f"the poses of {len(elsewhere)} of {len(evidence.each_m)} recordings are in other"
+            " frames: their routes are not on this floor (--recording makes the floor of one)"
+        )
+    return Surveyed(floor, made.grid, how, source, body, poses, agreement, notes, elsewhere)
 
 
 def _grid(

@@ -145,27 +145,25 @@ def fit_is_worse(gap: Document) -> str | None:
     )
 
 
-def no_ways(to: Settings, floor: Document) -> str | None:
+def no_ways(to: Settings) -> str | None:
     """Why none of the routes that the panel holds out can be driven; None where one can."""
     from restock.replay.panel.panel import Panel
     from restock.train.evaluation.logged_ways import logged_missions
     from restock.train.twin.floors.floors import open_floors
 
     try:
-        logged_missions(Panel.open(to.panel), open_floors(str(to.floor))[0], ("nominal",))
+        logged_missions(Panel.open(to.panel), open_floors(to.layouts), ("nominal",))
     except ConfigError as error:
-        own = f" (the floor has its frame, {floor['frame']}, from one recording)"
-        several = any("recordings in the store" in note for note in floor.get("notes", ()))
-        return error.what + own * several
+        return error.what
     return None
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
-    """Train on that floor, on these kinds of episode; none: all."""
+    """Train on the floors, on these kinds of episode; none: all."""
     from restock.toml import toml_value
     from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 
-    settings = [f"env.layouts={to.floor}"]
+    settings = [f"env.layouts={to.layouts}"]
     shares = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in kinds}
     if kinds and len(shares) < len(DEFAULT_CONDITIONS):
         settings.append(f"env.conditions={toml_value(shares)}")

@@ -23,6 +23,7 @@ class Settings:
     salvage: bool = False
     tags: tuple[str, ...] = ()  # each KEY=VALUE
     map: Path | None = None
+    further_floors: tuple[Path, ...] = ()  # of recordings in other frames than the first floor's
     train: tuple[str, ...] = ()  # further settings, each key=value
 
     @property
@@ -58,6 +59,11 @@ class Settings:
     @property
     def floor(self) -> Path:
         return self.out / "floor.toml"
+
+    @property
+    def layouts(self) -> str:
+        """All floors, as a run's config and evaluations take them."""
+        return ",".join(map(str, (self.floor, *self.further_floors)))
 
     @property
     def of_each_kind(self) -> str:

@@ -130,19 +130,35 @@ def mix_uniform(to: Settings) -> Stage:
 
 def floor(to: Settings) -> Stage:
     """The user's floor for the twin: their map, else scans, else the way that was driven."""
-    picture = to.out / "floor.png"
-    given = [] if to.map is None else ["--map", str(to.map)]
-    return Stage(
-        "floor",
-        "The floor, as the recordings show it",
+    given = () if to.map is None else ("--map", str(to.map))
+    return _floor(
+        to, to.floor, "The floor, as the recordings show it",
         "Made from the map in the recordings, else from their scans, else from the path that was "
-        "driven.",
+        "driven.", given,
+    )  # fmt: skip
+
+
+def further_floor(to: Settings, recording: str, made: Path) -> Stage:
+    """The floor of a recording whose poses are in another frame than those of the floors before."""
+    return _floor(
+        to, made, "The floor of another frame",
+        f"The poses of {Path(recording).name} are in a frame of their own: its routes are on a "
+        "floor of their own.", ("--recording", recording),
+    )  # fmt: skip
+
+
+def _floor(to: Settings, made: Path, title: str, why: str, given: Sequence[str]) -> Stage:
+    picture = made.with_suffix(".png")
+    return Stage(
+        made.stem,
+        title,
+        why,
         [
             *("twin", "layout", "--from", str(to.store), *given, *to.with_definitions),
-            *("--out", str(to.floor), "--png", str(picture)),
+            *("--out", str(made), "--png", str(picture)),
         ],
         reads=() if to.map is None else own_file(to.map),
-        writes=(to.floor, picture),
+        writes=(made, picture),
         outcome=outcomes.floor,
     )
 

@@ -26,6 +26,7 @@ from restock.cli.start.decisions import (
     several_kinds,
     updates_settings,
 )
+from restock.cli.start.outcomes import count
 from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import Ended, Work, escape
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
 ODOMETRY = "--odometry-as-command"
+MOST_FLOORS = 6
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
 
@@ -195,6 +197,7 @@ class Way:
                 "floor is then made from the recordings",
                 self.again,
             )
+        to = self.to = replace(to, further_floors=self._further_floors(floor))
         settings = practice_settings(to.profile)
         if floor.good:
             kinds = possible_kinds(to, floor.document)
@@ -213,6 +216,28 @@ class Way:
             return None
         self.to = replace(to, train=tuple(settings))
         return floor
+
+    def _further_floors(self, floor: Ended) -> tuple[Path, ...]:
+        """Floors of recordings in other frames than that floor's, with room for the same."""
+        kinds, used = set(floor.document.get("episodes", [])), []
+        left = list(floor.document.get("elsewhere", [])) if kinds else []
+        for number in range(2, MOST_FLOORS + 1):
+            if not left:
+                break
+            made = self.to.out / f"floor-{number}.toml"
+            further = self.work.do(stages.further_floor(self.to, left[0], made))
+            if not further.good:
+                left = left[1:]
+                continue
+            left = [name for name in left[1:] if name in further.document.get("elsewhere", [])]
+            if lacking := kinds - set(further.document["episodes"]):
+                self._warn(f"{made.name} is not used: it has no room for {', '.join(lacking)}")
+            else:
+                used.append(made)
+        if left:
+            others = count(len(left), "recording")
+            self._warn(f"{others} in other frames: their routes are on none of the floors")
+        return tuple(used)
 
     def _fit(self) -> tuple[Ended, bool]:
         """The gap of the twin that is used, and whether that is the fitted one."""
@@ -239,7 +264,7 @@ class Way:
         if floor is not None:
             goal = has_goal(to.profile)
             if goal and floor.good:
-                why = None if self.work.plan else no_ways(to, floor.document)
+                why = None if self.work.plan else no_ways(to)
                 if why is None:
                     judged.append(do(stages.evaluate_on_ways(to)))
                 else:

@@ -33,6 +33,10 @@ class LayoutCommand:
     """The floor."""
     source: Annotated[str | None, tyro.conf.arg(name="from", metavar="STORE|BAG")] = None
     """Make the floor from this recording or store."""
+    recording: str | None = None
+    """With --from STORE: the recording to make the floor from, by its path, the end of its path, or
+    its id. Default: the one with the most rows. If recordings each have a frame of their own, as
+    with odometry, each needs a floor of its own."""
     map: Path | None = None
     """With --from: the map.yaml in which the robot was localised. It replaces a map in the
     recording."""
@@ -136,6 +140,7 @@ class LayoutCommand:
 
         surveyed = survey(
             Path(str(self.source)),
+            recording=self.recording,
             map_yaml=self.map,
             by=self.by,
             profile=None if self.profile is None else load_profile(self.profile),
@@ -145,7 +150,16 @@ class LayoutCommand:
         return surveyed.floor, surveyed
 
     def _refuse_without_from(self) -> None:
-        for name in ("map", "by", "profile", "footprint", "typestore", "definitions", "zones"):
+        for name in (
+            "recording",
+            "map",
+            "by",
+            "profile",
+            "footprint",
+            "typestore",
+            "definitions",
+            "zones",
+        ):
             if getattr(self, name) is not None:
                 raise ConfigError(
                     f"--{name} applies only with --from",
@@ -158,7 +172,7 @@ def _show(name: str, facts: dict[str, Any]) -> None:
     from restock.cli import output
 
     notes = facts.get("notes", [])
-    rows = {key: value for key, value in facts.items() if key != "notes"}
+    rows = {key: value for key, value in facts.items() if key not in ("notes", "elsewhere")}
     output.print_table([{"": key, name: str(value)} for key, value in rows.items()])
     for note in notes:
         output.stdout().print(f"- {note}", markup=False, soft_wrap=True)
