@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -333,6 +334,41 @@ def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
     # Missions go where any of the drives on this map was.
     assert made.poses is not None
     assert "2 recordings" in made.poses.source
+
+
+def lapped(recording: int, away_m: float) -> pa.Table:
+    """Rows of a drive around the hall, in a frame that is so far off."""
+    poses, rows = lap(), recording_transitions(recording, episodes=8)
+    poses[:, 0] += away_m
+    at = np.minimum(np.arange(len(rows)), len(poses) - 1)
+    for name, values in zip(("pose_x_m", "pose_y_m", "pose_yaw_rad"), poses.T, strict=True):
+        kind = rows.schema.field(name)
+        rows = rows.set_column(rows.column_names.index(name), kind, pa.array(values[at], kind.type))
+    return rows
+
+
+def test_recordings_in_other_frames_are_named_and_get_a_floor_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = [lapped(1, 0.0), lapped(2, 40.0), lapped(3, 0.0)]
+    store = write_store(tmp_path / "store", tables)
+    names = [table["recording_id"][0].as_py() for table in tables]
+    first = survey(store, recording=names[0])
+    second = survey(store, recording=names[1])
+    sources = DeltaTable(str(store / "recordings")).to_pyarrow_table().to_pylist()
+    source = {row["recording_id"]: row["source_file"] or row["recording_id"] for row in sources}
+    assert first.elsewhere == [source[names[1]]]
+    assert sorted(second.elsewhere) == sorted([source[names[0]], source[names[2]]])
+    assert any("1 of 3 recordings are in other frames" in note for note in first.notes)
+    assert second.floor.map_origin[0] == pytest.approx(first.floor.map_origin[0] + 40.0, abs=0.2)
+    assert second.floor.name != first.floor.name
+    line = ["twin", "layout", "--from", str(store), "--recording"]
+    assert main([*line, names[1], "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["elsewhere"]) == 2
+    assert main([*line, "no_such"]) == 2
+    assert "no recording is 'no_such'" in capsys.readouterr().err
+    assert main(["twin", "layout", "default", "--recording", "x"]) == 2
+    assert "--recording applies only with --from" in capsys.readouterr().err
 
 
 class _Zones(Checked, frozen=True):
