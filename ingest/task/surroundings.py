@@ -120,9 +120,7 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
     none = np.full(len(clearance_m), float(task.range_max_m) if task.sectors else np.nan)
     if task.goal == "none" or not task.sectors:
         return none, none.copy()
-    bearing, reach = _sectors(task.sectors, task.body)
-    distance = clearance_m + reach
-    x, y = distance * np.cos(bearing) + task.body.lidar_x_m, distance * np.sin(bearing)  # (N, K)
+    x, y = sector_returns(task, clearance_m)
     off2 = np.full(clearance_m.shape, np.inf)  # of each return from the plan, squared
     along_m = np.zeros(clearance_m.shape)  # the plan, to where it is nearest
     passed = np.zeros((len(none), 1))
@@ -142,6 +140,13 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
     way_m = np.where(on_it, along_m, task.range_max_m).min(axis=1)
     gap_m = np.sqrt(np.where(ahead, off2, task.range_max_m**2).min(axis=1))
     return way_m, np.minimum(gap_m, task.range_max_m)
+
+
+def sector_returns(task: Task, clearance_m: F64) -> tuple[F64, F64]:
+    """x and y (N, K) in the body frame of each sector's nearest return, of clearances (N, K)."""
+    bearing, reach = _sectors(task.sectors, task.body)
+    distance = clearance_m + reach
+    return distance * np.cos(bearing) + task.body.lidar_x_m, distance * np.sin(bearing)
 
 
 @lru_cache(maxsize=64)

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.ingest.task.scan import Body
 from restock.ingest.task.signals import Signals
 from restock.toml import Checked
@@ -315,6 +315,19 @@ def _fastest(task: Task) -> NDArray[np.float64]:
 def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
     """Clearance to [0, 1], with more resolution close by."""
     return np.sqrt(np.clip(clearance_m / range_max_m, 0.0, 1.0))
+
+
+def nearness_of(task: Task, observation: NDArray[Any]) -> F64:
+    """The clearance entries (N, K) of observations (N, D), in [0, 1], by rising bearing."""
+    names = enumerate(task.observation_names)
+    first = next((place for place, name in names if name.startswith("clearance_")), 0)
+    nearness: F64 = observation[:, first : first + task.sectors].astype(np.float64)
+    return nearness
+
+
+def clearances_of(task: Task, observation: NDArray[Any]) -> F64:
+    """The clearance of each sector (N, K), in metres, by observations (N, D)."""
+    return nearness_of(task, observation) ** 2 * task.range_max_m
 
 
 def _action_name(speed_mps: float, yaw_rate_radps: float) -> str:

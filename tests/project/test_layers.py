@@ -66,7 +66,7 @@ MAY_IMPORT = {
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
         "dqn evaluation/off_policy feed run twin/drivers twin/env twin/floors twin/physics"
-        " replay/panel replay/ring replay/store ingest/live ingest/profile ingest/task"
+        " twin/survey replay/panel replay/ring replay/store ingest/live ingest/profile ingest/task"
     ),
     "train/comparison": (
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"

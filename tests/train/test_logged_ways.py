@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.kept_run import TASK, kept_run
 from support.panels import panel_of
-from support.stores import recording_transitions, write_store
+from support.stores import recording_transitions, with_clear_view, write_store
 
 from restock.arrays import F64
 from restock.cli import main
@@ -73,7 +73,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
     folder = tmp_path_factory.mktemp("ways")
     tables = []
     for recording, away_m, between_m in ((1, 0.0, 0.0), (2, 300.0, 0.0), (3, 0.0, 50.0)):
-        table = recording_transitions(recording, task=TASK)
+        table = with_clear_view(recording_transitions(recording, task=TASK), TASK)
         values = {name: table[name].to_numpy() for name in ("episode_index", "step_index")}
         columns = np.zeros((len(table), 7))
         for episode in np.unique(values["episode_index"]):

@@ -15,7 +15,7 @@ from deltalake import DeltaTable
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from support.stores import recording_transitions, write_store
+from support.stores import recording_transitions, with_clear_view, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
@@ -338,7 +338,7 @@ def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
 
 def lapped(recording: int, away_m: float) -> pa.Table:
     """Rows of a drive around the hall, in a frame that is so far off."""
-    poses, rows = lap(), recording_transitions(recording, episodes=8)
+    poses, rows = lap(), with_clear_view(recording_transitions(recording, episodes=8))
     poses[:, 0] += away_m
     at = np.minimum(np.arange(len(rows)), len(poses) - 1)
     for name, values in zip(("pose_x_m", "pose_y_m", "pose_yaw_rad"), poses.T, strict=True):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import StoreError
-from restock.ingest.task.task import Task
+from restock.ingest.task.task import Task, nearness_of
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
@@ -104,10 +104,7 @@ class FedRows:
 
     def sectors(self, *, after: bool = False) -> F64:
         """The clearance entries (N, sectors), in [0, 1], by rising bearing."""
-        names = enumerate(self.task.observation_names)
-        first = next((place for place, name in names if name.startswith("clearance_")), 0)
-        rows = self.next_observation if after else self.observation
-        return rows[:, first : first + self.task.sectors].astype(np.float64)
+        return nearness_of(self.task, self.next_observation if after else self.observation)
 
     def previous_action(self, *, after: bool = False) -> Ints:
         """The action before t (N,), or before t + 1, that the observations hold."""

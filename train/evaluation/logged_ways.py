@@ -4,8 +4,8 @@ A store keeps no goal, but in each row how far it was and, once within reach of 
 point, where. Where the robot never came that near, the distances from along its way tell it,
 unless it hardly moved aside. What is not told, and what the floor has no way for, is counted.
 
-Recordings may each have a frame of their own. A recording's ways are missions of the floor that its
-poses lie on, of those that there are.
+Recordings may each have a frame of their own. A recording's ways are missions of the floor whose
+frame it is in, of those that there are.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from restock.train.twin.floors.occupancy_grid import into_frame
 from restock.train.twin.floors.placed import placed_on
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import EpisodeSpec, Way, draw_episode
+from restock.train.twin.survey.logged_drives import logged_drives
 
 HELD_OUT, EVERY = "logged", "logged:all"
 AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says
@@ -48,7 +49,6 @@ class LoggedWays:
 
     ways: Sequence[Way]
     recordings: Sequence[str]  # of each way, its recording's id
-    places_m: Mapping[str, F64]  # (N, 2) by recording: where the robot was
     logged: int  # episodes that were looked at
 
 
@@ -92,14 +92,15 @@ def logged_missions(
         if not held_out:
             ids = np.union1d(ids, np.asarray(panel.meta_column("transition_id"), np.int64))
         found = logged_ways(store.connection, ids, panel.task)
+        drives = logged_drives(store.connection, panel.task, sorted(set(found.recordings)))
     source = (
         "episodes that the panel holds out"
         if held_out
         else "logged episodes, most of which were trained on"
     )
     placed = {
-        recording: next((floor for floor in floors if placed_on(floor, places)), None)
-        for recording, places in found.places_m.items()
+        recording: next((floor for floor in floors if placed_on(floor, drive)), None)
+        for recording, drive in drives.items()
     }
     planner = {floor.name: Planner(floor) for floor in floors}
     left_out = Counter({NO_GOAL: found.logged - len(found.ways)})
@@ -165,9 +166,7 @@ def logged_ways(connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task) ->
             x, y, yaw = episode[0, :3].tolist()
             ways.append((x, y, yaw, float(goal[0]), float(goal[1])))
             of.append(str(recordings[begin]))
-    known = np.isfinite(rows[:, :2]).all(axis=1)
-    places = {str(one): rows[known & (recordings == one), :2] for one in np.unique(recordings)}
-    return LoggedWays(ways, of, places, len(first) + 1 if len(rows) else 0)
+    return LoggedWays(ways, of, len(first) + 1 if len(rows) else 0)
 
 
 def goal_of(rows: F64, far_m: float) -> F64 | None:

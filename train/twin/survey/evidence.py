@@ -17,6 +17,7 @@ from restock.ingest.propose.evidence.footprint import Footprint, footprint_of
 from restock.replay.store.store import is_store
 from restock.train.twin.floors.occupancy_grid import FREE, OccupancyGrid
 from restock.train.twin.floors.occupancy_map import read_grid
+from restock.train.twin.floors.placed import Drive
 from restock.train.twin.survey.poses import (
     WELL_PLACED,
     Poses,
@@ -37,7 +38,7 @@ class Evidence:
     footprint: Footprint | None = None
     scans: list[PlacedScans] = field(default_factory=list)  # by one clock, and by another
     notes: list[str] = field(default_factory=list)
-    each_m: Mapping[str, F64] = field(default_factory=dict)  # of a store's recordings, (N, 2)
+    each: Mapping[str, Drive] = field(default_factory=dict)  # of a store's recordings
 
 
 def gather(
@@ -68,7 +69,7 @@ def gather(
         if stored.recording is None:
             known = None if map_yaml is None else (read_grid(map_yaml), str(map_yaml))
             size = _of_profile(profile)
-            return Evidence(stored.poses, known, size, notes=notes, each_m=stored.each_m)
+            return Evidence(stored.poses, known, size, notes=notes, each=stored.each)
         file = stored.recording
     with open_recording(file, typestore=typestore, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
@@ -80,7 +81,7 @@ def gather(
         scans: list[PlacedScans] = []
         if with_scans and poses is not None and not (with_map and known):
             scans = placed_scans(recording, poses, profile, size)
-    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.each_m)
+    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.each)
 
 
 def _lies_on(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:

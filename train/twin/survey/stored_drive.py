@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from restock.arrays import F64
 from restock.errors import RestockError, StoreError
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.replay.store.store import Store
+from restock.train.twin.floors.placed import Drive
+from restock.train.twin.survey.logged_drives import logged_drives
 from restock.train.twin.survey.poses import Poses, Times
 
 _POSES = (
@@ -36,7 +37,7 @@ class StoredDrive:
     )
     recording: Path | None  # where it lies; None where it is no longer there
     profile: Profile | None  # that its rows were made by
-    each_m: Mapping[str, F64]  # (N, 2) places of every recording by that profile, by its source
+    each: Mapping[str, Drive]  # of every recording by that profile, by its source
     notes: list[str] = field(default_factory=list)
 
 
@@ -61,7 +62,11 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
         alike = [row for row in rows if row[2] == toml]
         said = f"poses of the rows of {len(alike)} recordings"
         everywhere = _poses(store, [row[0] for row in alike], said)
-        of_each = {row[1] or row[0]: _poses(store, [row[0]], "") for row in alike}
+        profile = _profile(toml, source)
+        names = {row[0]: row[1] or row[0] for row in alike}
+        task = None if profile is None else profile.task
+        drives = logged_drives(store.connection, task, list(names)) if len(names) > 1 else {}
+        each = {name: drives[one] for one, name in names.items() if one in drives}
         poses = _poses(store, [identity], f"poses of the rows of {source}")
     notes = []
     if not source or not Path(source).exists():
@@ -69,8 +74,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
     file = Path(source) if source and Path(source).exists() else None
-    each_m = {name: one.places_m for name, one in of_each.items()}
-    return StoredDrive(poses, everywhere, file, _profile(toml, source), each_m, notes)
+    return StoredDrive(poses, everywhere, file, profile, each, notes)
 
 
 def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:

@@ -146,11 +146,11 @@ def survey(
         visited_m=None if poses is None else poses.places_m,
     )
     floor = with_zones(made.floor)
-    elsewhere = [name for name, places in evidence.each_m.items() if not placed_on(floor, places)]
+    elsewhere = [name for name, drive in evidence.each.items() if not placed_on(floor, drive)]
     notes += made.notes
     if elsewhere:
         notes.append(
-            f"the poses of {len(elsewhere)} of {len(evidence.each_m)} recordings are in other"
+            f"the poses of {len(elsewhere)} of {len(evidence.each)} recordings are in other"
             " frames: their routes are not on this floor (--recording makes the floor of one)"
         )
     return Surveyed(floor, made.grid, how, source, body, poses, agreement, notes, elsewhere)

@@ -1,0 +1,62 @@
+"""A drive is told to be on a floor by where it went and by the walls that its lidar saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from restock.ingest.profile.profile import load_profile
+from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.placed import Drive, from_walls_m, on_free_ground, placed_on
+from restock.train.twin.survey.logged_drives import drive_of
+
+TASK = load_profile("warehouse_amr").task
+(FLOOR,) = open_floors("default")
+(OTHER,) = open_floors("generated:1")
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    """Of a robot on FLOOR, among people and pallets, with the noise of its sensors."""
+    env = WarehouseVectorEnv(1, task=TASK, seed=5)
+    env.reset(seed=5)
+    driver = PlannerFollower(epsilon=0.1, seed=5)
+    poses, clearances = [], []
+    for _ in range(300):
+        signals = env.signals
+        names = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
+        poses.append([float(signals[name][0]) for name in names])
+        clearances.append(signals["sector_clearance_m"][0].copy())
+        env.step(driver.choose(env))
+    return drive_of(TASK, np.array(poses), np.array(clearances))
+
+
+def test_it_is_on_its_own_floor(drive: Drive) -> None:
+    assert placed_on(FLOOR, drive)
+
+
+def test_walls_that_are_elsewhere_tell_another_floor_where_its_way_would_fit(drive: Drive) -> None:
+    hall = replace(FLOOR, racks=())  # open ground: all of its poses fit
+    assert on_free_ground(hall, drive.places_m).all()
+    assert not placed_on(hall, drive)
+    assert placed_on(hall, Drive(drive.places_m, np.empty((0, 2))))  # no lidar: nothing against it
+    assert not placed_on(OTHER, drive)
+
+
+def test_a_frame_that_is_off_or_turned_is_another(drive: Drive) -> None:
+    x, y, yaw = FLOOR.map_origin
+    assert not placed_on(replace(FLOOR, map_origin=(x + 1.5, y, yaw)), drive)
+    assert not placed_on(replace(FLOOR, map_origin=(x, y, yaw + 0.4)), drive)
+    assert not placed_on(FLOOR, Drive(np.empty((0, 2)), np.empty((0, 2))))
+
+
+def test_distances_are_from_racks_and_edges() -> None:
+    rack = FLOOR.racks[0]
+    beside = np.array([[rack.x_min - 0.2, rack.y_min - 0.0], [0.1, FLOOR.depth_m / 2], [-0.3, 0.5]])
+    found = from_walls_m(FLOOR, beside)
+    assert found[1:] == pytest.approx([0.1, 0.3])
+    assert found[0] <= 0.2 + 1e-9
