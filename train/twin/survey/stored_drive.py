@@ -25,6 +25,7 @@ _POSES = (
     "SELECT stamp_ns, logged_ns, pose_x_m, pose_y_m, pose_yaw_rad FROM transitions"
     " WHERE list_contains(?, recording_id) ORDER BY recording_id, logged_ns"
 )
+COMPARED = 64  # recordings whose frames are looked at, those with the most rows
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class StoredDrive:
     )
     recording: Path | None  # where it lies; None where it is no longer there
     profile: Profile | None  # that its rows were made by
-    each: Mapping[str, Drive]  # of every recording by that profile, by its source
+    each: Mapping[str, Drive]  # of the largest recordings by that profile, by their sources
     notes: list[str] = field(default_factory=list)
 
 
@@ -63,7 +64,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
         said = f"poses of the rows of {len(alike)} recordings"
         everywhere = _poses(store, [row[0] for row in alike], said)
         profile = _profile(toml, source)
-        names = {row[0]: row[1] or row[0] for row in alike}
+        names = {row[0]: row[1] or row[0] for row in alike[:COMPARED]}
         task = None if profile is None else profile.task
         drives = logged_drives(store.connection, task, list(names)) if len(names) > 1 else {}
         each = {name: drives[one] for one, name in names.items() if one in drives}
