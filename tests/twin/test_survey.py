@@ -359,7 +359,7 @@ def test_recordings_in_other_frames_are_named_and_get_a_floor_of_their_own(
     source = {row["recording_id"]: row["source_file"] or row["recording_id"] for row in sources}
     assert first.elsewhere == [source[names[1]]]
     assert sorted(second.elsewhere) == sorted([source[names[0]], source[names[2]]])
-    assert any("1 of 3 recordings are in other frames" in note for note in first.notes)
+    assert any("1 of 2 other recordings are in other frames" in note for note in first.notes)
     assert second.floor.map_origin[0] == pytest.approx(first.floor.map_origin[0] + 40.0, abs=0.2)
     assert second.floor.name != first.floor.name
     line = ["twin", "layout", "--from", str(store), "--recording"]

@@ -40,7 +40,7 @@ ASIDE_M = 0.3  # that the way must leave a straight line by, for distances to te
 NO_GOAL = "the rows do not contain the goal's position"
 NO_WAY = "the goal cannot be reached on the floor: it is inside a wall, outside, or enclosed"
 AT_GOAL = "it starts at its goal"
-OTHER_FRAME = "its recording's poses are in another frame than the floor"
+OTHER_FRAME = "its recording is in another frame than the floor"
 
 
 @dataclass(frozen=True)

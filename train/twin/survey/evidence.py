@@ -38,7 +38,7 @@ class Evidence:
     footprint: Footprint | None = None
     scans: list[PlacedScans] = field(default_factory=list)  # by one clock, and by another
     notes: list[str] = field(default_factory=list)
-    each: Mapping[str, Drive] = field(default_factory=dict)  # of a store's recordings
+    others: Mapping[str, Drive] = field(default_factory=dict)  # of a store's other recordings
 
 
 def gather(
@@ -69,7 +69,7 @@ def gather(
         if stored.recording is None:
             known = None if map_yaml is None else (read_grid(map_yaml), str(map_yaml))
             size = _of_profile(profile)
-            return Evidence(stored.poses, known, size, notes=notes, each=stored.each)
+            return Evidence(stored.poses, known, size, notes=notes, others=stored.others)
         file = stored.recording
     with open_recording(file, typestore=typestore, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
@@ -81,7 +81,7 @@ def gather(
         scans: list[PlacedScans] = []
         if with_scans and poses is not None and not (with_map and known):
             scans = placed_scans(recording, poses, profile, size)
-    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.each)
+    return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.others)
 
 
 def _lies_on(poses: Poses, free_on: Callable[[F64], Bools]) -> bool:

@@ -38,7 +38,7 @@ class StoredDrive:
     )
     recording: Path | None  # where it lies; None where it is no longer there
     profile: Profile | None  # that its rows were made by
-    each: Mapping[str, Drive]  # of the largest recordings by that profile, by their sources
+    others: Mapping[str, Drive]  # of the largest other recordings by that profile, by source
     notes: list[str] = field(default_factory=list)
 
 
@@ -64,10 +64,10 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
         said = f"poses of the rows of {len(alike)} recordings"
         everywhere = _poses(store, [row[0] for row in alike], said)
         profile = _profile(toml, source)
-        names = {row[0]: row[1] or row[0] for row in alike[:COMPARED]}
+        names = {row[0]: row[1] or row[0] for row in alike[:COMPARED] if row[0] != identity}
         task = None if profile is None else profile.task
-        drives = logged_drives(store.connection, task, list(names)) if len(names) > 1 else {}
-        each = {name: drives[one] for one, name in names.items() if one in drives}
+        drives = logged_drives(store.connection, task, list(names))
+        others = {name: drives[one] for one, name in names.items()}
         poses = _poses(store, [identity], f"poses of the rows of {source}")
     notes = []
     if not source or not Path(source).exists():
@@ -75,7 +75,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
     file = Path(source) if source and Path(source).exists() else None
-    return StoredDrive(poses, everywhere, file, profile, each, notes)
+    return StoredDrive(poses, everywhere, file, profile, others, notes)
 
 
 def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:

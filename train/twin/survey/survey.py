@@ -146,12 +146,12 @@ def survey(
         visited_m=None if poses is None else poses.places_m,
     )
     floor = with_zones(made.floor)
-    elsewhere = [name for name, drive in evidence.each.items() if not placed_on(floor, drive)]
+    elsewhere = [name for name, drive in evidence.others.items() if not placed_on(floor, drive)]
     notes += made.notes
     if elsewhere:
         notes.append(
-            f"the poses of {len(elsewhere)} of {len(evidence.each)} recordings are in other"
-            " frames: their routes are not on this floor (--recording makes the floor of one)"
+            f"{len(elsewhere)} of {len(evidence.others)} other recordings are in other frames:"
+            " their routes are not on this floor (--recording makes the floor of one)"
         )
     return Surveyed(floor, made.grid, how, source, body, poses, agreement, notes, elsewhere)
 
