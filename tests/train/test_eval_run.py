@@ -14,6 +14,7 @@ from restock.cli import main
 from restock.files import write_table
 from restock.train.evaluation.evaluation_plan import plan_evaluation
 from restock.train.run.kept_evaluations import (
+    WAYS,
     add_evaluation,
     read_evaluations,
     shown_evaluation,
@@ -95,9 +96,17 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(
     assert said == (
         "2 of 10 episodes that `restock eval` drove: floors elsewhere, policy a@9, seeds 1 to 1."
     )
+    many = ",".join(f"/some/where/floor-{number}.toml" for number in range(1, 7))
+    place = newer.schema.get_field_index("layouts")
+    for layouts in (many, many + WAYS):
+        named = newer.set_column(place, "layouts", pa.array([layouts] * 2))
+        add_evaluation(run, named.cast(kept.schema))
+    assert "drove: floors floor-1.toml to floor-6.toml (6), policy" in shown_evaluation(run)[1]
+    on_ways = shown_evaluation(run, ways=True)[1]
+    assert "floors floor-1.toml to floor-6.toml (6), ways of the logs, policy" in on_ways
     capsys.readouterr()
     assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_episodes", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == [{"n": 10}]
+    assert json.loads(capsys.readouterr().out) == [{"n": 14}]
 
 
 def test_what_an_earlier_restock_evaluated_is_still_shown(tmp_path: Path) -> None:

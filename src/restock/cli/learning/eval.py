@@ -132,7 +132,8 @@ class EvalCommand:
             for line in plan.warnings:
                 say(line)
             for kind, floors in plan.left_out.items():
-                say(f"left out: {kind}, as there is no room for it on {', '.join(floors)}")
+                some = floors if len(floors) <= 3 else [*floors[:2], f"{len(floors) - 2} others"]
+                say(f"left out: {kind}, as there is no room for it on {', '.join(some)}")
             with progress("driving", plan.total) as advance:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]

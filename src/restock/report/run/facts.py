@@ -199,9 +199,7 @@ def _add_floor(facts: Facts) -> None:
     if len(floors) == 1:
         facts.floor = floors[0]
     else:
-        facts.missing.append(
-            f"No floor is drawn: the run drives on {len(floors)} floors ({layouts})."
-        )
+        facts.missing.append(f"No floor is drawn: the run drives on {len(floors)} floors.")
 
 
 def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
