@@ -108,12 +108,12 @@ def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
     text = f"{shown.num_rows:,} of {every:,} episodes that `restock eval` drove: "
-    text += f"floors {_floors(last['layouts']) or 'not named'}, policy {version or 'not named'}, "
+    text += f"floors {_floors(last['layouts'] or 'not named')}, policy {version or 'not named'}, "
     return shown, text + f"seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
 
 
 def _floors(layouts: str) -> str:
-    """Floors as a run names them, in few words: of files their names, of many the first and last."""
+    """Floors as a run names them, in few words: files by name, of many the first and last."""
     ways = WAYS if layouts.endswith(WAYS) else ""
     names = [part.rpartition("/")[2].strip() for part in layouts.removesuffix(ways).split(",")]
     some = names if len(names) <= 3 else [f"{names[0]} to {names[-1]} ({len(names)})"]
