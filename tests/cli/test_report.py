@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html import escape
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -12,6 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import msgspec
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -19,14 +21,16 @@ import vl_convert
 from PIL import Image
 from support.page_scripts import charts_of
 from support.panels import panel_of
-from support.stores import TASK
+from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
+from restock.replay.store.store import Store
 from restock.report import build_report
+from restock.report.look.queries import ask, statements
 from restock.report.look.theme import DARK
 from restock.report.run import shares
 from restock.report.run.facts import evaluation_bias, gather, mean_success
@@ -38,6 +42,9 @@ from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
+from restock.train.twin.floors.floor_file import write_floor
+from restock.train.twin.floors.floors import open_floors
+from restock.train.twin.floors.occupancy_grid import into_frame
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -632,6 +639,35 @@ def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> N
     assert "18 failed clean episodes there" in page
     page = _on_floors(run, tmp_path / "b", str(hall), "default")
     assert "0 failed clean episodes there" in page
+
+
+def test_logs_in_another_frame_are_counted_and_not_drawn(run: Path, tmp_path: Path) -> None:
+    (floor,) = open_floors("default")
+    away = replace(floor, name="away", map_origin=(900.0, 0.0, 0.0))
+    write_floor(away, tmp_path / "away.toml")
+    page = _on_floors(run, tmp_path / "a", str(tmp_path / "away.toml"), "away")
+    assert "0 logged steps in cells" in page
+    assert re.search(r"Not drawn: what was logged in other frames, \d+ recording", page)
+
+
+def test_what_was_logged_is_drawn_in_the_floors_frame(tmp_path: Path) -> None:
+    table = with_clear_view(recording_transitions(1))
+    store = write_store(tmp_path / "store", [table])
+    origin = (1.5, -2.0, 0.7)
+    x_m, y_m, yaw_rad = origin
+    recordings = [table["recording_id"][0].as_py(), "none"]
+    query = statements("restock.report.run", "store.sql")["visited"]
+    with Store(store) as opened:
+        cells = ask(
+            opened.connection, query, cell_m=1e-3, recordings=recordings,
+            x_m=x_m, y_m=y_m, yaw_rad=yaw_rad,
+        )  # fmt: skip
+    poses = np.column_stack([table[name].to_numpy() for name in ("pose_x_m", "pose_y_m")])
+    expected = into_frame(poses[np.isfinite(poses).all(axis=1)], origin)
+    assert sum(row["rows"] for row in cells) == len(expected)
+    found = np.array([(row["x_m"], row["y_m"]) for row in cells for _ in range(row["rows"])])
+    for axis in (0, 1):
+        np.testing.assert_allclose(np.sort(found[:, axis]), np.sort(expected[:, axis]), atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ MAY_IMPORT = {
     "report/look": "",
     "report/run": (
         "look replay/panel replay/store train/evaluation train/run train/twin/calibration"
-        " train/twin/floors"
+        " train/twin/floors train/twin/survey"
     ),
     "report/fleet": "look replay/fleet replay/store",
     "report/study": "look",

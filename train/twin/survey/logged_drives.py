@@ -12,6 +12,7 @@ from restock.ingest.task.surroundings import sector_returns
 from restock.ingest.task.task import Task, clearances_of
 from restock.train.twin.floors.placed import Drive
 
+COMPARED = 64  # recordings whose frames are looked at where there may be thousands
 ROWS = 2000  # of a recording, at most about so many
 WITHIN_M = 3.0  # of the lidar: farther off, a sector is wide
 RETURNS = 4000  # at most so many
@@ -58,4 +59,4 @@ def _known(poses: F64) -> F64:
     return poses[np.isfinite(poses).all(axis=1)]
 
 
-__all__ = ["drive_of", "logged_drives"]
+__all__ = ["COMPARED", "drive_of", "logged_drives"]

@@ -18,14 +18,13 @@ from restock.errors import RestockError, StoreError
 from restock.ingest.profile.profile import Profile, parse_profile
 from restock.replay.store.store import Store
 from restock.train.twin.floors.placed import Drive
-from restock.train.twin.survey.logged_drives import logged_drives
+from restock.train.twin.survey.logged_drives import COMPARED, logged_drives
 from restock.train.twin.survey.poses import Poses, Times
 
 _POSES = (
     "SELECT stamp_ns, logged_ns, pose_x_m, pose_y_m, pose_yaw_rad FROM transitions"
     " WHERE list_contains(?, recording_id) ORDER BY recording_id, logged_ns"
 )
-COMPARED = 64  # recordings whose frames are looked at, those with the most rows
 
 
 @dataclass(frozen=True)

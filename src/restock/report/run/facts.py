@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import numpy as np
 
 from restock.errors import RestockError, RunError
 from restock.files import read_table
@@ -21,6 +22,8 @@ from restock.train.run.measures import measures
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
+from restock.train.twin.floors.placed import placed_on
+from restock.train.twin.survey.logged_drives import COMPARED, logged_drives
 
 PACKAGE = "restock.report.run"
 CELL_M = 0.25
@@ -54,8 +57,10 @@ class Facts:
     ways: Rows = field(default_factory=list)  # as `cells`, on the ways of logs, beside those
     evaluation_on_ways: str = ""  # which they are
     floor: Warehouse | None = None  # that the run drives on, where it is one
-    visited: Rows = field(default_factory=list)
+    visited: Rows = field(default_factory=list)  # of the floor, by recordings in its frame
     rare: Rows = field(default_factory=list)
+    elsewhere: int = 0  # recordings in other frames
+    floors: int = 1  # that the run drives on
     recordings: Rows = field(default_factory=list)
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
     labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
@@ -149,8 +154,6 @@ def gather(path: Path) -> Facts:
     if not facts.cells and facts.twin:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
-    if facts.visited:
-        _add_floor(facts)
     return facts
 
 
@@ -177,8 +180,7 @@ def _add_panel(facts: Facts) -> None:
     try:
         facts.panel = Panel.open(where)
         with Store(facts.panel.header.store) as store:
-            facts.visited = _store_rows(store, "visited", cell_m=CELL_M)
-            facts.rare = _store_rows(store, "rare", most=MOST_DOTS)
+            _add_floor(facts, facts.panel, store)
             facts.recordings = _store_rows(store, "recordings")
             facts.logged = _store_rows(store, "logged")
             facts.labels = _store_rows(store, "labels")
@@ -187,19 +189,44 @@ def _add_panel(facts: Facts) -> None:
         facts.missing.append(f"Not shown, since it could not be read: {error}")
 
 
-def _add_floor(facts: Facts) -> None:
+def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
+    """The floor that is drawn, the first with logs, and what was logged there."""
+    floors = _floors(facts)
+    if not floors:
+        return
+    recordings, rows = np.unique(panel.meta_column("recording_id").astype(str), return_counts=True)
+    largest = recordings[np.argsort(-rows, kind="stable")][:COMPARED].tolist()
+    drives = logged_drives(store.connection, panel.task, largest)
+    on = {
+        floor.name: [name for name, drive in drives.items() if placed_on(floor, drive)]
+        for floor in floors
+    }
+    with_logs = [floor for floor in floors if on[floor.name]]
+    if len(floors) > 1 and not with_logs:
+        facts.missing.append(
+            f"No floor is drawn: the run drives on {len(floors)} floors, and no recording is in the"
+            " frame of one."
+        )
+        return
+    facts.floor, facts.floors = (with_logs or floors)[0], len(floors)
+    here = on[facts.floor.name]
+    facts.elsewhere = len(drives) - len(here)
+    x_m, y_m, yaw_rad = facts.floor.map_origin
+    frame = {"recordings": here, "x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
+    facts.visited = _store_rows(store, "visited", cell_m=CELL_M, **frame)
+    facts.rare = _store_rows(store, "rare", most=MOST_DOTS, **frame)
+
+
+def _floors(facts: Facts) -> tuple[Warehouse, ...]:
+    """Those of the run; none where it drove on none, or they cannot be read."""
     layouts = facts.config["config"].get("env", {}).get("layouts", DEFAULT)
     if not facts.twin and layouts == DEFAULT:  # the logs are of another floor
-        return
+        return ()
     try:
-        floors = open_floors(layouts)
+        return open_floors(layouts)
     except RestockError as error:
         facts.missing.append(f"The floor is not drawn, since it could not be read: {error}")
-        return
-    if len(floors) == 1:
-        facts.floor = floors[0]
-    else:
-        facts.missing.append(f"No floor is drawn: the run drives on {len(floors)} floors.")
+        return ()
 
 
 def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:

@@ -305,7 +305,14 @@ def floor_section(facts: Facts) -> Section | None:
                 "Where the logs have been",
                 f"{steps:,} logged steps in cells of {CELL_M} m, darker where there are more"
                 f" (logarithmic); the bar is {floor_map.BAR_M} m. Drawn on the run's floor, "
-                f"{layout.name}."
+                f"{layout.name}"
+                + (f", the first of {facts.floors} with logs." if facts.floors > 1 else ".")
+                + (
+                    f" Not drawn: what was logged in other frames, {facts.elsewhere} "
+                    f"recording{'s' * (facts.elsewhere != 1)}."
+                    if facts.elsewhere
+                    else ""
+                )
                 + (
                     f" Its missions start at {len(layout.starts_m)} places where the robot was in "
                     f"the logs, and go to {len(layout.goals)}."
