@@ -22,7 +22,7 @@ _COUNTS = (
     " GROUP BY recording_id"
 )
 _ROWS = (
-    "SELECT pose_x_m, pose_y_m, pose_yaw_rad, observation FROM transitions"
+    "SELECT pose_x_m, pose_y_m, pose_yaw_rad{} FROM transitions"
     " WHERE recording_id = ? AND step_index % ? = 0"
 )
 
@@ -32,16 +32,19 @@ def logged_drives(
 ) -> dict[str, Drive]:
     """Of each of these recordings, by its id, from rows of this task; None: poses alone."""
     counts = connection.execute(_COUNTS, [list(recordings)]).fetchall()
+    lidar = task is not None and task.lidar
+    query = _ROWS.format(", observation" if lidar else "")  # large: only where it is looked at
     drives = {}
     for recording, count in counts:
-        rows = connection.execute(_ROWS, [recording, count // ROWS + 1]).fetchnumpy()
-        x, y, yaw, observation = rows.values()
+        x, y, yaw, *seen = (
+            connection.execute(query, [recording, count // ROWS + 1]).fetchnumpy().values()
+        )
         poses = np.column_stack([x, y, yaw]).astype(np.float64)
         if task is None or not task.lidar:
             drives[recording] = Drive(_known(poses)[:, :2], np.empty((0, 2)))
         else:
-            seen = clearances_of(task, np.stack(list(observation)))
-            drives[recording] = drive_of(task, poses, seen)
+            clearance_m = clearances_of(task, np.stack(list(seen[0])))
+            drives[recording] = drive_of(task, poses, clearance_m)
     return drives
 
 

@@ -68,12 +68,12 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
         drives = logged_drives(store.connection, task, list(names))
         others = {name: drives[one] for one, name in names.items()}
         poses = _poses(store, [identity], f"poses of the rows of {source}")
+    file = Path(source) if source and Path(source).exists() else None
     notes = []
-    if not source or not Path(source).exists():
+    if file is None:
         notes.append(f"{source} no longer exists: its map and its scans cannot be read")
     if len(rows) > 1:
         notes.append(f"by {source}, of {len(rows)} recordings in the store")
-    file = Path(source) if source and Path(source).exists() else None
     return StoredDrive(poses, everywhere, file, profile, others, notes)
 
 

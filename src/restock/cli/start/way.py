@@ -231,7 +231,9 @@ class Way:
                 continue
             left = [name for name in left[1:] if name in further.document.get("elsewhere", [])]
             if lacking := kinds - set(further.document["episodes"]):
-                self._warn(f"{made.name} is not used: it has no room for {', '.join(lacking)}")
+                self._warn(
+                    f"{made.name} is not used: it has no room for {', '.join(sorted(lacking))}"
+                )
             else:
                 used.append(made)
         if left:
