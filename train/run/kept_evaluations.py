@@ -81,20 +81,21 @@ def mission_of(row: Mapping[str, Any]) -> Mission:
 def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     """The episodes to show and to compare, and in words which they are of how many.
 
-    With `ways` only those on the ways of logs are looked at.
+    With `ways` only those on the ways of logs are looked at; without, the others, if there are any.
 
     Raises:
         RunError: the file is damaged.
     """
     table = read_evaluations(run)
+    every = table.num_rows
+    asked = pa.array(
+        [str(on).endswith(WAYS) == ways for on in table["layouts"].to_pylist()], pa.bool_()
+    )
+    some = table.filter(asked)
+    if some.num_rows or ways:
+        table = some
     if not table.num_rows:
         return table, ""
-    every = table.num_rows
-    if ways:
-        of_logs = [str(name).endswith(WAYS) for name in table["layouts"].to_pylist()]
-        table = table.filter(pa.array(of_logs, pa.bool_()))
-        if not table.num_rows:
-            return table, ""
     last = table.slice(table.num_rows - 1).to_pylist()[0]
     policies, versions, layouts = (
         table[name].to_pylist() for name in ("policy", "version", "layouts")
