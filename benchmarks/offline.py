@@ -187,7 +187,7 @@ def _missed(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _as_markdown(rows: Sequence[dict[str, Any]]) -> str:
-    header = ["cloned", "policy", *CELLS, "rare", "bumps a km"]
+    header = ["cloned", "policy", *CELLS, "rare", "bumps per km"]
     lines = [
         [
             row["arm"],

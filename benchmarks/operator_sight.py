@@ -157,7 +157,7 @@ def _driven(kind: str, sees: str, driver: Operator, episodes: int) -> dict[str, 
 
 def _as_markdown(rows: list[dict[str, Any]]) -> str:
     return markdown(
-        ["missions", "the operator sees", "success", "bumps a km", "s"],
+        ["missions", "the operator sees", "success", "bumps per km", "s"],
         (
             (
                 row["kind"].replace("_", " "),

@@ -185,7 +185,7 @@ def _missed(rows: Sequence[dict[str, Any]], budget: str) -> list[str]:
         missed.append(f"ahead of the planner by {at['rare']['ahead_of_planner']:.3f} (0.15)")
     if budget == "hour":
         if at["rare"]["agent_bumps_per_km"] > 2 * at["rare"]["operator_bumps_per_km"]:
-            missed.append("more than twice the operator's bumps a kilometre")
+            missed.append("more than twice the operator's bumps per km")
         if at["rare"]["seconds_less_than_operator"] < 0:
             missed.append("slower than the operator")
     return missed
@@ -215,7 +215,7 @@ def _as_markdown(rows: Sequence[dict[str, Any]]) -> str:
         for ahead in [row["ahead_of_planner_interval"]]
     ]
     header = ["twin", "cell", "episodes", "agent", *REFERENCES, "ahead of the planner"]
-    header += ["bumps a km: agent, planner, operator"]
+    header += ["bumps per km: agent, planner, operator"]
     return markdown([*header, "s less than planner", "than operator"], lines)
 
 

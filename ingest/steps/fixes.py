@@ -3,7 +3,7 @@
 Latitude, longitude and the origin go to earth-centred coordinates on the WGS84 ellipsoid (at height
 0), and from there to the plane that touches it at the origin, x to the east and y to the north (REP
 103; NIMA TR8350.2). Distances within 10 km of the origin are right to 5 mm at that height, and too
-short by height / 6,371 km above it: 8 cm a km at 500 m.
+short by height / 6,371 km above it: 8 cm per km at 500 m.
 
 A fix does not say where the robot faces. That is the heading of an IMU, where the profile names
 one, else the direction of the last `track_m` that were driven: of what came before alone, held

@@ -44,7 +44,7 @@ def evaluate(
 ) -> list[dict[str, Any]]:
     """Drive a run's kept policy and its references through the same episodes, as `restock eval`.
 
-    Returns a row per policy, perturbation and condition: success, return, bumps a kilometre,
+    Returns a row per policy, perturbation and condition: success, return, bumps per km,
     closest approach to people and time lost against the planner, with 95 % intervals over episodes.
     The episodes are kept in the run's `eval/episodes.parquet`.
 

@@ -50,7 +50,7 @@ def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
         "episodes": row["episodes"],
         "success": "no goal" if row["success"] is None else _with_interval(row, "success", ".2f"),
         "discounted return": _with_interval(row, "discounted_return", ".2f"),
-        "bumps a km": _with_interval(row, "bumps_per_km", ".1f"),
+        "bumps per km": _with_interval(row, "bumps_per_km", ".1f"),
         "people, least (mean) m": ""
         if nearest is None
         else f"{nearest:.2f} ({row['closest_person_m']:.2f})",

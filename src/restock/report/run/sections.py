@@ -50,7 +50,7 @@ def success(facts: Facts) -> Section | None:
             else f"{row['success']:.0%} [{row['low']:.0%}, {row['high']:.0%}]",
             "episodes": row["episodes"],
             "discounted return": _told(row, "discounted_return", ".2f"),
-            "bumps a km": _told(row, "bumps_per_km", ".1f"),
+            "bumps per km": _told(row, "bumps_per_km", ".1f"),
             "least distance to people": _told(row, "closest_person_least_m", ".2f", " m"),
             "time to goal": _told(row, "time_s", ".1f", " s"),
             "time lost to the planner": ""

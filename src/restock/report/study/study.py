@@ -18,7 +18,7 @@ from restock.report.study.comparison import (
 from restock.stats import interval_text
 
 SAFETY = {
-    "bumps_per_km": ("bumps a km", ".1f"),
+    "bumps_per_km": ("bumps per km", ".1f"),
     "closest_person_m": ("closest person, m", ".2f"),
     "time_lost_s": ("time lost, s", "+.1f"),
     "discounted_return": ("discounted return", ".2f"),
