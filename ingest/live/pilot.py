@@ -69,7 +69,6 @@ class Pilot:
             self._people.append(Input(takeover_topic, BOOL, {"pressed": "data"}))
         self._active_ns: dict[str, int | None] = {}  # a person's topic -> when it last said so
         self._now_ns: int | None = None
-        self._blind = False
         self.counts: Counter[str] = Counter()  # decisions, and each kind of stop and intervention
         self.unreadable: Counter[str] = Counter()  # messages of another type, by topic
         self._was_taken = False
@@ -95,7 +94,6 @@ class Pilot:
                     self._hear(source, message, now_ns)
             if topic in self.observer.topics:
                 self.observer.receive(topic, message, now_ns)
-                self._look(topic, message)
         except OTHER_TYPE:
             self.unreadable[topic] += 1
 
@@ -103,13 +101,6 @@ class Pilot:
         path = source.fields.get("pressed")
         drives = path is None or bool(value_of(message, path))
         self._active_ns[source.topic] = now_ns if drives else None
-
-    def _look(self, topic: str, message: Any) -> None:
-        """A scan that says nothing at all is no free floor, whatever a log makes of it."""
-        scan = self.profile.inputs.scan
-        if scan is not None and topic == scan.topic:
-            ranges = np.asarray(value_of(message, scan.fields["ranges_m"]), np.float64)
-            self._blind = not (ranges >= self.profile.task.range_min_m).any()  # False for NaN
 
     def taken_over(self, now_ns: int) -> bool:
         """Whether a person drives."""
@@ -154,8 +145,6 @@ class Pilot:
             self.observer.reset()
             unreadable = f"unreadable: {str(error).splitlines()[0]}"
             return self.observer.observe(now_ns), unreadable
-        if not observed.problem and self._blind:
-            return observed, "scan: no beam has a valid range"
         return observed, observed.problem
 
     def _limit(

@@ -17,13 +17,14 @@ from restock.ingest.task.task import Task
 # What is made of a scan, beside the message's own fields (whose names hold no space).
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
 BEAMS = "number of beams"  # (N,) int64
+BLIND = "whether no beam has a valid range"  # (N,) bool; inf is one: nothing was hit
 
 _VALUES = 1 << 18  # ranges reduced at a time: what is in between stays in the processor's cache
 _MAPS = 64  # geometries that are remembered; a lidar has one
 
 
 def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reduction:
-    """What makes SECTORS and BEAMS of a topic's scans, by the `fields` of the profile's input.
+    """What makes SECTORS, BEAMS and BLIND of a topic's scans, by the profile input's `fields`.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
@@ -46,23 +47,25 @@ class _ScanReducer:
         else:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
+        blind = np.zeros(len(beams), np.bool_)
         geometry = np.stack([first, increment, beams], axis=1)
         if len(geometry) and (geometry == geometry[0]).all():
-            self._fill(clearance, ranges, None, geometry[0])
+            self._fill(clearance, blind, ranges, None, geometry[0])
         else:
             kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
             for index, one in enumerate(kinds):
-                self._fill(clearance, ranges, np.flatnonzero(kind == index), one)
-        return {SECTORS: clearance, BEAMS: beams}
+                self._fill(clearance, blind, ranges, np.flatnonzero(kind == index), one)
+        return {SECTORS: clearance, BEAMS: beams, BLIND: blind}
 
     def _fill(
         self,
         clearance: NDArray[np.float64],
+        blind: NDArray[np.bool_],
         ranges: FieldColumn,
         rows: NDArray[np.intp] | None,
         geometry: NDArray[np.float64],
     ) -> None:
-        """Clearance of these rows (None: of all), which have one geometry."""
+        """Clearance and blindness of these rows (None: of all), which have one geometry."""
         first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
         if not beams or not np.isfinite(first + increment):
             return
@@ -79,7 +82,13 @@ class _ScanReducer:
                 part = take(ranges, here)
             values = part.values if isinstance(part, Ragged) else part
             table = np.asarray(values).reshape(stop - start, beams)
-            clearance[here] = sectors.clearance(table, task.range_min_m, task.range_max_m)
+            found = sectors.clearance(table, task.range_min_m, task.range_max_m)
+            clearance[here] = found
+            free = np.flatnonzero((found >= task.range_max_m).all(axis=1))
+            if len(free):
+                blind[start + free if rows is None else rows[start + free]] = ~(
+                    table[free] >= task.range_min_m  # False for NaN
+                ).any(axis=1)
 
     def _map(self, first: float, increment: float, beams: int) -> SectorMap:
         key = (first, increment, beams)

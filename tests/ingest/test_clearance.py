@@ -11,7 +11,7 @@ from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps import clearance
-from restock.ingest.steps.clearance import BEAMS, SECTORS, scan_reduction
+from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, scan_reduction
 from restock.ingest.task.scan import SectorMap
 
 TASK = load_profile("warehouse_amr").task
@@ -58,11 +58,12 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
             REDUCE.apply({name: take(column, some) for name, column in fields.items()})
             for some in (rows[:at], rows[at:])
         ]
-    for name in (SECTORS, BEAMS):
+    for name in (SECTORS, BEAMS, BLIND):
         together = np.concatenate([np.asarray(part[name]) for part in parts])
         assert np.array_equal(np.asarray(whole[name]), together)
     for row, (beams, first) in enumerate(kinds):
         expected = np.full(TASK.sectors, TASK.range_max_m)
+        blind = beams > 0 and np.isfinite(first)
         if beams and np.isfinite(first):
             bearings = float(np.float32(first)) + float(np.float32(0.05)) * np.arange(beams)
             sectors = SectorMap.build(bearings, TASK.sectors, TASK.body)
@@ -70,8 +71,10 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
             assert isinstance(ranges, Ragged)
             one = np.asarray(ranges[row])[None]
             expected = sectors.clearance(one, TASK.range_min_m, TASK.range_max_m)[0]
+            blind = not (one >= TASK.range_min_m).any()
         assert np.array_equal(np.asarray(whole[SECTORS])[row], expected)
         assert np.asarray(whole[BEAMS])[row] == beams
+        assert np.asarray(whole[BLIND])[row] == blind
 
 
 def test_ranges_of_a_fixed_size_are_no_different() -> None:
@@ -79,7 +82,7 @@ def test_ranges_of_a_fixed_size_are_no_different() -> None:
     ranges = fields["ranges"]
     assert isinstance(ranges, Ragged)
     fixed = {**fields, "ranges": np.asarray(ranges.values).reshape(3, 30)}
-    for name in (SECTORS, BEAMS):
+    for name in (SECTORS, BEAMS, BLIND):
         one, other = REDUCE.apply(fields)[name], REDUCE.apply(fixed)[name]
         assert np.array_equal(np.asarray(one), np.asarray(other))
 

@@ -107,6 +107,21 @@ def test_scans_of_inf_and_nan_and_changing_geometry():
     assert clearance[-1].max() < 3.0
 
 
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
+    topics = Drive().topics()
+    tenth = np.arange(0, 6, 0.1)
+    ranges = np.full((60, 72), np.inf)  # far from everything: that is free
+    ranges[30:40] = nothing  # a lidar that has failed
+    topics["/scan"] = columns(tenth, scans(ranges))
+    steps = steps_of(PROFILE, topics)
+    blind = np.array(steps.problem) == "scan: no beam has a valid range"
+    at_s = (steps.signals["stamp_ns"] - START_NS) * 1e-9
+    assert blind.sum() == 5  # of 1 s
+    assert ((at_s[blind] >= 3.0) & (at_s[blind] < 4.0)).all()
+    assert set(np.array(steps.problem)[~blind]) == {""}
+
+
 def proposed(time_s, speed_mps):
     fields = {"linear.x": np.asarray(speed_mps, float), "angular.z": np.full(len(time_s), -0.2)}
     return columns(np.asarray(time_s), fields, stamped=False)
