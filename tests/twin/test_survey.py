@@ -215,6 +215,27 @@ def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path)
         survey(bag)
 
 
+def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All poses lie on the free floor of a larger, empty room; its walls are elsewhere."""
+    room = np.zeros((240, 200), np.int8)
+    room[[0, -1]] = room[:, [0, -1]] = 100
+    elsewhere = OccupancyGrid(room, CELL_M, (-1.5, -1.5, 0.0))
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=elsewhere, scanned=hall())
+    floor = tmp_path / "floor.toml"
+    arguments = ["twin", "layout", "--from", str(bag), "--out", str(floor)]
+    assert main(arguments) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "only 0% of the lidar's returns lie on walls of the map" in said
+    assert "--by scans" in said
+    assert not floor.exists()
+    assert main([*arguments, "--by", "map", "--footprint", "0.4x0.4"]) == 0  # it was asked for
+    near = OccupancyGrid(hall(), CELL_M, (0.4, 0.4, 0.0))  # of a robot that is badly localised
+    made = survey(write_bag(tmp_path / "near", poses=lap(), grid=near, scanned=hall()))
+    assert any("of the lidar's returns lie on walls" in note for note in made.notes)
+
+
 @pytest.mark.parametrize(
     ("shape", "resolution", "origin", "data", "message"),
     [

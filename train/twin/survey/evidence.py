@@ -53,8 +53,7 @@ def gather(
 ) -> Evidence:
     """What a recording has, or one of a store: `stored_recording`, or that with the most rows.
 
-    `with_map`: a map that is none is an error, and scans are not needed where there is one;
-    without, it is left aside. `with_scans`: scans are read where they are needed.
+    `with_map`: a map that is none is an error; without, it is left aside.
 
     Raises:
         RecordingError: it cannot be read, or its map is none.
@@ -74,13 +73,13 @@ def gather(
     with open_recording(file, typestore=typestore, salvage=True) as recording:
         known = _map(recording, map_yaml, notes, needed=with_map)
         free_on = _free_on(known)
-        poses = choose_poses(candidate_poses(recording, profile), free_on)
+        poses = own = choose_poses(candidate_poses(recording, profile), free_on)
         if with_map and known and stored is not None and _lies_on(stored.everywhere, free_on):
             poses = stored.everywhere  # drives on one map are in one frame
         size = _of_profile(profile) or footprint_of(recording)[0]
         scans: list[PlacedScans] = []
-        if with_scans and poses is not None and not (with_map and known):
-            scans = placed_scans(recording, poses, profile, size)
+        if with_scans and own is not None:
+            scans = placed_scans(recording, own, profile, size)
     return Evidence(poses, known, size, scans, notes, {} if stored is None else stored.others)
 
 

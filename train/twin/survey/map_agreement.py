@@ -1,4 +1,4 @@
-"""How far two maps of the same place agree on its walls."""
+"""How far two maps of one place agree on its walls, and a lidar's returns with those of a map."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from restock.train.twin.floors.occupancy_grid import (
     OccupancyGrid,
     out_of_frame,
 )
+from restock.train.twin.floors.placed import FEWEST_RETURNS, NEAR_M
+from restock.train.twin.survey.logged_drives import RETURNS, WITHIN_M
+from restock.train.twin.survey.scans import PlacedScans
 
 
 def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
@@ -37,6 +40,24 @@ def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
     shared = (shared_mine + shared_theirs) / 2
     alone = len(mine) * a - shared_mine + len(theirs) * b - shared_theirs
     return shared / (shared + alone)
+
+
+def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
+    """The share of a lidar's returns that lie within NEAR_M of an occupied cell of a map.
+
+    Returns farther than `WITHIN_M` from the lidar do not count: an error of the pose's yaw moves
+    them. None where there are too few to say.
+    """
+    nearby = [
+        hit[np.hypot(*(hit - origin).T) < WITHIN_M]
+        for origin, hit in zip(scans.origin_m, scans.hit_m, strict=True)
+    ]
+    returns = np.concatenate([np.zeros((0, 2)), *nearby])
+    walls = _walls(grid)
+    if len(returns) < FEWEST_RETURNS or not len(walls):
+        return None
+    apart = cKDTree(walls).query(returns[:: len(returns) // RETURNS + 1])[0]
+    return float((apart <= NEAR_M + grid.cell_m / 2).mean())
 
 
 def _walls(grid: OccupancyGrid) -> F64:
