@@ -14,10 +14,12 @@ from support.kept_run import kept_run
 
 from restock.cli import main
 from restock.report.run.films import films_section
+from restock.train.evaluation import film
 from restock.train.evaluation.eval_run import drive_evaluation
-from restock.train.evaluation.evaluation_plan import plan_evaluation
+from restock.train.evaluation.evaluation_plan import EvaluationPlan, make_policy, plan_evaluation
 from restock.train.evaluation.film import RESCUE, WORST, drive_again, scenes, unlike
 from restock.train.run.kept_evaluations import FILE, read_evaluations
+from restock.train.twin.env.interface import Policy
 
 KINDS = "wheel_slip=2,blocked_aisle=1"
 
@@ -37,11 +39,16 @@ def test_the_worst_failure_and_the_best_rescue_of_each_condition() -> None:
         row("wheel_slip", 4, "agent", True, 5.0),  # the planner arrived, too: no rescue
         row("wheel_slip", 3, "planner", False, 0.0),
         row("wheel_slip", 4, "planner", True, 5.0),
+        row("blocked_aisle", 5, "agent", True, 1.0),
+        row("blocked_aisle", 6, "agent", True, 9.0),
+        row("blocked_aisle", 6, "planner", False, 0.0),
+        row("blocked_aisle", 5, "run:out/logs_alone", False, 0.0),  # as before this run
         row("nominal", 1, "agent", True, 1.0),
         {**row("nominal", 9, "agent", False, -9.0), "perturbation": "friction"},
     ]
     found = {(s.row["condition"], s.kind): s.row["episode_seed"] for s in scenes(rows)}
-    assert found == {("wheel_slip", WORST): 2, ("wheel_slip", RESCUE): 3}
+    rescues = {("wheel_slip", RESCUE): 3, ("blocked_aisle", RESCUE): 5}
+    assert found == {("wheel_slip", WORST): 2, **rescues}
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +97,36 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
     (run / "eval" / "films" / "films.json").write_text("{}")
     assert films_section(cast(Any, facts)) is None
     assert "could not be read" in facts.missing[0]
+
+
+def test_a_rescue_shows_who_failed_beside_who_arrived(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The planner, as if it were the agent, beside a network that fails, as another run's."""
+    path = kept_run(tmp_path / "run")
+    plan = plan_evaluation(path, policies=("agent", "planner"), episodes="nominal=1")
+    drive_evaluation(plan)
+    table = read_evaluations(path)
+    rows = table.to_pylist()
+    version = next(row["version"] for row in rows if row["policy"] == "agent")
+    swapped = {"agent": "run:out/before", "planner": "agent"}
+    for row in rows:
+        row |= {"policy": swapped[row["policy"]], "version": version}
+    pq.write_table(table.from_pylist(rows, schema=table.schema), path / FILE)
+    drivers = {"run:out/before": "agent", "agent": "planner"}
+
+    def driver(name: str, plan: EvaluationPlan) -> Policy:
+        policy = make_policy(drivers[name], plan)
+        policy.version = version
+        return policy
+
+    monkeypatch.setattr(film, "make_policy", driver)
+    paths, missing = film.film_evaluation(plan)
+    assert [file.name for file in paths] == ["nominal-rescue.webp"]
+    assert missing == []
+    alone = len(film.drive_again(plan, next(r for r in rows if r["policy"] == "agent"))[1])
+    with Image.open(paths[0]) as shown:
+        assert shown.width > 1.9 * shown.height  # two floors of 12 x 9 m, about
+        assert getattr(shown, "n_frames", 1) == min(film.MOST_FRAMES, max(alone, 2))
+    (document,) = json.loads((path / film.FOLDER / film.DOCUMENT).read_text())["films"]
+    assert document["rescued_from"] == "run:out/before"

@@ -2,7 +2,8 @@
 
 An episode follows from its spec alone, so what `restock eval` recorded can be driven again with the
 policy that is kept. A film whose outcome is not the recorded one is not made: it would show another
-episode. Pictures are drawn from above and need no OpenGL.
+episode. A rescue shows two drives beside each other: the one that failed, and the agent's.
+Pictures are drawn from above and need no OpenGL.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from restock.arrays import F32, Ints
-from restock.errors import RunError
+from restock.errors import RestockError, RunError
 from restock.files import write_bytes, write_text
 from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episodes
 from restock.train.evaluation.evaluation_plan import CLEAN, EvaluationPlan, make_policy
@@ -36,7 +37,9 @@ if TYPE_CHECKING:
 FOLDER = Path("eval") / "films"  # in a run
 DOCUMENT = "films.json"
 WORST, RESCUE = "worst failure", "rescue"
-RESCUED_FROM = ("planner", "cloned", "operator")
+RESCUED_FROM = ("planner", "cloned", "operator")  # and other runs: they come first
+OTHER_RUN = "run:"
+CAPTION_PIXELS, GAP_PIXELS = 26, 12
 MOST_FRAMES = 60
 FRAME_MS = 100
 STRIP = 6  # frames of the strip, first and last among them
@@ -58,28 +61,36 @@ class Scene:
 
 def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
     """Of each condition, unperturbed: the agent's failure of the lowest return, and the episode of
-    the highest that it ended well and another policy did not. Those that there are."""
+    the highest that it ended well and another policy did not: preferably that of another run, and
+    of these the one that arrives least often. Those that there are."""
     clean = [row for row in rows if row["perturbation"] == CLEAN and row["success"] is not None]
     others = {
         (row["policy"], row["condition"], row["episode_seed"], row["layouts"]): row
         for row in clean
-        if row["policy"] in RESCUED_FROM and not row["success"]
+        if not row["success"]
     }
+    arrived: dict[str, int] = {}  # by each other run
+    for row in clean:
+        if row["policy"].startswith(OTHER_RUN):
+            arrived[row["policy"]] = arrived.get(row["policy"], 0) + row["success"]
+    runs = sorted(arrived, key=lambda policy: arrived[policy])
     found = []
     for condition in dict.fromkeys(row["condition"] for row in clean):
         own = [r for r in clean if r["policy"] == "agent" and r["condition"] == condition]
         failed = [row for row in own if not row["success"]]
         if failed:
             found.append(Scene(WORST, min(failed, key=lambda row: row["return"])))
-        rescued = [
-            Scene(RESCUE, row, others[key])
-            for row in own
-            if row["success"]
-            for policy in RESCUED_FROM
-            if (key := (policy, condition, row["episode_seed"], row["layouts"])) in others
-        ]
-        if rescued:
-            found.append(max(rescued, key=lambda scene: scene.row["return"]))
+        for policies in (*((policy,) for policy in runs), RESCUED_FROM):
+            rescued = [
+                Scene(RESCUE, row, others[key])
+                for row in own
+                if row["success"]
+                for policy in policies
+                if (key := (policy, condition, row["episode_seed"], row["layouts"])) in others
+            ]
+            if rescued:
+                found.append(max(rescued, key=lambda scene: scene.row["return"]))
+                break
     return found
 
 
@@ -116,6 +127,8 @@ def film_evaluation(
         if differing := unlike(scene.row, result):
             missing.append(f"{scene.name}: driven again it has another {', '.join(differing)}")
             continue
+        if scene.other is not None and (before := _failure(plan, scene.other)) is not None:
+            frames = _beside(before, frames, [_told(scene.other), _told(scene.row)])
         file = folder / f"{scene.name}.webp"
         write_bytes(file, _animation(frames))
         paths.append(file)
@@ -124,11 +137,21 @@ def film_evaluation(
     return paths, missing
 
 
+def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
+    """Pictures of another policy's drive; None where it cannot be driven as it was: its run is gone
+    or another now, or what it does depends on what drove beside it."""
+    try:
+        result, frames, _ = drive_again(plan, row)
+    except RestockError:
+        return None
+    return None if unlike(row, result) else frames
+
+
 def drive_again(
     plan: EvaluationPlan, row: dict[str, Any]
 ) -> tuple[EpisodeResult, list[NDArray[np.uint8]], list[dict[str, Any]]]:
-    """Drive the agent's episode once more: how it went, a picture of each step (H, W, 3), and where
-    everything was (metres and radians, in the map frame)."""
+    """Drive an episode once more with the policy that drove it: how it went, a picture of each step
+    (H, W, 3), and where everything was (metres and radians, in the map frame)."""
     frames: list[NDArray[np.uint8]] = []
     states: list[dict[str, Any]] = []
 
@@ -154,7 +177,8 @@ def drive_row(
     row: dict[str, Any],
     watched: Callable[[WarehouseVectorEnv], Stepper],
 ) -> EpisodeResult:
-    """Drive the agent's episode once more, with the steps that `watched` makes of its twin."""
+    """Drive an episode once more with the policy that drove it, with the steps that `watched` makes
+    of its twin."""
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
     profile = profile_of_run(plan.run)
@@ -170,7 +194,7 @@ def drive_row(
     )
     (result,) = run_episodes(
         env,
-        make_policy("agent", plan),
+        make_policy(row["policy"], plan),
         [EpisodeSpec(row["condition"], row["episode_seed"])],
         control_period_s=task.control_period_s,
         time_limit_steps=task.time_limit_steps,
@@ -243,6 +267,40 @@ def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str
     }
 
 
+def _told(row: dict[str, Any]) -> str:
+    """Who drove and how it ended, in words that fit above a picture."""
+    ended = "arrives" if row["success"] else row["failure"]
+    return f"{label_of(row['policy'])}: {ended}, {row['time_s']:.1f} s"
+
+
+def label_of(policy: str) -> str:
+    """A policy's name, of another run that of its folder."""
+    own = policy.removeprefix(OTHER_RUN)
+    return policy if own == policy else Path(own).name
+
+
+def _beside(
+    left: list[NDArray[np.uint8]], right: list[NDArray[np.uint8]], captions: Sequence[str]
+) -> list[NDArray[np.uint8]]:
+    """Two drives from their first steps on, each under its caption; the shorter one's last picture
+    stays."""
+    height, width = left[0].shape[:2]
+    font = ImageFont.load_default(size=16)
+    canvas = Image.new("RGB", (2 * width + GAP_PIXELS, height + CAPTION_PIXELS), "white")
+    draw = ImageDraw.Draw(canvas)
+    for column, caption in enumerate(captions):
+        draw.text((column * (width + GAP_PIXELS) + 4, 4), caption, fill="black", font=font)
+    blank = np.asarray(canvas)
+    frames = []
+    for step in range(max(len(left), len(right))):
+        frame = blank.copy()
+        for column, pictures in enumerate((left, right)):
+            x = column * (width + GAP_PIXELS)
+            frame[CAPTION_PIXELS:, x : x + width] = pictures[min(step, len(pictures) - 1)]
+        frames.append(frame)
+    return frames
+
+
 def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
     """An endless WebP of at most MOST_FRAMES frames; the last one stays for a second."""
     from io import BytesIO
@@ -263,6 +321,7 @@ __all__ = [
     "drive_row",
     "everything",
     "film_evaluation",
+    "label_of",
     "scenes",
     "unlike",
 ]

@@ -12,6 +12,7 @@ from restock.report.look.blocks import Drawing, Figure, Section, words
 from restock.report.look.charts import FONT
 from restock.report.look.floor_map import SCALE, Box, FloorMap
 from restock.report.run.facts import Facts
+from restock.train.evaluation.film import label_of
 from restock.train.run.measures import cell_name
 from restock.train.twin.floors.floors import open_floors
 
@@ -39,9 +40,9 @@ def films_section(facts: Facts) -> Section | None:
         "What does it look like?",
         intro="Episodes of the evaluation, driven again with the same spec, policy and outcome. "
         "For each condition: the failure with the lowest return, and an episode in which the "
-        "agent succeeded and another policy did not. Seen from above: the robot is orange, "
-        "its path a line, its plan dashed, the goal green; people are blue, forklifts yellow, "
-        "pallets brown, slippery floor light blue.",
+        "agent succeeded and another policy did not; the film shows that one to its left. Seen "
+        "from above: the robot is orange, its path a line, its plan dashed, the goal green; people "
+        "are blue, forklifts yellow, pallets brown, slippery floor light blue.",
         figures=figures,
         two=True,
     )
@@ -53,7 +54,7 @@ def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
     plan = FloorMap(floor.width_m, floor.depth_m, racks)
     data = base64.b64encode((facts.run / FOLDER / str(film["file"])).read_bytes()).decode()
     how = (
-        f"arrived after {film['time_s']:.1f} s, where {film['rescued_from']} did not"
+        f"arrived after {film['time_s']:.1f} s, where {label_of(film['rescued_from'])} did not"
         f" ({film['other_failure']})"
         if film["success"]
         else f"{film['failure']} after {film['time_s']:.1f} s"
