@@ -2,7 +2,7 @@
 
 A wheel is a link on a joint that turns without end about an axis across the robot. What the
 description does not have stays unknown, and what cannot be used is named: meshes (no other file is
-read), arms, steering, wheels that the twin has no drive for.
+read), arms, steering, wheels that the twin has no drive for, values that are none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,18 @@ from typing import Any
 import numpy as np
 
 from restock.errors import ConfigError
-from restock.ingest.urdf.description import F64, LONGEST, Description, Joint, Place, extent, number
+from restock.ingest.urdf.description import (
+    BASE_FRAMES,
+    F64,
+    HEAVIEST_KG,
+    LONGEST,
+    Description,
+    Joint,
+    Place,
+    extent,
+    number,
+)
+from restock.ingest.urdf.unusable import unusable
 
 SMALLEST_M = 0.005  # of a wheel's radius
 MOST_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
@@ -85,9 +96,13 @@ def described_robot(
     places = description.places()
     wheels = _wheels(description, places)
     driven = _driven(wheels)
+    faults = unusable(description, places)
     if not driven:
-        return DescribedRobot(problem=_no_wheels(description, places, wheels))
+        why = _no_wheels(description, places, wheels)
+        return DescribedRobot(problem="; ".join([why, *faults]))
     notes: list[str] = []
+    if description.base.split("/")[-1] not in BASE_FRAMES:
+        notes.append(_other_base(description.base))
     radius = float(np.median([wheel.radius_m for wheel in driven]))
     axles = sorted(_axles(driven, radius), reverse=True)
     middle = (axles[0] + axles[-1]) / 2
@@ -124,9 +139,18 @@ def described_robot(
         values["lidar.z_m"] = lidar
     meshes = _meshes(description, boxes)
     if meshes:
-        notes.append(f"{meshes} links have only meshes, whose size is in other files: left out")
+        have = "1 link has" if meshes == 1 else f"{meshes} links have"
+        notes.append(f"{have} only meshes, whose size is in other files: left out")
+    notes += faults
+    if any(_without_radius(description.links.get(wheel.joint.child)) for wheel in driven):
+        notes.append("wheels without a usable radius: it is their axle's height over the floor")
     rounded = {key: _rounded(value) for key, value in values.items()}
     return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
+
+
+def _other_base(base: str) -> str:
+    usual = f"{', '.join(BASE_FRAMES[:-1])} or {BASE_FRAMES[-1]}"
+    return f"{base!r} is taken for the base, as the other links hang on it: none is named {usual}"
 
 
 def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
@@ -192,9 +216,15 @@ def _axis(joint: Joint, place: Place) -> F64:
 def _radius(link: ET.Element | None) -> float:
     for shape in () if link is None else (*link.findall("collision"), *link.findall("visual")):
         for kind in ("cylinder", "sphere"):
-            if (found := shape.find(f"geometry/{kind}")) is not None:
-                return number(found.get("radius"))
+            found = shape.find(f"geometry/{kind}")
+            if found is not None and (radius := number(found.get("radius"))) > 0:
+                return radius
     return float("nan")
+
+
+def _without_radius(link: ET.Element | None) -> bool:
+    """Whether nothing gives its radius, not even a mesh, which is noted for itself."""
+    return not _radius(link) > 0 and (link is None or link.find(".//mesh") is None)
 
 
 def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
@@ -241,7 +271,7 @@ def _drive(description: Description, wheels: list[_Wheel], axles: list[float]) -
 def _mass(link: ET.Element) -> float:
     found = link.find("inertial/mass")
     mass = number(found.get("value")) if found is not None else 0.0
-    return mass if 0 < mass < 1e5 else 0.0
+    return mass if 0 < mass < HEAVIEST_KG else 0.0
 
 
 def _arms(description: Description) -> list[str]:
@@ -305,8 +335,9 @@ def _no_wheels(description: Description, places: dict[str, Place], wheels: list[
     has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
         return (
-            f"{description.name!r} has {len(wheels)} wheels, but no driven pair on both sides "
-            "with a known radius (a mesh has none): give wheel_radius_m and track_m in [robot]"
+            f"{description.name!r} has {len(wheels)} wheel{'s' * (len(wheels) > 1)}, but no driven "
+            "pair on both sides with a known radius (a mesh has none): give wheel_radius_m and "
+            "track_m in [robot]"
         )
     rotors = [
         joint

@@ -2,6 +2,9 @@
 
 The text may be anyone's: entities, documents that are too long and numbers that are none are
 refused or read as unknown, and no other file is opened, so a mesh has no size.
+
+The base is the link of a usual name, else the one that no joint places. Whether that is the body or
+a footprint below it makes no difference: heights are over the floor.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ F64 = NDArray[np.float64]
 LONGEST = 4_000_000  # letters of a description
 MOST_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
+HEAVIEST_KG = 100_000.0  # of a link
+SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ def read_description(text: str) -> Description | str:
         robot = ET.fromstring(text)  # no entities: checked above
     except (ET.ParseError, ValueError) as error:
         return f"is not XML ({error})"
-    if any("${" in value for e in robot.iter() for value in e.attrib.values()):
+    if any(_of_xacro(element) for element in robot.iter()):
         return "is a xacro file, not a URDF: convert it first (`xacro FILE > robot.urdf`)"
     if robot.tag != "robot":
         return f"is not a URDF: it begins with <{robot.tag}>, not with <robot>"
@@ -83,11 +88,43 @@ def read_description(text: str) -> Description | str:
         for j in robot.findall("joint")
         if (p := j.find("parent")) is not None and (c := j.find("child")) is not None
     ]
+    if not links:
+        return "has no links"
     named = (n for word in BASE_FRAMES for n in links if n.split("/")[-1] == word)
     base = next(named, None)
     if base is None:
-        return f"has none of the links {', '.join(BASE_FRAMES)}"
+        placed = {joint.child for joint in joints}
+        roots = [name for name in links if name not in placed]
+        if len(roots) != 1:
+            return _no_base(roots)
+        base = _moving(roots[0], links, joints)
     return Description(str(robot.get("name") or "robot"), links, joints, base, robot)
+
+
+def _of_xacro(element: ET.Element) -> bool:
+    """Whether it is still to be expanded by xacro."""
+    values = element.attrib.values()
+    in_namespace = element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]
+    return in_namespace or any("${" in value or "$(" in value for value in values)
+
+
+def _moving(root: str, links: dict[str, ET.Element], joints: list[Joint]) -> str:
+    """The root, or the robot that moves in it where it is a world: without a part of its own."""
+    under = [joint for joint in joints if joint.parent == root]
+    free = len(under) == 1 and under[0].kind in ("floating", "planar")
+    return under[0].child if free and not len(links[root]) and under[0].child in links else root
+
+
+def _no_base(roots: list[str]) -> str:
+    """Why no link can be taken for the base."""
+    why = "every link hangs on another"
+    if roots:
+        more = f" and {len(roots) - 4:,} more" if len(roots) > 4 else ""
+        why = f"{', '.join(map(repr, roots[:4]))}{more} are not joined to each other"
+    return (
+        f"has none of the links {', '.join(BASE_FRAMES)}, and {why}: name the robot's own link "
+        f"{BASE_FRAMES[0]}, or join all links in one tree below it"
+    )
 
 
 @dataclass(frozen=True)
@@ -123,13 +160,13 @@ def _shape_extent(shape: ET.Element, place: Place) -> tuple[F64, F64] | None:
         return None
     box, cylinder, sphere = (geometry.find(kind) for kind in ("box", "cylinder", "sphere"))
     if box is not None:
-        half = np.abs(place.rotation) @ (three(box.get("size")) / 2)
+        half = np.abs(place.rotation) @ (lengths(box.get("size"), 3) / 2)
     elif cylinder is not None:
-        radius, length = (number(cylinder.get(key)) for key in ("radius", "length"))
+        radius, length = (lengths(cylinder.get(key), 1)[0] for key in ("radius", "length"))
         axis = place.rotation[:, 2]
         half = radius * np.sqrt(np.maximum(1 - axis**2, 0)) + length / 2 * np.abs(axis)
     elif sphere is not None:
-        half = np.full(3, number(sphere.get("radius")))
+        half = np.full(3, lengths(sphere.get("radius"), 1)[0])
     else:
         return None
     low, high = place.at_m - half, place.at_m + half
@@ -148,6 +185,14 @@ def three(text: str | None) -> F64:
     """Three numbers of a description, 0 where it has fewer."""
     numbers = [number(part) for part in itertools.islice((text or "").split(), 3)]
     return np.array([*numbers, *[0.0] * (3 - len(numbers))])
+
+
+def lengths(text: str | None, count: int) -> F64:
+    """So many numbers (count,) of 0 or more; all NaN where the text does not have just these."""
+    parts = (text or "").split(maxsplit=count)
+    found = np.array([number(part) for part in parts[:count]])
+    sound = len(parts) == count and bool((found >= 0).all())
+    return found if sound else np.full(count, np.nan)
 
 
 def number(text: Any) -> float:

@@ -36,6 +36,7 @@ def joint(
 
 WHEEL = "<cylinder radius='0.1' length='0.04'/>"
 BASE = link("base_link", "<box size='0.8 0.5 0.2'/>", mass=20.0)
+XACRO = "<robot name='x' xmlns:xacro='http://www.ros.org/wiki/xacro'>{}</robot>"
 
 
 def robot(*parts: str) -> str:
@@ -127,7 +128,25 @@ def test_what_does_not_roll_is_named(text: str, message: str) -> None:
         ),
         ("<!DOCTYPE r SYSTEM 'file:///etc/passwd'><robot/>", "must not declare entities"),
         (robot(wheels((0, 0.2), (0, -0.2))).replace("0.8 0.5", "${length} 0.5"), "xacro file"),
+        (XACRO.format("<xacro:include filename='a.xacro'/>"), "xacro file"),
+        (XACRO.format("<link name='base_link'/><xacro:wheel prefix='left'/>"), "xacro file"),
+        (
+            robot(wheels((0, 0.2), (0, -0.2))).replace("0.8 0.5", "$(arg length) 0.5"),
+            "convert it first (`xacro FILE > robot.urdf`)",
+        ),
         ("<sdf version='1.6'/>", "begins with <sdf>"),
+        ("<robot/>", "has no links"),
+        (
+            "<robot><link name='a'/><link name='b'/></robot>",
+            "'a', 'b' are not joined to each other: name the robot's own link base_link, or join",
+        ),
+        (
+            "<robot><link name='a'/><link name='b'/>"
+            + joint("b", "0 0 0", parent="a")
+            + joint("a", "0 0 0", parent="b")
+            + "</robot>",
+            "every link hangs on another: name the robot's own link base_link",
+        ),
         ("<robot>" + "<link name='a'/>" + " " * 4_000_000 + "</robot>", "too many"),
         ("<robot>" + "".join(f"<link name='{i}'/>" for i in range(6000)) + "</robot>", "too many"),
     ],
@@ -136,6 +155,161 @@ def test_a_hostile_description_is_refused(text: str, message: str) -> None:
     found = read_description(text)
     assert isinstance(found, str)
     assert message in found
+
+
+def test_a_urdf_that_xacro_wrote_is_used_though_it_still_names_the_namespace() -> None:
+    text = XACRO.format(BASE + wheels((0, 0.2), (0, -0.2)))
+    assert of(text).values["track_m"] == 0.4
+
+
+@pytest.mark.parametrize("base", ["chassis", "robot1_base_link"])
+def test_a_base_of_another_name_is_the_link_that_no_joint_places(base: str) -> None:
+    laser = link("laser") + joint("laser", "0.3 0 0.2", kind="fixed")
+    usual = robot(wheels((0.2, 0.22), (0.2, -0.22)), laser)
+    found = of(usual.replace("base_link", base))
+    assert found.values == of(usual).values
+    assert found.notes == [
+        f"{base!r} is taken for the base, as the other links hang on it: none is named base_link, "
+        "base_footprint or base"
+    ]
+    under = link("foot") + joint(base, "0 0 0.15", kind="fixed", parent="foot")
+    above = of(usual.replace("base_link", base).replace("</robot>", under + "</robot>"))
+    assert above.values == found.values
+    assert "'foot' is taken for the base" in above.notes[0]
+
+
+def test_a_robot_that_moves_in_a_world_is_not_that_world() -> None:
+    world = link("world") + joint("chassis", "1 2 0", kind="floating", parent="world")
+    text = robot(wheels((0, 0.2), (0, -0.2)), world).replace("base_link", "chassis")
+    assert of(text).values["track_m"] == 0.4
+    description = read_description(text)
+    assert isinstance(description, Description)
+    assert description.base == "chassis"
+
+
+DRIVEN = robot(wheels((0.2, 0.2), (0.2, -0.2)))
+
+
+@pytest.mark.parametrize(
+    ("written", "instead", "note"),
+    [
+        (
+            "<link name='wheel_0'><collision>",
+            "<link name='wheel_0'><inertial><mass value='-5'/></inertial><collision>",
+            "link 'wheel_0': mass value='-5' is not from 0 to 100,000 kg: counted as 0",
+        ),
+        (
+            "size='0.8 0.5 0.2'",
+            "size='0,8 0,5 0,2'",
+            "link 'base_link': box size='0,8 0,5 0,2' is not 3 numbers of 0 or more (decimals take "
+            "a point): this shape is left out of the outline",
+        ),
+        (
+            "<box size='0.8 0.5 0.2'/>",
+            "<box/>",
+            "link 'base_link': box has no size: this shape is left out of the outline",
+        ),
+        (
+            "<box size='0.8 0.5 0.2'/>",
+            "<sphere radius='-1'/>",
+            "link 'base_link': sphere radius='-1' is not a number of 0 or more: this shape is left "
+            "out of the outline",
+        ),
+        (
+            "<box size='0.8 0.5 0.2'/>",
+            "<capsule radius='1' length='2'/>",
+            "link 'base_link': capsule is not a box, cylinder, sphere or mesh: this shape is left "
+            "out of the outline",
+        ),
+        (
+            "<geometry><box",
+            "<origin xyz='0 0 x'/><geometry><box",
+            "link 'base_link': collision origin xyz='0 0 x' is not 3 numbers: this shape is left "
+            "out of the outline",
+        ),
+        (
+            "</robot>",
+            link("mast", "<sphere radius='0.1'/>")
+            + joint("mast", "nan 0 1", kind="fixed")
+            + "</robot>",
+            "joint 'mast_joint': origin xyz='nan 0 1' is not 3 numbers: shapes of what it carries "
+            "are left out",
+        ),
+        (
+            "</robot>",
+            link("mast") + joint("mast", "0.1 0", kind="fixed") + "</robot>",
+            "joint 'mast_joint': origin xyz='0.1 0' is not 3 numbers: 0 for what is missing",
+        ),
+        (
+            "</robot>",
+            link("mast") + joint("mast", "0 0 0", axis="0 0 0") + "</robot>",
+            "joint 'mast_joint': axis xyz='0 0 0' is not a direction: it is not taken for a wheel",
+        ),
+        (
+            "</robot>",
+            link("mast") + joint("mast", "0 0 0", kind="Fixed") + "</robot>",
+            "joint 'mast_joint': type='Fixed' is not a joint's: what it carries is left out",
+        ),
+        (
+            "</robot>",
+            joint("mast", "0 0 0", kind="fixed") + "</robot>",
+            "joint 'mast_joint': child link='mast' is not described: left out",
+        ),
+        (
+            "</robot>",
+            "<joint name='j' type='fixed'><parent link='base_link'/></joint></robot>",
+            "joint 'j': has no child: left out",
+        ),
+        (
+            "<axis xyz='0 1 0'/></joint><link",
+            "<axis xyz='0 1 0'/><limit velocity='fast'/></joint><link",
+            "joint 'wheel_0_joint': limit velocity='fast' is not a number of 0 or more: it is not "
+            "used",
+        ),
+        (
+            "</robot>",
+            link("stray", mass=3.0) + "</robot>",
+            "no joint leads from the base to 'stray': left out",
+        ),
+    ],
+)  # fmt: skip
+def test_a_value_that_cannot_be_used_is_named_with_what_stands_in(
+    written: str, instead: str, note: str
+) -> None:
+    assert of(DRIVEN).notes == []
+    assert written in DRIVEN
+    found = of(DRIVEN.replace(written, instead, 1))
+    assert found.notes == [note]
+    assert found.values["track_m"] == 0.4
+
+
+def test_wheels_without_a_usable_radius_stand_on_the_floor_or_are_refused_with_its_value() -> None:
+    unknown = DRIVEN.replace("radius='0.1'", "radius='nan'")
+    why = "link 'wheel_0': cylinder radius='nan' is not a number of 0 or more"
+    found = of(unknown)
+    assert found.values["wheel_radius_m"] == 0.05
+    assert found.notes[0].startswith(why)
+    assert found.notes[-1] == (
+        "wheels without a usable radius: it is their axle's height over the floor"
+    )
+    assert why in (of(unknown.replace("-0.05", "-0.1")).problem or "")
+
+
+def test_one_wheel_is_not_wheels() -> None:
+    assert "'test' has 1 wheel, but" in (of(robot(wheels((0, 0.2)))).problem or "")
+
+
+def test_a_radius_that_only_a_visible_shape_has_is_used() -> None:
+    seen = "<visual><geometry><cylinder radius='0.1' length='0.04'/></geometry></visual></link>"
+    text = DRIVEN.replace("radius='0.1'", "radius='x'").replace("</link><joint", f"{seen}<joint")
+    assert of(text).values["wheel_radius_m"] == 0.1
+
+
+def test_many_unusable_values_are_counted() -> None:
+    stray = "".join(link(f"a{i}", "<sphere/>") + joint(f"a{i}", "0 0 0", "x") for i in range(9))
+    notes = of(robot(wheels((0, 0.2), (0, -0.2)), stray)).notes
+    assert len(notes) == 7
+    assert notes[-1] == "12 more values cannot be used"
 
 
 @given(
