@@ -21,6 +21,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.inputs import MOTION
+from restock.ingest.propose.evidence.commands import off_the_floor
 from restock.ingest.propose.evidence.footprint import descriptions
 from restock.ingest.propose.evidence.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
@@ -197,7 +198,14 @@ def no_wheeled_robot(
             f"{ON_WHEELS}"
         )
     if command:
-        return None
+        off, asked = off_the_floor(recording, command[0])
+        if 2 * off <= asked:
+            return None
+        return (
+            f"this looks like a robot arm's or a drone's recording ({off:,} of the {asked:,} "
+            f"commands to move of {command[0][0].name} have linear.z, angular.x or angular.y): "
+            f"{ON_WHEELS}"
+        )
     arm = sorted(t for t in types if t.startswith(ARMS))
     if arm and not located:
         told = f"it has {', '.join(arm[:2])}, no velocity command and no pose"

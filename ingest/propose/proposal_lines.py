@@ -8,7 +8,6 @@ import textwrap
 import numpy as np
 
 from restock.errors import visible
-from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.evidence.cameras import camera_lines
@@ -21,8 +20,8 @@ from restock.ingest.propose.evidence.roles import (
     LATCHED,
     REQUIRED,
     Kind,
-    Roles,
 )
+from restock.ingest.propose.node_lines import node_lines
 from restock.ingest.propose.task_lines import actions_of, task_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.condition_files import shipped
@@ -42,7 +41,7 @@ def profile_lines(
         *(f"# NOT USABLE YET: {problem}" for problem in problems),
         *_trial_lines(trial),
         "#",
-        *_topic_lines(recording, seen.roles, seconds),
+        *_topic_lines(seen),
         f'name = "{name}"',
         f"conditions = {json.dumps(_conditions(seen))}",
         *_unknown_lines(seen),
@@ -66,6 +65,7 @@ def profile_lines(
         lines += seen.frames.lines(used=seen.poses_from_frames)
     if seen.motion is not None and not seen.motion.problem:
         lines += seen.motion.lines()
+    lines += node_lines(seen, lines)
     if seen.signals:
         lines += [
             "# Custom signals: columns of the table, for conditions and queries. To use one,",
@@ -141,10 +141,11 @@ def _trial_lines(trial: Trial) -> list[str]:
     return [f"# It gives {trial.transitions:,} transitions from {trial.ticks:,} ticks{dropped}."]
 
 
-def _topic_lines(recording: Recording, roles: Roles, seconds: float) -> list[str]:
+def _topic_lines(seen: Evidence) -> list[str]:
     """Every topic with its rate and what it is taken for, as a comment."""
-    taken: dict[str, list[str]] = {}
-    for role, found in roles.items():
+    recording, seconds = seen.recording, seen.recorded_s
+    taken: dict[str, list[str]] = {name: ["Restock's node"] for name in seen.node_topics}
+    for role, found in seen.roles.items():
         if found:
             taken.setdefault(found[0][0].name, []).append(role)
     width = max((len(name) for name in recording.topics), default=0)

@@ -78,8 +78,7 @@ def actions_of(commands: Commands, robot: RobotProposal) -> list[tuple[float, fl
     if 0.8 * speed > GENTLE_MPS:  # over slippery floor it needs a curve, too, that is none of these
         slow, bend = min(0.35 * speed, GENTLE_MPS), min(0.5 * turn, GENTLE_RADPS)
         actions += [(slow, bend), (slow, -bend)]
-    actions += [(-speed / 2, 0.0)] if commands.backs else []
-    return actions
+    return actions + [(-back, 0.0) for back in commands.reverse_mps]
 
 
 def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
@@ -90,10 +89,11 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
     least_m = Robot(drive="ackermann", wheelbase_m=wheelbase_m, **known).min_turning_radius_m
     slow = 0.4 * speed
     wide, tight = min(0.6 * turn, 0.8 * speed / least_m), min(turn, slow / least_m)
-    curves = [(0.8 * speed, wide), (slow, tight), *([(-slow, tight)] if commands.backs else [])]
+    curves = [(0.8 * speed, wide), (slow, tight)]
+    curves += [(-back, min(turn, back / least_m)) for back in commands.reverse_mps[:1]]
     actions = [(0.0, 0.0), (speed / 2, 0.0), (speed, 0.0)]
     actions += [(v, side * 0.99 * w) for v, w in curves for side in (1, -1)]
-    return actions + ([(-slow, 0.0)] if commands.backs else [])
+    return actions + [(-back, 0.0) for back in commands.reverse_mps]
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:

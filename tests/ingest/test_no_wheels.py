@@ -11,6 +11,7 @@ from support.paths import SHARED
 
 from restock.cli import main
 from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import parse_profile
 
 SECONDS = np.arange(0, 8, 0.1)
 RISING = np.clip(SECONDS, 0, 3)
@@ -43,6 +44,18 @@ def arm() -> dict[str, tuple[str, TopicColumns]]:
     }
 
 
+def servoed(**speeds: object) -> dict[str, tuple[str, TopicColumns]]:
+    """As MoveIt Servo drives an arm: twists of its tool, which is located in the base's frame."""
+    at = pose("pose", 0.4 + 0.1 * np.sin(SECONDS), 0.1) | {"pose.position.z": 0.5 + 0 * SECONDS}
+    told = {"twist.linear.x": 0.1 * np.sin(SECONDS)}
+    told |= {f"twist.{path}": value + 0 * SECONDS for path, value in speeds.items()}
+    return {
+        "/joint_states": ("sensor_msgs/msg/JointState", columns(SECONDS, {})),
+        "/servo/twists": ("geometry_msgs/msg/TwistStamped", columns(SECONDS, told)),
+        "/tool_pose": ("geometry_msgs/msg/PoseStamped", columns(SECONDS, at)),
+    }
+
+
 def cameras() -> dict[str, tuple[str, TopicColumns]]:
     empty = columns(SECONDS, {})
     return {
@@ -57,6 +70,16 @@ def cameras() -> dict[str, tuple[str, TopicColumns]]:
         (flight("/mavros/setpoint_velocity/cmd_vel"), "a drone's recording (it rises by 2.6 m"),
         (flight(None), "a drone's recording (it has trajectory_msgs/msg/MultiDOF"),
         (arm(), "a robot arm's recording (it has trajectory_msgs/msg/JointTrajectory"),
+        (
+            servoed(**{"linear.y": 0.1, "linear.z": 0.05, "angular.y": 0.1}),
+            "a robot arm's or a drone's recording (80 of the 80 commands to move of /servo/twists"
+            " have linear.z, angular.x or angular.y)",
+        ),
+        (servoed(**{"angular.x": -0.2}), "a robot arm's or a drone's recording (80 of the 80"),
+        (
+            servoed(**{"linear.z": np.where(SECONDS < 4.2, 0.1, 0.0)}),
+            "a robot arm's or a drone's recording (42 of",
+        ),
         (cameras(), "a recording of sensors alone"),
     ],
 )
@@ -75,9 +98,49 @@ def test_a_robot_on_a_ramp_is_on_wheels(tmp_path, capsys):
     assert main(["profile", "new", str(bag), "--json"]) == 0
 
 
+@pytest.mark.parametrize("speeds", [{}, {"linear.z": np.where(SECONDS < 3, 0.1, 0.0)}])
+def test_commands_that_mostly_stay_on_the_floor_are_of_a_robot_on_wheels(speeds, tmp_path, capsys):
+    bag = write_topics(servoed(**speeds), tmp_path / "bag")
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["problems"] == []
+
+
+def test_noise_off_the_floor_tells_no_arm(tmp_path, capsys):
+    noise = np.random.default_rng(0).normal(0, 1e-3, len(SECONDS))
+    bag = write_topics(servoed(**{"linear.z": noise, "angular.y": noise}), tmp_path / "bag")
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+
+
+def test_the_base_below_an_arm_is_what_drives(tmp_path, capsys):
+    """Its commands are far fewer than the arm's, and their topic's name tells nothing."""
+    topics = servoed(**{"linear.z": 0.05, "angular.y": 0.1})
+    seldom = SECONDS[::4]
+    told = {"twist.linear.x": 0.1 * np.sin(seldom), "twist.angular.z": 0.2 * np.cos(seldom)}
+    topics["/wheels/speeds"] = ("geometry_msgs/msg/TwistStamped", columns(seldom, told))
+    bag = write_topics(topics, tmp_path / "bag")
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["problems"] == []
+    assert parse_profile(said["toml"], where="p").inputs.command.topic == "/wheels/speeds"
+
+
+def test_measured_motion_that_sways_is_of_a_robot_on_wheels(tmp_path, capsys):
+    """Odometry in three dimensions, in place of commands: rough floor pitches and rolls it."""
+    topics = servoed()
+    del topics["/servo/twists"], topics["/tool_pose"]
+    sways = 0.2 * np.sin(9 * SECONDS)
+    motion = {"twist.twist.linear.x": 0.1 + 0 * SECONDS, "twist.twist.linear.z": sways}
+    motion |= {"twist.twist.angular.x": sways, "twist.twist.angular.y": sways}
+    at = pose("pose.pose", 0.1 * SECONDS, 1.0)
+    topics["/odom"] = ("nav_msgs/msg/Odometry", columns(SECONDS, motion | at))
+    bag = write_topics(topics, tmp_path / "bag")
+    assert main(["profile", "new", str(bag), "--odometry-as-command", "--json"]) == 0
+
+
 def test_start_says_so_and_leaves_no_profile_to_edit(tmp_path, capsys):
     out = tmp_path / "out"
-    for number, topics in enumerate((flight("/mavros/setpoint_velocity/cmd_vel"), arm())):
+    drone = flight("/mavros/setpoint_velocity/cmd_vel")
+    for number, topics in enumerate((drone, arm(), servoed(**{"linear.z": 0.05}))):
         bag = write_topics(topics, tmp_path / f"bag{number}")
         assert main(["start", str(bag), "--out", str(out), "--json"]) == 3
         stopped = json.loads(capsys.readouterr().out)["stopped"]

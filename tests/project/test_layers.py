@@ -31,9 +31,11 @@ MAY_IMPORT = {
     "ingest/task": "",
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": "containers decoding profile propose/driven propose/evidence steps task urdf",
+    "ingest/propose": (
+        "containers decoding live profile propose/driven propose/evidence steps task urdf"
+    ),
     "ingest/propose/evidence": (
-        "camera containers decoding profile propose/driven steps task urdf"
+        "camera containers decoding live profile propose/driven steps task urdf"
     ),
     "ingest/propose/driven": "steps task",
     "ingest/live": "decoding profile steps task",

@@ -32,6 +32,9 @@ from restock.ingest.propose.evidence.roles import Kind, Roles
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.robot import USUAL_STEERING_RAD
 
+MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
+APART = 0.25  # of the fastest command; a command that is further from every action is far off it
+SLIGHT = 0.05  # of the largest speed of commands: noise, or what was rounded
 _ANGLES = {"yaw_rate_radps": "steering_rad"}
 
 
@@ -41,7 +44,7 @@ class Commands:
 
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
-    backs: bool = False
+    reverse_mps: tuple[float, ...] = ()  # slowest first; none where it was never told to back up
     count: int = 0
     topic: str = ""
     measured: bool = False  # they are odometry, in place of commands
@@ -52,10 +55,12 @@ class Commands:
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
         """The same for a robot that stays below these commands; None: it does what they say."""
+        most = speed_mps or self.speed_mps
         return replace(
             self,
-            speed_mps=speed_mps or self.speed_mps,
+            speed_mps=most,
             yaw_rate_radps=yaw_rate_radps or self.yaw_rate_radps,
+            reverse_mps=tuple(sorted({min(back, most) for back in self.reverse_mps})),
             reached=(speed_mps, yaw_rate_radps),
         )
 
@@ -63,13 +68,23 @@ class Commands:
         """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
         if not len(speed_mps):
             return self
-        fast, sharp = (float(np.percentile(np.abs(c), 98)) for c in (speed_mps, yaw_rate_radps))
+        fast, sharp = (float(np.percentile(np.abs(c), MOSTLY)) for c in (speed_mps, yaw_rate_radps))
+        most = fast or Commands.speed_mps
         return replace(
             self,
-            speed_mps=fast or Commands.speed_mps,
+            speed_mps=most,
             yaw_rate_radps=sharp or Commands.yaw_rate_radps,
-            backs=bool((speed_mps < -0.05 * fast).any()),
+            reverse_mps=_reverse_speeds(-speed_mps[speed_mps < -0.05 * fast], most),
         )
+
+
+def _reverse_speeds(back_mps: F64, most_mps: float) -> tuple[float, ...]:
+    """The fastest of these speeds in reverse (N,) that is commanded now and then, at most
+    `most_mps`; half of it, too, where others are so slow that they would be far off that one."""
+    if not len(back_mps):
+        return ()
+    slow, fast = (min(float(np.percentile(back_mps, p)), most_mps) for p in (RARELY, MOSTLY))
+    return (fast / 2, fast) if fast - slow > APART * most_mps else (fast,)
 
 
 def read_commands(
@@ -114,6 +129,30 @@ def commanded(
         turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
+
+
+def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[int, int]:
+    """Of the Twists of a topic that ask for motion, how many ask for some that no wheels make: up
+    and down, roll or pitch; and how many there are. (0, 0) of other types, and of odometry, which
+    was measured on floors that are not even."""
+    topic, kind = fit
+    message = kind.fields["speed_mps"].removesuffix("linear.x")
+    leaves = [f"{message}{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
+    if topic.type == MOTION or not set(leaves) <= set(recording.leaves(topic.name)):
+        return 0, 0
+    fields = recording.read({topic.name: leaves})[topic.name].fields
+    asked = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
+    asked = asked[np.isfinite(asked).all(axis=1) & (asked > 0).any(axis=1)]
+    if not len(asked):
+        return 0, 0
+    least = SLIGHT * float(np.percentile(asked.max(axis=1), MOSTLY))
+    return int((asked[:, [2, 3, 4]] > least).any(axis=1).sum()), len(asked)
+
+
+def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
+    """Whether most commands of a topic are for an arm or a drone."""
+    off, asked = off_the_floor(recording, fit)
+    return 2 * off > asked
 
 
 def settled_at_most(

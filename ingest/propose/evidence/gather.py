@@ -29,6 +29,7 @@ from restock.ingest.propose.evidence.commands import (
     Commands,
     as_angles,
     how_it_turned,
+    leaves_the_floor,
     read_commands,
     read_turns,
 )
@@ -44,11 +45,13 @@ from restock.ingest.propose.evidence.roles import (
     FIX,
     KINDS,
     LATCHED,
+    NODE_TOPICS,
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,
     FrameGuess,
     Roles,
+    node_topics,
     topics_for,
     transform_frames,
     usable_topics,
@@ -89,6 +92,7 @@ class Evidence:
     signals: list[Candidate]
     cameras: list[CameraTopic]
     robot: RobotProposal
+    node_topics: dict[str, str]  # of Restock's own node: name -> type
 
 
 def gather(
@@ -106,6 +110,8 @@ def gather(
     if not roles["command"] and odometry_as_command:
         roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)
     else:
+        if len(roles["command"]) > 1:  # an arm on the robot may have its own
+            roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
         roles["command"], chosen = choose_command(recording, topics, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
@@ -178,11 +184,12 @@ def gather(
         GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
         candidates(
             recording,
-            without={topic.name for role, topic, _ in best if role in SPENT},
+            without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS,
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
         camera_topics(recording, recorded_s),
         robot,
+        node_topics(recording),
     )
 
 

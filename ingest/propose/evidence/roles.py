@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.live.node_topics import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
 from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.frames import FIELDS, Edges, upward
 from restock.ingest.urdf.description import BASE_FRAMES
@@ -185,14 +187,27 @@ ODOMETRY_AS_COMMAND = (
 REQUIRED = ("command", "pose")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
+# Of Restock's own node: what a policy would have driven is no command of the robot.
+NODE_TOPICS = frozenset((PROPOSAL, SHADOW, ACTION, LIMITER, TAKEOVER))
 SPENT = (*LATCHED, "true_condition", "true_exposure")  # nothing else is in their topics
 
 Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 
 
 def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
-    """The topics that can be decoded and have messages."""
-    return {n: t for n, t in recording.topics.items() if t.skipped is None and t.expected}
+    """The topics that can be decoded and have messages, without those of Restock's node."""
+    return {name: topic for name, topic in _readable(recording) if name not in NODE_TOPICS}
+
+
+def node_topics(recording: Recording) -> dict[str, str]:
+    """The topics of Restock's node that can be decoded and have messages: name -> type."""
+    return {name: topic.type for name, topic in _readable(recording) if name in NODE_TOPICS}
+
+
+def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
+    for name, topic in recording.topics.items():
+        if topic.skipped is None and topic.expected:
+            yield name, topic
 
 
 def topics_for(

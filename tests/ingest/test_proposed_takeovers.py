@@ -1,0 +1,135 @@
+"""What Restock's own node published: a proposal reads it as `node --write-profile` does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import (
+    START_NS,
+    Drive,
+    columns,
+    typed_topics,
+    up_to_the_panel,
+    write_topics,
+)
+
+from restock.cli import main
+from restock.ingest.live.node_topics import (
+    ACTION,
+    LIMITER,
+    PROPOSAL,
+    SHADOW,
+    TAKEOVER,
+    with_node_topics,
+)
+from restock.ingest.profile.profile import Profile, load_profile
+from restock.replay.store.store import Store
+
+TWIST, BOOL = "geometry_msgs/msg/Twist", "std_msgs/msg/Bool"
+TAKEN_S = (4.0, 8.0)
+Topics = dict[str, Any]
+
+
+def driven() -> Topics:
+    """A drive of a robot whose logs do not say who drives."""
+    topics: Topics = typed_topics(Drive(duration_s=12.0))
+    del topics["/behaviour_policy"]
+    return topics
+
+
+def taken_over(kind: str = BOOL) -> Topics:
+    at_s = np.arange(0, 12, 0.2)
+    pressed = (at_s >= TAKEN_S[0]) & (at_s < TAKEN_S[1])
+    data = pressed if kind == BOOL else np.where(pressed, "yes", "no").astype(object)
+    return driven() | {TAKEOVER: (kind, columns(at_s, {"data": data}, stamped=False))}
+
+
+def in_shadow() -> Topics:
+    """The node proposes twice as often as the planner drives, and its limiter holds it back."""
+    at_s = np.arange(0, 12, 0.1)
+    half = np.full(len(at_s), 0.2)
+    slow = {"linear.x": half, "angular.z": 0 * half}
+    chosen = {"data": np.ones(len(at_s), np.int16)}
+    rule = {"data": (at_s > 6).astype(np.uint8)}
+    return driven() | {
+        PROPOSAL: (TWIST, columns(at_s, slow | {"linear.x": 2 * half}, stamped=False)),
+        SHADOW: (TWIST, columns(at_s, slow, stamped=False)),
+        ACTION: ("std_msgs/msg/Int16", columns(at_s, chosen, stamped=False)),
+        LIMITER: ("std_msgs/msg/UInt8", columns(at_s, rule, stamped=False)),
+    }
+
+
+def proposed(topics: Topics, folder: Path, name: str = "robot") -> tuple[Path, Path, Profile]:
+    """The bag, its proposal, and that as a profile."""
+    bag, file = write_topics(topics, folder / f"{name}_bag"), folder / f"{name}.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    return bag, file, load_profile(file)
+
+
+def rows(bag: Path, file: Path, query: str) -> list[Any]:
+    store = file.with_suffix("")
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    with Store(store) as opened:
+        return opened.sql(query).fetchall()
+
+
+def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
+    bag, file, profile = proposed(taken_over(), tmp_path)
+    assert list(profile.command_sources) == ["operator"]
+    assert "shadow_action" not in profile.signals
+    said = rows(bag, file, "SELECT stamp_ns, behaviour_policy FROM transitions ORDER BY 1")
+    by_hand = [(stamp - START_NS) * 1e-9 for stamp, policy in said if policy == "operator"]
+    assert len(by_hand) == pytest.approx((TAKEN_S[1] - TAKEN_S[0]) / 0.2, abs=1)
+    assert min(by_hand) >= TAKEN_S[0]
+    assert max(by_hand) < TAKEN_S[1] + 0.01
+    assert {policy for _, policy in said} == {"operator", "unknown"}
+    assert "[signals.restock_takeover]" not in file.read_text()
+
+
+def test_start_names_the_operator_too(tmp_path, capsys):
+    bag = write_topics(taken_over(), tmp_path / "bag")
+    out = tmp_path / "out"
+    main(["start", str(bag), "--out", str(out), "--accept", "--json", *up_to_the_panel(tmp_path)])
+    with Store(out / "store") as store:
+        counted = store.sql("SELECT count(*) FROM transitions WHERE behaviour_policy = 'operator'")
+        assert counted.fetchall()[0][0] > 15
+
+
+def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
+    assert proposed(taken_over("std_msgs/msg/String"), tmp_path)[2].command_sources == {}
+
+
+def test_what_the_node_published_is_read_as_its_own_profile_reads_it(tmp_path):
+    plain = proposed(driven(), tmp_path, "plain")[2]
+    bag, file, profile = proposed(in_shadow() | taken_over(), tmp_path)
+    expected = with_node_topics(plain)
+    assert profile.signals == expected.signals
+    assert profile.command_sources == expected.command_sources
+    assert profile.own_conditions == expected.own_conditions
+    assert "= {}" not in file.read_text()
+    (found,) = rows(
+        bag,
+        file,
+        "SELECT count(*), count(*) FILTER (list_contains(exposures, 'limited')),"
+        " max(shadow_speed_mps), max(shadow_action) FROM transitions",
+    )
+    assert found[0] > 40
+    assert 0 < found[1] < found[0]
+    assert found[2:] == (pytest.approx(0.2), 1)
+
+
+def test_what_a_policy_would_have_driven_does_not_drive(tmp_path, capsys):
+    """In shadow it publishes twists beside the command, more of them."""
+    topics = in_shadow()
+    bag, file, profile = proposed(topics, tmp_path)
+    assert profile.inputs.command.topic == "/cmd_vel"
+    assert profile.inputs.nav_command is None
+    assert profile.command_sources == {}
+    capsys.readouterr()
+    assert main(["profile", "new", str(bag), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["commands"] == []
+    assert not any(line.startswith("# [signals.restock") for line in file.read_text().splitlines())
