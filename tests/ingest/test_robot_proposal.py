@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.driven_robot import Drive, columns, typed_topics, write_topics
 from support.paths import ROOT
 
 from restock.errors import ConfigError
@@ -354,6 +356,20 @@ def test_a_proposed_profile_has_the_robot_of_the_file(tmp_path: Path) -> None:
     assert by_logs is not None
     assert by_logs.origin_of("track_m") == "default"
     assert by_logs.lidar.beams == own.robot.lidar.beams
+
+
+def test_the_description_of_an_arm_does_not_hide_that_of_its_base(tmp_path: Path) -> None:
+    texts = {"/arm": robot(), "/base": robot(wheels((0.2, 0.22), (0.2, -0.22)))}
+    topics = typed_topics(Drive())
+    for place, text in texts.items():
+        data = {"data": np.array([text], object)}
+        described = "std_msgs/msg/String", columns(np.array([0.01]), data, stamped=False)
+        topics[f"{place}/robot_description"] = described
+    with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
+        proposed = propose_profile(recording, "mine")
+    own = parse_profile(proposed.toml, where="proposed").robot
+    assert own is not None
+    assert (own.track_m, own.origin_of("track_m")) == (0.44, "robot_description")
 
 
 def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:

@@ -158,6 +158,7 @@ def propose_robot(
     values: dict[str, Any] = {}
     origin: dict[str, str] = {}
     notes: list[str] = []
+    unfit: list[str] = []
     for source, text in texts:
         description = read_description(text)
         if isinstance(description, str):
@@ -171,12 +172,15 @@ def propose_robot(
                 raise ConfigError(
                     found.problem, where=str(urdf), remedy="give the URDF of a wheeled robot"
                 )
-            return RobotProposal(notes=[f"{source}: {found.problem}"], rolls=False)
+            unfit.append(f"{source}: {found.problem}")  # an arm's, say, beside that of its base
+            continue
         kind = "robot_description" if urdf is None else "urdf"
         values = _sound(found.values, notes)
         origin = dict.fromkeys(values, kind)
         notes += [f"{source}: {note}" for note in found.notes]
         break
+    if unfit and not values:
+        return RobotProposal(notes=unfit, rolls=False)
     if scan_topic is not None:
         seen = _lidar(recording, scan_topic, notes)
         values |= seen
