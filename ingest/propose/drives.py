@@ -3,14 +3,15 @@
 Drives show different things: one its description, another the fastest command, a third the longest
 gap through which the robot drove on. What is the robot's is put together from all of them, and of
 the clocks that the drives propose the one is taken that makes rows of most of their time, all
-together. Drives of another kind of robot are left out, and named.
+together. Drives of another kind of robot are left out, and named. The kind of every recording is
+looked at, in a few of its topics; of many drives of one kind, the proposal reads the largest.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,8 @@ from restock.ingest.propose.propose import (
 )
 from restock.ingest.propose.trial import Advice, Trial
 
-MOST_DRIVES = 12  # that are read
+MOST_DRIVES = 12  # of one kind, that a proposal reads
+MOST_NAMED = 5  # of those that it does not read, in a profile's first lines
 MOST_BASES = 4  # that are tried on all drives
 # Poses on a map are worth so many times the time that odometry serves: where some drives have no
 # map, most of the time would be lost for want of it.
@@ -43,10 +45,60 @@ LOCALISED_WORTH = 1.25
 SAME_PACE = 1.5  # times the period: commands that are no further apart than this are of one pace
 
 
+@dataclass(frozen=True)
+class Drives:
+    """Recordings by the kind of robot that they are of, and which of them a proposal reads."""
+
+    paths: Sequence[Path]
+    traits: Sequence[RobotTraits]  # of each of them
+    kinds: Sequence[Sequence[int]]  # places in `paths`; the first kind is the one proposed for
+    read: Sequence[int]  # places of those of the first kind that the proposal reads
+
+    @property
+    def unread(self) -> list[Path]:
+        """Those of the first kind that the proposal does not read."""
+        return [self.paths[one] for one in self.kinds[0] if one not in self.read]
+
+    @property
+    def others(self) -> list[tuple[Path, RobotTraits]]:
+        """Those of other kinds, and what they say of their robot."""
+        return [
+            (self.paths[one], self.traits[one]) for kind in self.kinds[1:] for one in sorted(kind)
+        ]
+
+    @property
+    def robots(self) -> list[RobotKind]:
+        """Every kind with all its recordings, where there are several."""
+        return [
+            RobotKind(str(self.traits[kind[0]]), [str(self.paths[one]) for one in kind])
+            for kind in self.kinds
+            if len(self.kinds) > 1
+        ]
+
+
+def drives_by_kind(
+    paths: Sequence[Path], traits: Sequence[RobotTraits], *, most: int = MOST_DRIVES
+) -> Drives:
+    """The kinds of these recordings, and of the one with most drives that have a command at most so
+    many to read: the largest, those with a command first.
+
+    Raises:
+        RecordingError: there is no recording.
+    """
+    if not paths:
+        raise RecordingError("no recording given", remedy="give at least one")
+    kinds = robot_kinds(traits)
+    own = max(kinds, key=lambda members: sum(bool(traits[one].command) for one in members))
+    fullest = sorted(own, key=lambda one: (not traits[one].command, -_bytes(paths[one])))
+    ordered = sorted(kinds, key=lambda members: members != own)
+    return Drives(paths, traits, ordered, sorted(fullest[:most]))
+
+
 def propose_for_drives(
     recordings: Sequence[Recording],
     name: str,
     *,
+    drives: Drives | None = None,
     footprint: Footprint | None = None,
     urdf: Path | None = None,
     odometry_as_command: bool = False,
@@ -58,6 +110,8 @@ def propose_for_drives(
         recordings: drives of one kind of robot; of several kinds those of the first are taken that
             has most drives with a command.
         name: of the profile.
+        drives: what is known of these and more recordings; `recordings` are then those that it
+            says to read, in that order. None: these are all there are.
         footprint, urdf, odometry_as_command, hindsight_goals: as of `propose_profile`.
 
     Raises:
@@ -66,7 +120,7 @@ def propose_for_drives(
     """
     if not recordings:
         raise RecordingError("no recording given", remedy="give at least one")
-    if len(recordings) == 1:
+    if len(recordings) == 1 and (drives is None or len(drives.paths) == 1):
         return propose_profile(
             *(recordings[0], name),
             footprint=footprint,
@@ -74,41 +128,36 @@ def propose_for_drives(
             odometry_as_command=odometry_as_command,
             hindsight_goals=hindsight_goals,
         )
-    traits = [robot_traits(recording) for recording in recordings]
-    kinds = robot_kinds(traits)
-    kind = max(kinds, key=lambda members: sum(bool(traits[one].command) for one in members))
-    drives = [
+    if drives is None:
+        traits = [robot_traits(recording) for recording in recordings]
+        drives = drives_by_kind([r.path for r in recordings], traits, most=len(recordings))
+        recordings = [recordings[one] for one in drives.read]
+    evidence = [
         gather(
-            *(recordings[one], footprint, urdf),
+            *(recording, footprint, urdf),
             odometry_as_command=odometry_as_command,
             hindsight_goals=hindsight_goals,
         )
-        for one in kind
+        for recording in recordings
     ]
     seen = max(
-        (pooled(base, drives) for base in _bases(drives)),
+        (pooled(base, evidence) for base in _bases(evidence)),
         key=lambda one: (
-            sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives))
+            sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), evidence))
             * (LOCALISED_WORTH if _on_map(one) else 1.0)
         ),
     )
-    usual = _trials(seen, drives)
+    usual = _trials(seen, evidence)
     dropped: Counter[str] = sum((Counter(trial.dropped) for trial in usual), Counter())
     goal = seen.goal.tried(sum(trial.transitions for trial in usual), dropped)
     proposal = propose_from(replace(seen, goal=goal), name, goal_decided=True)
-    trials = [tried(one.recording, proposal.toml) for one in drives]
-    others = [(recordings[m], traits[m]) for members in kinds if members != kind for m in members]
-    advice = [*proposal.advice, *_left_out(others)]
+    trials = [tried(one.recording, proposal.toml) for one in evidence]
     return replace(
         proposal,
-        problems=[*proposal.problems, *_in_another(proposal.missing, drives)],
-        toml="\n".join([*_lines(drives, trials, others), proposal.toml]),
-        advice=advice,
-        kinds=[
-            RobotKind(str(traits[of[0]]), [str(recordings[one].path) for one in of])
-            for of in sorted(kinds, key=lambda members: members != kind)
-            if len(kinds) > 1
-        ],
+        problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
+        toml="\n".join([*_lines(evidence, trials, drives), proposal.toml]),
+        advice=[*proposal.advice, *_left_out(drives.others)],
+        kinds=drives.robots,
         ticks=sum(trial.ticks for trial in trials),
         transitions=sum(trial.transitions for trial in trials),
     )
@@ -117,13 +166,6 @@ def propose_for_drives(
 def _trials(seen: Evidence, drives: Sequence[Evidence]) -> list[Trial]:
     toml = "\n".join(profile_lines(seen, "robot", []))
     return [tried(one.recording, toml) for one in drives]
-
-
-def drives_to_read(paths: Sequence[Path]) -> tuple[list[Path], int]:
-    """The largest recordings, which a proposal reads; and how many it does not."""
-    sizes = {path: _bytes(path) for path in paths}
-    largest = sorted(paths, key=lambda path: -sizes[path])[:MOST_DRIVES]
-    return [path for path in paths if path in largest], len(paths) - len(largest)
 
 
 def _bytes(path: Path) -> int:
@@ -156,6 +198,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
             topic: max(one.paces_s[topic] for one in drives if topic in one.paces_s)
             for topic in base.paces_s
         },
+        node_topics={name: kind for one in drives for name, kind in one.node_topics.items()},
         footprint=outlined.footprint,
         footprint_notes=outlined.footprint_notes,
         outline=outlined.outline,
@@ -234,26 +277,31 @@ def _fullness(one: Evidence) -> tuple[int, int, float]:
     return deciding, sum(map(bool, one.roles.values())), one.driven_s
 
 
-def _lines(
-    drives: Sequence[Evidence],
-    trials: Sequence[Trial],
-    others: Sequence[tuple[Recording, RobotTraits]],
-) -> list[str]:
-    """What comes of each drive, as comments."""
-    rows = sum(trial.transitions for trial in trials)
-    lines = [
-        f"# For {len(drives)} drives of one kind of robot, by what they say: {rows:,} transitions."
-    ]
-    for drive, trial in zip(drives, trials, strict=True):
+def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives) -> list[str]:
+    """What comes of each drive, and which were not read, as comments."""
+    rows = f"by what they say: {sum(trial.transitions for trial in trials):,} transitions."
+    of, unread = len(drives.kinds[0]), drives.unread
+    number = f"the {len(evidence)} largest of {of:,} drives" if unread else f"{of:,} drives"
+    if of == 1:
+        number = "the one drive"
+    lines = [f"# For {number} of one kind of robot, {rows}"]
+    for drive, trial in zip(evidence, trials, strict=True):
         why = f"  ({trial.problem})" if trial.problem else ""
-        lines.append(f"#   {_name(drive.recording)}: {trial.transitions:,}{why}")
-    lines += [f"# NOT OF THAT KIND: {_name(one)}: {told}" for one, told in others]
-    return lines
+        lines.append(f"#   {_name(drive.recording.path)}: {trial.transitions:,}{why}")
+    if unread:
+        lines.append(f"# NOT READ, of that kind: {names_of(unread)}")
+    return lines + [f"# NOT OF THAT KIND: {_name(path)}: {told}" for path, told in drives.others]
 
 
-def _name(recording: Recording) -> str:
+def names_of(paths: Sequence[Path]) -> str:
+    """The first of these recordings by name, and how many more there are."""
+    more = f" and {len(paths) - MOST_NAMED:,} more" if len(paths) > MOST_NAMED else ""
+    return ", ".join(map(_name, paths[:MOST_NAMED])) + more
+
+
+def _name(path: Path) -> str:
     """Two parts of its path: bags of several robots often have the same names."""
-    return "/".join(recording.path.parts[-2:])
+    return "/".join(path.parts[-2:])
 
 
 def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
@@ -262,20 +310,20 @@ def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]
     for role, lacks in (("pose", "command"), ("command", "pose")):
         for one in drives if role in missing else ():
             if (topics := one.roles[role]) and not one.roles[lacks]:
-                found.append(
-                    f"{_name(one.recording)} has a {role} ({topics[0][0].name}) and no {lacks}:"
-                    " one recording must hold both"
-                )
+                said = f"{_name(one.recording.path)} has a {role} ({topics[0][0].name})"
+                found.append(f"{said} and no {lacks}: one recording must hold both")
     return found
 
 
-def _left_out(others: Sequence[tuple[Recording, RobotTraits]]) -> list[Advice]:
+def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:
     if not others:
         return []
-    names = ", ".join(_name(recording) for recording, _ in others[:5])
-    more = f" and {len(others) - 5} more" if len(others) > 5 else ""
-    text = f"{len(others)} recordings are of another kind of robot, by what they say: {names}{more}"
-    return [Advice("name", f"{text}; propose another profile for them")]
+    one = len(others) == 1
+    number = "1 recording is" if one else f"{len(others):,} recordings are"
+    text = f"{number} of another kind of robot, by what {'it says' if one else 'they say'}"
+    names = names_of([path for path, _ in others])
+    propose = f"propose another profile for {'it' if one else 'them'}"
+    return [Advice("name", f"{text}: {names}; {propose}")]
 
 
-__all__ = ["drives_to_read", "pooled", "propose_for_drives"]
+__all__ = ["Drives", "drives_by_kind", "names_of", "pooled", "propose_for_drives"]

@@ -29,6 +29,8 @@ from restock.ingest.steps.frames import FIELDS, FRAME_ID
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
 
+NEARLY = 0.8  # of a name's letters: /plan is not /scan
+
 
 def read_topics(
     recording: Recording, profile: Profile, *, reduced: bool = True
@@ -88,7 +90,8 @@ def wanted_fields(
         have = ", ".join(sorted(available)) or "none"
         raise RecordingError(
             f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
-            remedy=f"its topics are {have}; choose another --profile, or see `restock info`",
+            remedy=f"its topics are {have}; choose another --profile, or let `restock profile new"
+            " RECORDING` propose one (`restock start RECORDING` does so, and goes on from there)",
         )
     wanted: dict[str, list[str]] = {}
     optional = {FRAME_ID}
@@ -163,6 +166,7 @@ def input_problems(
 ) -> list[str]:
     """Why a recording with these topics (and fields) does not fit the profile, a line a topic."""
     needed: dict[str, list[str]] = {}
+    types: dict[str, str] = {}  # of what is needed
     wrong: dict[str, list[str]] = {}
     fields: list[str] = []
     sources: dict[str, Input | CustomSignal] = {**profile.sources}
@@ -173,6 +177,7 @@ def input_problems(
         if required and (topic is None or not topic.expected):
             what = "no message of" if topic is not None else "no topic"
             needed.setdefault(f"{what} {source.topic}", []).append(name)
+            types[f"{what} {source.topic}"] = source.type
         elif topic is not None and topic.type != source.type:
             what = f"{source.topic} holds {topic.type}, not {source.type}"
             wrong.setdefault(what, []).append(name)
@@ -187,7 +192,7 @@ def input_problems(
         elif leaves is not None and (field := other_field(topic.type, leaves[camera.topic])):
             has = f"its {topic.type} has no {field!r} as ROS defines it"
             fields.append(f"`cameras.{name}`: {camera.topic}: {has}")
-    hints = {what: near(what.split()[-1], available) for what in needed}
+    hints = {what: near(what.split()[-1], available, types[what]) for what in needed}
     lacking = [
         f"{what} ({', '.join(names)})" + (f": {hints[what]}" if hints.get(what) else "")
         for what, names in itertools.chain(needed.items(), wrong.items())
@@ -195,9 +200,15 @@ def input_problems(
     return lacking + fields + _transform_problems(profile, available, leaves or {})
 
 
-def near(topic: str, available: Mapping[str, Any]) -> str:
-    """A question about a topic that is nearly the one that is missing, or ""."""
-    close = [] if topic in available else get_close_matches(topic, available, n=1)
+def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> str:
+    """A question about a topic that may be the one that is missing, or "": one that is spelled
+    nearly like it, or the one of its type, `kind`, that is spelled most like it."""
+    if topic in available:
+        return ""
+    alike = [name for name, info in available.items() if kind is not None and info.type == kind]
+    close = get_close_matches(topic, available, n=1, cutoff=NEARLY) or get_close_matches(
+        topic, alike, n=1, cutoff=0.0
+    )
     return f"did you mean {close[0]}?" if close else ""
 
 

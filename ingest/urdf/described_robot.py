@@ -28,6 +28,7 @@ from restock.ingest.urdf.description import (
     number,
 )
 from restock.ingest.urdf.unusable import unusable
+from restock.words import counted
 
 SMALLEST_M = 0.005  # of a wheel's radius
 MOST_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
@@ -335,7 +336,7 @@ def _no_wheels(description: Description, places: dict[str, Place], wheels: list[
     has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
         return (
-            f"{description.name!r} has {len(wheels)} wheel{'s' * (len(wheels) > 1)}, but no driven "
+            f"{description.name!r} has {counted(len(wheels), 'wheel')}, but no driven "
             "pair on both sides with a known radius (a mesh has none): give wheel_radius_m and "
             "track_m in [robot]"
         )

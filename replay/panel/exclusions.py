@@ -17,6 +17,7 @@ from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.panel.candidates import bools, codes
 from restock.replay.panel.strata import NO_STRATUM, ResolvedStratum
 from restock.replay.store.definitions import install_repeated_rows
+from restock.words import counted
 
 DAY_NS = 86_400 * 10**9
 # What an evaluation split is by, where that is not an episode: column and name.
@@ -295,7 +296,8 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
     if untold.any():
         of = len(np.unique(codes(table, "recording_id")[untold]))
         raise MixtureError(
-            f"{int(untold.sum()):,} rows of {of:,} recordings have no {column}: they could belong "
+            f"{int(untold.sum()):,} rows of {counted(of, 'recording')} have no {column}: "
+            "they could belong "
             "to one that is held out",
             remedy=f"add it with `restock ingest RECORDING --tag {column}=…`, or leave them out:"
             f' where = "{column} IS NOT NULL"',

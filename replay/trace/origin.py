@@ -33,6 +33,7 @@ _RELABELLED = ("condition", "conditions", "labels_version", "profile_hash", "ing
 _LEFT_OUT = (
     "task_json",
     "conditions_json",
+    "exposures_json",
     "profile_toml",
     "topics",
     "label_scores",

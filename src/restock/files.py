@@ -6,6 +6,7 @@ bytes) is a `RestockError` of the caller's kind that says which file it is and w
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from restock.errors import RestockError
+from restock.errors import ConfigError, RestockError
 
 
 def read_table(
@@ -99,7 +100,7 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
     if _takes_a_stream(path) and not exclusive:
         path.write_bytes(content)
         return
-    temporary = _temporary(path)
+    temporary = _temporary(path, replaces=not exclusive)
     try:
         temporary.write_bytes(content)
         if exclusive:
@@ -117,7 +118,23 @@ def _takes_a_stream(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def _temporary(path: Path) -> Path:
+def refuse_folder(path: Path | None, option: str) -> None:
+    """Refuse a folder where an option names a file to write: before the work, not after it.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if path is not None and path.is_dir():
+        raise ConfigError(
+            f"{path} is a folder, and a file is to be written",
+            where=option,
+            remedy="give the name of a file, in this folder for example",
+        )
+
+
+def _temporary(path: Path, *, replaces: bool = True) -> Path:
+    if replaces and path.is_dir():  # said of the path itself: not, later, of the file beside it
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     return temporary_name(path)
 
@@ -165,6 +182,7 @@ __all__ = [
     "is_running",
     "read_json",
     "read_table",
+    "refuse_folder",
     "remove_leftovers",
     "temporary_name",
     "write_bytes",

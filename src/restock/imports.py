@@ -27,10 +27,25 @@ def import_extra(
     try:
         return import_module(name)
     except ImportError as error:
-        remedy = f"pip install 'restock[{extra}]'" + (f", or {instead}" if instead else "")
+        remedy = install_command(extra) + (f", or {instead}" if instead else "")
         raise ConfigError(
             f"{use}, which is not installed ({error})", where=where, remedy=remedy
         ) from error
+
+
+def install_command(extra: str = "") -> str:
+    """How pip adds an extra, or what Restock needs, to the Restock that is installed here."""
+    import json
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    try:
+        origin = json.loads(distribution("restock").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:  # imported from a path
+        origin = {}
+    extras = f"[{extra}]" if extra else ""
+    if origin.get("dir_info", {}).get("editable"):
+        return f"pip install -e '.{extras}' in the source tree"
+    return f"pip install 'restock{extras}'"
 
 
 def installed(name: str) -> bool:
@@ -97,4 +112,4 @@ class _Hides:
         return None
 
 
-__all__ = ["hidden", "import_extra", "installed", "when_imported"]
+__all__ = ["hidden", "import_extra", "install_command", "installed", "when_imported"]

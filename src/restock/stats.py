@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
+LEAST_PAIRS = 3  # of which `paired_t` says more than the mean
 _WEIGHTS_AT_ONCE = 4_000_000  # in memory
 
 
@@ -30,6 +31,11 @@ class ConfidenceInterval:
     low: float
     high: float
 
+    def within(self, least: float, most: float = math.inf) -> ConfidenceInterval:
+        """The same, its ends cut at the range of the quantity."""
+        low, high = np.clip([self.low, self.high], least, most).tolist()
+        return ConfidenceInterval(self.value, low, high)
+
 
 NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 
@@ -37,6 +43,11 @@ NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 def interval_text(value: float, low: float | None, high: float | None, form: str = ".2f") -> str:
     """A value with the ends of its interval where there is one: `.52 [.41, .63]`."""
     return f"{value:{form}}" + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
+
+
+def no_interval_text(why: str | None) -> str:
+    """What follows a value that has no interval: ` (no interval: WHY)`."""
+    return f" (no interval: {why})" if why else ""
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -206,21 +217,24 @@ def paired_t(
 ) -> tuple[ConfidenceInterval, float]:
     """The mean of paired differences (n,), its Student's t interval, and p of no difference.
 
-    With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below two
-    differences, ends and p are NaN; where all are the same, p is 0, or 1 if that is 0.
+    With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below
+    `LEAST_PAIRS`, and where all are the same, the spread is not known: ends and p are NaN.
     """
     from scipy.stats import t
 
     values = np.asarray(differences, np.float64)
     value, count = float(values.mean()), len(values)
-    if count < 2:
+    if count < LEAST_PAIRS or nothing_varies(values):
         return ConfidenceInterval(value, float("nan"), float("nan")), float("nan")
     error = float(values.std(ddof=1)) / math.sqrt(count)
     half = float(t.ppf(0.5 + confidence / 2, count - 1)) * error
-    if error == 0:
-        return ConfidenceInterval(value, value, value), float(value == 0)
     p = 2 * float(t.sf(abs(value) / error, count - 1))
     return ConfidenceInterval(value, value - half, value + half), p
+
+
+def nothing_varies(values: NDArray[Any]) -> bool:
+    """Whether all values (n,) are the same, but for rounding."""
+    return bool(np.allclose(values, values[0], rtol=1e-9, atol=1e-12))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -234,6 +248,19 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return adjusted
 
 
+def which_adjusted(primary: bool) -> str:
+    """Which p values of contrasts `holm` adjusted, as a sentence."""
+    if primary:
+        return (
+            "The primary contrast was named before the runs; p of the others is adjusted for their"
+            " number (Holm)."
+        )
+    return (
+        "None of these contrasts was named as primary before the runs: all p values are adjusted"
+        " for their number (Holm)."
+    )
+
+
 def paired_t_power(effect: float, sd: float, pairs: int, *, confidence: float = 0.95) -> float:
     """The probability that `paired_t` finds a true mean difference (the noncentral t).
 
@@ -242,7 +269,7 @@ def paired_t_power(effect: float, sd: float, pairs: int, *, confidence: float = 
     """
     from scipy.stats import chi2, norm, t
 
-    if pairs < 2:
+    if pairs < LEAST_PAIRS:
         return 0.0
     freedom, shift = pairs - 1, effect / (sd / math.sqrt(pairs))
     limit = float(t.ppf(0.5 + confidence / 2, freedom))

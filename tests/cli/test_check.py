@@ -96,6 +96,36 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
     assert "is not a run directory" in capsys.readouterr().err
 
 
+def test_what_cannot_be_compared_names_the_option_and_its_store(
+    stores: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    old = f"{stores['one']}@99"
+    assert main(["check", str(stores["one"]), "--against", old, "--json"]) == 1
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    (found,) = (one for one in checks if one["check"] == "comparable")
+    assert found["what"].startswith(f"--against {old}: has no version 99")
+    assert "--against" in found["advice"]
+
+
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [
+        *(("check", "--junit"), ("check", "--summary"), ("audit", "--junit")),
+        *(("coverage", "--out"), ("drift", "--out"), ("report", "--out")),
+    ],
+)
+def test_a_folder_to_write_to_is_refused_before_the_work(
+    verb: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before it is even looked whether there is a store."""
+    capsys.readouterr()
+    assert main([verb, str(tmp_path / "gone"), option, str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"restock: {option}: {tmp_path} is a folder")
+    assert ".tmp" not in error
+
+
 def evaluated(name: str, successes: int) -> Evaluated:
     """40 episodes of one condition, so many of them at the goal."""
     episodes = {

@@ -82,14 +82,32 @@ def test_the_version_is_printed() -> None:
     assert f"\nnative code {native.state()}\n" in done.stdout
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
+PRINTS = """
+import sys
+from restock import cli
+from restock.cli import output
+cli._dispatch = lambda args: output.print_wrapped("8 checks: 8 pass")
+sys.exit(cli.main([]))
+"""
+
+
+@pytest.mark.parametrize(
+    "python", [["-m", "restock", "--help"], ["-m", "restock", "info", "--help"], ["-c", PRINTS]]
+)
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_goes_away_is_no_error(python: list[str], unbuffered: str) -> None:
     read_end, write_end = os.pipe()
     os.close(read_end)
     with os.fdopen(write_end, "wb") as gone:
-        command = [sys.executable, "-m", "restock", "--help"]
-        done = subprocess.run(command, stdout=gone, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == 0
+        done = subprocess.run(
+            [sys.executable, *python],
+            env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+            stdout=gone,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     assert done.stderr == ""
+    assert done.returncode == 0
 
 
 def test_starting_up_loads_none_of_the_heavy_libraries() -> None:

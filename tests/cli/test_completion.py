@@ -44,6 +44,12 @@ def tab(script: Path, *words: str) -> list[str]:
         (["eval", "runs/a", "--no"], ["--no-drive"]),
         (["compare", "a", "b", "--treatment", "m"], ["mixture", "method"]),
         (["sql", "store", "--ru"], ["--run"]),
+        (["schema", "st"], ["study"]),
+        (["schema", "m"], ["mixture", "missions"]),
+        (["mix", "store", "--mixture", ""], ["coverage", "exposure", "steps", "uniform"]),
+        (["coverage", "store", "--mixture", "uni"], ["uniform"]),
+        (["ingest", "bag", "--profile", "ware"], ["warehouse_amr"]),
+        (["mix", "store", "--mixture", "my_own"], []),  # a file, as well
         (["ingest", "bag"], []),  # a file: bash's own completion
     ],
     ids=lambda value: " ".join(value),

@@ -33,7 +33,7 @@ def plan(tmp_path: Path) -> list[Stage]:
 def test_every_stage_is_a_verb_with_flags_that_exist(tmp_path: Path) -> None:
     verbs = [stage.command[0] for stage in plan(tmp_path)]
     before = ["info", "ingest", "sql", "audit", "mix", "mix"]
-    assert verbs == [*before, "train", "train", "train", "eval", "eval", "report"]
+    assert verbs == [*before, "train", "train", "train", "eval", "eval", "eval", "report"]
     for stage in plan(tmp_path):
         assert cli.main([*stage.command, "--help"]) == 0
         assert not stage.beside or cli.main([*stage.beside, "--help"]) == 0

@@ -78,8 +78,9 @@ def write(run: Path, rows: list[dict[str, Any]]) -> None:
 
 def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path)
-    write(to.logs_alone, [driven("agent", "wheel_slip", n < 1, n) for n in range(4)])
-    after = [driven("agent", "wheel_slip", n < 3, n) for n in range(4)]
+    alone = stages.from_logs_alone(to)
+    after = [driven(alone, "wheel_slip", n < 1, n) for n in range(4)]
+    after += [driven("agent", "wheel_slip", n < 3, n) for n in range(4)]
     easy = [driven("planner", "nominal", True, n) for n in range(2)]
     write(to.run, [*after, *easy, *(driven("planner", "wheel_slip", n < 2, n) for n in range(4))])
     easy_row, slip, rare = story.before_and_after(to)
@@ -103,6 +104,6 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
 
 def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path)
-    write(to.logs_alone, [driven("agent", "nominal", None, 0)])
-    write(to.run, [driven("agent", "nominal", None, 0), driven("planner", "nominal", None, 0)])
+    policies = stages.from_logs_alone(to), "agent", "planner"
+    write(to.run, [driven(policy, "nominal", None, 0) for policy in policies])
     assert story.before_and_after(to) == []

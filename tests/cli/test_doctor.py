@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 
 from restock.cli import doctor, main
+from restock.errors import ConfigError
+from restock.imports import import_extra, install_command
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
@@ -43,8 +46,29 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
     assert ">=99 is needed" in found["duckdb"]["what"]
     assert found["no-such-package"]["state"] == "wrong"
     extra = found["no-such-extra"]
-    assert (extra["state"], extra["remedy"]) == ("missing", "pip install 'restock[onnx]'")
+    assert (extra["state"], extra["remedy"]) == ("missing", install_command("onnx"))
+    assert found["duckdb"]["remedy"] == install_command()
     assert "of-another-machine" not in found
+
+
+@pytest.mark.parametrize(
+    ("direct_url", "command"),
+    [
+        (None, "pip install 'restock[onnx]'"),
+        ('{"url": "file:///restock.whl", "archive_info": {}}', "pip install 'restock[onnx]'"),
+        (
+            '{"url": "file:///restock", "dir_info": {"editable": true}}',
+            "pip install -e '.[onnx]' in the source tree",
+        ),
+    ],
+)
+def test_an_extra_is_added_to_the_restock_that_is_installed(
+    direct_url: str | None, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata.PathDistribution, "read_text", lambda *_: direct_url)
+    assert install_command("onnx") == command
+    with pytest.raises(ConfigError, match=re.escape(f"{command}, or do without")):
+        import_extra("no_such_module", "onnx", "it is needed", instead="do without")
 
 
 def test_a_store_that_is_not_there_is_wrong(

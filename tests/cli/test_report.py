@@ -371,6 +371,28 @@ def test_one_average_of_success_is_on_the_page(run: Path) -> None:
     assert f"instead of {mean_success(facts.clean_cells()):.0%}" in evaluation_bias(facts)
 
 
+def test_no_card_is_a_bare_average(run: Path) -> None:
+    """The success on the episodes that chose the checkpoint was beside that of other episodes."""
+    cards = page(gather(run))["cards"]
+    assert all("success" not in card["label"] for card in cards)
+    (kept,) = [card for card in cards if "kept policy" in card["label"]]
+    assert kept == {
+        "value": "2,000",
+        "label": "environment step of the kept policy, the best of 2 evaluations in training",
+    }
+
+
+def test_a_table_of_many_columns_is_stacked_before_it_is_cut(html: str) -> None:
+    """On a tablet it ended in the middle of a column, with no sign of more."""
+    style = html.split("</style>")[0]
+    assert re.search(r"@container \([^)]*\) and \(max-width: 780px\) {\s*\.wide,", style)
+    assert re.search(r"\.scroll {[^}]*local", style)  # a shadow where more is to the right
+    columns = re.findall(r"<table([^>]*)>\s*<thead>(.*?)</thead>", html, flags=re.DOTALL)
+    for attributes, head in columns:
+        assert ("wide" in attributes) == (head.count("<th ") > 6)
+    assert any("wide" in attributes for attributes, _ in columns)
+
+
 def test_a_condition_is_spelt_one_way(html: str) -> None:
     shown = re.sub(r"<(pre|code)>.*?</\1>", "", html.split("</style>")[1], flags=re.DOTALL)
     assert "wheel slip" in shown

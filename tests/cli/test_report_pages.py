@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 from support.finished_runs import document, make_run
 from support.page_scripts import charts_of
+from support.stores import recording_transitions, write_store
 
 from restock.cli import main
+from restock.replay.store.store import Store
 from restock.report import write_study_page
+from restock.report.fleet.coverage import coverage_facts, coverage_page
 from restock.report.look import charts
 from restock.report.look.live import Charts
 from restock.report.study.comparison import gate_section
@@ -150,6 +153,69 @@ def test_a_store_has_a_page_of_what_it_holds(
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
     assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
     assert "give --out FILE, too" in capsys.readouterr().err
+
+
+CONTROL_PERIOD_S = 0.2
+NO_PLAN = {"orders": [], "total": 0.0, "total_low": 0.0, "total_high": 0.0, "hours": 0.0}
+NEVER_SEEN = {
+    **{"asked_by": "audit missing_cells", "cell": "blocked_aisle, action 7"},
+    **{"condition": "blocked_aisle", "stratum": None, "action": 7, "zone": None, "robot": None},
+    **{"counted": "rows", "needed": 1, "there": 0, "missing": 1, "thinnest_zones": []},
+    **{"best": None, "amount": None, "amount_low": None, "amount_high": None},
+    **{"never_seen_in": "blocked_aisle", "at_least": 9},
+}
+
+
+def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[str, Any]:
+    """As `restock gaps --json` prints it."""
+    place = {"store": "store", "store_version": 1, "mixture": "coverage", "confidence": 0.8}
+    whole = {**NO_PLAN, **plan}
+    return {**place, "unit": unit, "closed": not gaps, "gaps": list(gaps), "plan": whole}
+
+
+def coverage_of(store: Store, gaps: dict[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
+    """The cards by label, and the sections by id."""
+    page = coverage_page(coverage_facts(store), gaps, "nothing to compare")
+    cards = {card["label"]: card["value"] for card in page["cards"]}
+    return cards, {section.id: section for section in page["sections"]}
+
+
+def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) -> None:
+    """Each robot's row once held its hours times the number of conditions that it had met."""
+    tables = [recording_transitions(number) for number in (1, 2, 3)]
+    tags = [{"robot": "a"}, {"robot": "a"}, {"robot": "b"}]
+    with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
+        _, sections = coverage_of(store, missing())
+        (table,) = sections["robots"].tables
+        of_robot = "SELECT robot, count(*), count(DISTINCT condition) FROM transitions GROUP BY ALL"
+        counted = store.sql(of_robot).fetchall()
+    assert all(conditions > 1 for _, _, conditions in counted)
+    expected = {robot: f"{rows * CONTROL_PERIOD_S / 3600:.2f}" for robot, rows, _ in counted}
+    assert {row["robot"]: row["hours"] for row in table.rows} == expected
+
+
+def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: Path) -> None:
+    with Store(store_path) as store:
+        cards, sections = coverage_of(store, missing(NEVER_SEEN))
+        some = {**NEVER_SEEN, "best": "wheel_slip", "amount": 3, "amount_low": 2, "amount_high": 5}
+        order = {"kind": "wheel_slip", "zone": None, "robot": None, "missions": 3, "hours": 0.1}
+        plan = {"orders": [{**order, "fills": ["wheel_slip"]}], "total": 3.0}
+        both, _ = coverage_of(store, missing(some, NEVER_SEEN, **plan))
+        closed, _ = coverage_of(store, missing())
+    assert cards["gap"] == "1"
+    assert cards["more episodes of blocked aisle, to see what was never logged (95 %)"] == (
+        "at least 9"
+    )
+    assert not any("to log next" in label for label in cards)  # no "0 missions"
+    shopping = sections["shopping"]
+    assert "at least 9 more episodes of blocked aisle" in shopping.intro
+    (row,) = shopping.tables[-1].rows
+    assert row["best"] == "no rate is known: at least 9 more episodes of blocked aisle"
+    assert both["gaps"] == "2"
+    label = "missions to log next (95 %: 0 to 0); 1 gap has no rate and is not in it"
+    assert both[label] == "3"
+    assert closed["gaps"] == "0"
+    assert closed["missions to log next"] == "0"
 
 
 def test_a_chart_of_numbers_that_are_none_is_drawn_with_gaps() -> None:

@@ -14,7 +14,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock import cli
 from restock.cli.start import outcomes
-from restock.cli.start.decisions import fit_is_worse, no_room, robot_line
+from restock.cli.start.decisions import robot_line
 from restock.cli.start.stage import Stage
 from restock.cli.start.start import StartCommand
 from restock.cli.start.way import Way
@@ -312,30 +312,3 @@ def test_several_topics_of_commands_are_for_a_person_to_choose_from(
     assert "/base/cmd_vel, /cmd_vel" in document["stopped"]["why"]
     _, document = start(capsys, *argv, "--accept")
     assert document["stages"][-1]["name"] == "mix"
-
-
-def test_where_no_mission_fits_there_is_no_training_in_the_twin_whatever_was_asked() -> None:
-    def floor(**document: Any) -> Ended:
-        return Ended("floor", "", "done", document=document)
-
-    assert no_room(floor(episodes=["nominal"])) is None
-    assert "no mission fits" in str(no_room(floor(episodes=[])))
-    # Without any floor the twin has its own, where that is asked for.
-    assert no_room(Ended("floor", "", "failed")) is None
-
-
-def test_a_fit_that_ends_farther_from_the_logs_is_told_with_its_figures() -> None:
-    def gap(*ends: tuple[str, str, float, float]) -> dict[str, Any]:
-        rows = [
-            {"condition": "nominal", "quantity": what, "source": source, "median": m, "p90": p}
-            for what, source, m, p in ends
-        ]
-        return {"paths": rows}
-
-    described = ("position", "nominal", 0.12, 0.3)
-    worse = gap(described, ("position", "calibrated", 0.26, 0.5))
-    assert "0.260 m from the log" in str(fit_is_worse(worse))
-    assert "without it 0.120 m" in str(fit_is_worse(worse))
-    assert fit_is_worse(gap(described, ("position", "calibrated", 0.13, 0.2))) is None
-    assert fit_is_worse(gap(described, ("position", "calibrated", 0.08, 0.4))) is None
-    assert fit_is_worse(gap(described, ("heading", "calibrated", 0.9, 0.9))) is None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,10 @@ from restock.cli.start.decisions import (
 )
 from restock.cli.start.settings import Settings
 from restock.cli.start.work import Work
+from restock.ingest.containers.discover import recordings_in
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.propose import drives
 from restock.replay.store.store import Store
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.floors.occupancy_map import write_pgm
@@ -204,12 +208,54 @@ def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on
     assert found["status"] == "failed"
     assert "--salvage" in found["errors"][0]
     assert "recordings of 2 kinds of robots" in document["stopped"]["why"]
+    options = shlex.join(up_to_the_panel(tmp_path))
     assert document["stopped"]["remedies"][:2] == [
-        f"restock start {bags / 'a'} {bags / 'b'} --out {out}",
-        f"restock start {bags / 'c'} --out {out}-2",
+        f"restock start {bags / 'a'} {bags / 'b'} --out {out} {options}",
+        f"restock start {bags / 'c'} --out {out}-2 {options}",
     ]
     _, document = start(capsys, *argv, "--accept")
     assert f"restock ingest {bags / 'a'} {bags / 'b'} --store" in commands(document)["ingest"]
+
+
+def test_recordings_that_the_proposal_does_not_read_are_of_a_kind_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The small drive of another robot was ingested with the others."""
+    monkeypatch.setattr(drives, "drives_by_kind", partial(drives.drives_by_kind, most=2))
+    bags, out = tmp_path / "bags", tmp_path / "out"
+    for name, seconds in (("a", 9.0), ("b", 4.0), ("c", 8.0)):
+        write_bag(Drive(seconds), bags / name)
+    write_bag(OtherLidar(3.0), bags / "small")
+    argv = (str(bags), "--out", str(out), "--tag", "site=north", "--minutes", "0.5")
+    code, document = start(capsys, *argv, "--footprint", "0.5x0.4")
+    assert code == 3
+    mine = f"{bags / 'a'} {bags / 'b'} {bags / 'c'}"
+    options = "--tag site=north --minutes 0.5"
+    # The outline is one robot's: it is in the first call alone.
+    assert document["stopped"]["remedies"][:2] == [
+        f"restock start {mine} --out {out} --footprint 0.5x0.4 {options}",
+        f"restock start {bags / 'small'} --out {out}-2 {options}",
+    ]
+    argv = (str(bags), "--out", str(out), "--accept", *up_to_the_panel(tmp_path))
+    _, document = start(capsys, *argv)
+    assert f"restock ingest {mine} --store" in commands(document)["ingest"]
+    (proposed,) = [stage for stage in document["stages"] if stage["name"] == "propose"]
+    assert "by the 2 largest of 3 recordings of this robot" in proposed["outcome"][0]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
+def test_all_recordings_of_two_fleets_are_in_the_calls(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 19 recordings the calls named 12, and with --accept rows of two fleets were mixed."""
+    fleets = [str(SHARED / name) for name in ("fleet-neato", "fleet-turtlebot3")]
+    code, document = start(capsys, *fleets, "--out", str(tmp_path / "out"))
+    assert code == 3
+    *calls, _ = document["stopped"]["remedies"]
+    named = [word for call in calls for word in call.split() if word.startswith(str(SHARED))]
+    every = [str(path) for fleet in fleets for path in recordings_in(fleet)]
+    assert sorted(named) == sorted(every)
+    assert not any(len({fleet in call for fleet in fleets}) == 1 for call in calls)
 
 
 class OtherLidar(Drive):

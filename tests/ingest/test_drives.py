@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from support.paths import ROOT
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.propose.drives import propose_for_drives
+from restock.ingest.propose import drives as drives_module
+from restock.ingest.propose.drives import drives_by_kind, propose_for_drives
 from restock.ingest.propose.kinds import Lidar, RobotTraits, robot_kinds, robot_traits
 from restock.ingest.propose.propose import tried
 
@@ -132,6 +134,53 @@ def test_the_usual_names_alone_tell_of_no_kind():
         traits(**usual, inputs=inputs, topics=topics | {("/a", "A")}),
     ]
     assert robot_kinds(robots) == [[0], [1], [2, 3]]
+
+
+def test_every_recording_is_of_a_kind_and_the_largest_of_one_are_read(tmp_path: Path):
+    """Of 12 large drives and a small one of another robot, the small one was not looked at, and
+    its rows were mixed with the others'."""
+    mine = traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR)
+    other = replace(mine, lidar=replace(LIDAR, beams=720))
+    told = [*(mine for _ in range(14)), other, replace(mine, command="")]
+    paths = [tmp_path / f"{number}.mcap" for number in range(len(told))]
+    for number, path in enumerate(paths):
+        path.write_bytes(bytes(100 + number))
+    found = drives_by_kind(paths, told)
+    assert [len(kind.recordings) for kind in found.robots] == [15, 1]
+    assert found.others == [(paths[14], other)]
+    # The smallest two are not read, nor is the largest, which has no command.
+    assert found.read == list(range(2, 14))
+    assert found.unread == [paths[0], paths[1], paths[15]]
+
+
+def test_what_was_read_and_what_not_is_told(tmp_path, capsys, monkeypatch):
+    two = partial(drives_by_kind, most=2)
+    monkeypatch.setattr(drives_module, "drives_by_kind", two)
+    for name, drive in (
+        ("a", Told(duration_s=9.0)),
+        ("b", Told(duration_s=4.0)),
+        ("c", Told(duration_s=8.0)),
+        ("other", Told(duration_s=3.0, beams=40)),
+    ):
+        write_bag(drive, tmp_path / "bags" / name)
+    file = tmp_path / "robot.toml"
+    assert main(["profile", "new", str(tmp_path / "bags"), "--out", str(file), "--json"]) == 0
+    printed = capsys.readouterr()
+    said = json.loads(printed.out)
+    bags = {name: str(tmp_path / "bags" / name) for name in ("a", "b", "c", "other")}
+    assert said["read"] == [bags["a"], bags["c"]]
+    assert said["unread"] == [bags["b"]]
+    assert [kind["recordings"] for kind in said["kinds"]] == [
+        [bags["a"], bags["b"], bags["c"]],
+        [bags["other"]],
+    ]
+    told = "read the 2 largest of 3 recordings of that kind of robot; not read: bags/b\n"
+    assert told in printed.err
+    header = file.read_text()
+    assert "# For the 2 largest of 3 drives of one kind of robot" in header
+    assert "# NOT READ, of that kind: bags/b\n" in header
+    assert "# NOT OF THAT KIND: bags/other: lidar" in header
+    assert "1 recording is of another kind of robot, by what it says: bags/other" in printed.err
 
 
 def test_what_a_recording_says_of_its_robot(tmp_path: Path):

@@ -52,6 +52,17 @@ def test_a_release_is_checked_on_each_python_that_is_promised() -> None:
     assert "upload dist" not in built
 
 
+def test_the_workflow_to_copy_gives_what_must_be_given() -> None:
+    inputs = workflow("restock-check")["on"]["workflow_call"]["inputs"]
+    required = {name for name, of in inputs.items() if of.get("required")}
+    assert required == {"restock", "store"}  # there is no index that has a `restock` to install
+    page = (ROOT / "docs/ci.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    given = YAML(typ="safe", pure=True).load(block)["jobs"]["gate"]["with"]
+    assert required <= set(given) <= set(inputs)
+    assert given["restock"].endswith(f"@v{PROJECT['version']}")
+
+
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
 def test_every_command_of_a_workflow_exists(path: Any) -> None:
     document = workflow(path.stem)

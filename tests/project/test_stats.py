@@ -145,9 +145,23 @@ def test_paired_t_against_a_published_value() -> None:
     interval, p = paired_t(gained)
     assert (interval.value, p) == pytest.approx((1.58, 0.00283), abs=1e-5)
     assert (interval.low, interval.high) == pytest.approx((0.7001, 2.4599), abs=1e-4)
-    one, unknown = paired_t(np.array([0.3]))
-    assert one.value == 0.3
-    assert np.isnan([one.low, one.high, unknown]).all()
+
+
+@pytest.mark.parametrize(
+    "ahead", [[0.3], [0.3, 0.3], [-0.1, 0.7], [0.0, 0.0, 0.0], [0.1 + 0.2, 0.3, 0.6 - 0.3]]
+)
+def test_two_pairs_or_equal_ones_have_neither_an_interval_nor_a_p(ahead: list[float]) -> None:
+    """Two seeds that came to the same difference were significant, with p < .001."""
+    found, p = paired_t(np.array(ahead))
+    assert found.value == pytest.approx(np.mean(ahead))
+    assert np.isnan([found.low, found.high, p]).all()
+
+
+def test_an_interval_is_cut_at_the_range_of_its_quantity() -> None:
+    assert ConfidenceInterval(0.5, -5.85, 6.85).within(0, 1) == ConfidenceInterval(0.5, 0.0, 1.0)
+    assert ConfidenceInterval(2.0, 1.0, 3.0).within(0) == ConfidenceInterval(2.0, 1.0, 3.0)
+    unknown = ConfidenceInterval(0.5, float("nan"), float("nan")).within(0, 1)
+    assert np.isnan([unknown.low, unknown.high]).all()
 
 
 def test_over_five_seeds_t_covers_what_it_says_and_a_bootstrap_does_not() -> None:
@@ -233,6 +247,7 @@ def test_power_is_how_often_the_test_finds_it() -> None:
         0.05, abs=5e-4
     )  # of nothing: the error of the test
     assert paired_t_power(0.1, 0.1, 1) == 0.0
+    assert paired_t_power(9.0, 0.1, 2) == 0.0  # of two, `paired_t` says nothing
     # Pilots' spread of .06 between the seeds of an arm (docs/study.md).
     sd = 0.06 * 2**0.5
     told = [paired_t_power(effect, sd, n) for n, effect in ((5, 0.12), (20, 0.05), (30, 0.05))]

@@ -103,7 +103,7 @@ def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
     tables = [recording_transitions(number) for number in (1, 2, 3)]
     store = write_store(tmp_path / "store", tables, tags=[{}, {"robot": "a"}, {"robot": "b"}])
     text = "[evaluation_split]\nby = 'robot'\n" + EVERY
-    says = f"{len(tables[0]):,} rows of 1 recordings have no robot: they could belong to one that"
+    says = f"{len(tables[0]):,} rows of 1 recording have no robot: they could belong to one that"
     with pytest.raises(MixtureError, match=says) as refused:
         panel_of(store, text, tmp_path / "panel")
     assert 'where = "robot IS NOT NULL"' in str(refused.value.remedy)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from support.finished_runs import document, make_run
 
 from restock.cli import main
+from restock.report import write_study_page
 from restock.train.comparison.compare import compare
 from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
@@ -23,10 +25,10 @@ from restock.train.study.page import as_markdown
 from restock.train.study.power import PowerConfig, least_effect, seeds_needed, spread
 from restock.train.study.study import StudyPlan, load_study
 
-STUDY = """
+PRIMARY = 'primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }\n'
+STUDY = f"""
 seeds = [0, 1, 2, 3]
-primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }
-measures = ["auc_rare", "success_rare", "auc_nominal"]
+{PRIMARY}measures = ["auc_rare", "success_rare", "auc_nominal"]
 rare = ["wheel_slip"]
 [[arms]]
 name = "uniform"
@@ -88,7 +90,8 @@ def test_curves_are_compared_over_the_steps_that_all_have(tmp_path: Path) -> Non
     found = contrast("a", "b", "auc_wheel_slip", [(whole, late)])
     assert found is not None
     assert (found.arm_mean, found.baseline_mean) == (1.0, 0.5)
-    assert (found.low, found.p) == (None, None)  # one seed has no interval
+    assert (found.low, found.p) == (None, None)
+    assert found.no_interval == "1 seed, at least 3 are needed"
     assert contrast("a", "b", "success_wheel_slip", [(whole, late)]) is None
 
 
@@ -119,8 +122,9 @@ def test_a_study_names_its_primary_contrast_and_adjusts_the_others(tmp_path: Pat
     assert first.p_holm is None
     assert [one.measure for one in others] == ["auc_rare", "auc_nominal"]  # nothing at the end
     assert others[0].p is not None
-    assert others[0].p_holm == pytest.approx(2 * others[0].p)
-    assert (others[1].difference, others[1].p_holm) == (0.0, 1.0)
+    assert others[0].p_holm == pytest.approx(others[0].p)  # the other has no p
+    assert (others[1].difference, others[1].p_holm) == (0.0, None)  # it never differed
+    assert others[1].no_interval == "the same in every seed: nothing varies"
     assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
 
 
@@ -144,7 +148,8 @@ def test_power_of_pilots() -> None:
     assert same == pytest.approx(sd)
     paired, _ = spread(PowerConfig(0.06, 0.12, 0.5), at_end=True, kinds=3, episodes=40)
     assert paired == pytest.approx(0.06)
-    for seeds in (5, 10, 30):
+    assert least_effect(sd, 2) == float("inf")  # two seeds show nothing
+    for seeds in (3, 5, 10, 30):
         least = least_effect(sd, seeds)
         assert seeds_needed(least + 1e-9, sd) == seeds
         assert seeds_needed(least - 1e-6, sd) == seeds + 1
@@ -174,6 +179,13 @@ def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
     (tmp_path / "s.toml").write_text(text.replace("effect = 0.05", "effect = 0.5"))
     assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
     assert "too small" not in capsys.readouterr().err
+    (tmp_path / "s.toml").write_text(text.replace("[0, 1, 2, 3]", "[0, 1]"))
+    assert main([*line, "--power"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Below 3 seeds there is no interval, so no difference is found." in said
+    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "with 2 seeds; below 3 seeds there is no interval; " in said
 
 
 def test_power_needs_a_contrast_and_a_spread(
@@ -226,3 +238,56 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
     assert places == sorted(places)
     assert "Treatment: mixture; what differs: `replay.logs_share`." in page
     assert "| **primary**: quotas against uniform | success_rare | 0.750 | 0.200 |" in page
+    assert "The primary contrast was named before the runs" in page
+    html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
+    assert "The primary contrast was named before the runs" in html
+
+
+def two_seeds(tmp_path: Path) -> dict[str, Any]:
+    """Of a study without a primary contrast, whose arms differ alike in both seeds."""
+    plan = study(tmp_path, STUDY.replace("[0, 1, 2, 3]", "[0, 1]").replace(PRIMARY, ""))
+    for job in plan.jobs:
+        level = 0.3 + 0.4 * job.seed + (0.1 if job.arm.name == "quotas" else 0.0)
+        make_run(job.path, document(job.seed), success=level)
+        add_evaluation(job.path, driven("agent", level, 12.0))
+        job.done.write_text(plan.fingerprint(job))
+    one, other = plan.study.arms
+    return findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
+
+
+def test_of_two_seeds_there_are_values_alone_and_the_pages_say_why(tmp_path: Path) -> None:
+    found = two_seeds(tmp_path)
+    (row,) = [row for row in found["contrasts"] if row["measure"] == "success_rare"]
+    assert row["difference"] == pytest.approx(0.1)
+    assert [row[name] for name in ("low", "high", "p", "p_holm")] == [None] * 4
+    for arm in found["arms"]:
+        assert all(value[1:] == [None, None] for value in arm.values() if isinstance(value, list))
+    html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
+    for page in (as_markdown(found), html):
+        assert "no interval: 2 seeds, at least 3 are needed" in page
+        assert "named before the runs; p" not in page
+        assert "None of these contrasts was named as primary before the runs" in page
+        assert "&lt; .001" not in page
+        assert "< .001" not in page
+    assert "**+0.100" not in as_markdown(found)
+
+
+def test_an_interval_of_an_arm_stays_in_the_range_of_its_measure(tmp_path: Path) -> None:
+    plan = study(tmp_path, STUDY.replace("[0, 1, 2, 3]", "[0, 1, 2]"))
+    for job in plan.jobs:
+        level = (0.0, 0.1, 1.0)[job.seed]
+        opposite = 1.0 - level if job.arm.name == "quotas" else level
+        make_run(job.path, document(job.seed), success=level)
+        add_evaluation(job.path, driven("agent", opposite, 12.0))
+        job.done.write_text(plan.fingerprint(job))
+    one, other = plan.study.arms
+    found = findings(plan, [compare(plan.runs(one), plan.runs(other), treatment="mixture")])
+    for row in found["arms"]:
+        assert row["success wheel_slip"][1:] == [0.0, 1.0]
+        assert row["bumps_per_km"][1] == 0.0
+        assert row["bumps_per_km"][2] > row["bumps_per_km"][0]
+    (row,) = [row for row in found["contrasts"] if row["measure"] == "success_rare"]
+    assert (row["low"], row["high"]) == (-1.0, 1.0)
+    for outcome in found["comparisons"][0]["outcomes"]:
+        if outcome["difference_low"] is not None:
+            assert -1 <= outcome["difference_low"] <= outcome["difference_high"] <= 1

@@ -33,6 +33,7 @@ from restock.train.comparison.comparability import (
 )
 from restock.train.evaluation.regression import LEAST_EPISODES, agent_episodes
 from restock.train.run.run import Run
+from restock.words import counted
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
@@ -156,7 +157,7 @@ def _outcome(
     a: F64,  # (runs, episodes, 2) success and return
     b: F64,
 ) -> dict[str, Any]:
-    difference = difference_of_arms(a[..., 0], b[..., 0])
+    difference = difference_of_arms(a[..., 0], b[..., 0]).within(-1.0, 1.0)
     missing = _why_no_interval(a, b, difference)
     # Episode by episode, over all pairs of runs.
     better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
@@ -189,9 +190,9 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
         return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
     if runs < LEAST_RUNS:
-        return f"{runs} run{'s' * (runs > 1)} an arm, at least {LEAST_RUNS} are needed"
+        return f"{counted(runs, 'run')} an arm, at least {LEAST_RUNS} are needed"
     if episodes < LEAST_EPISODES:
-        return f"{episodes} episode{'s' * (episodes > 1)}, at least {LEAST_EPISODES} are needed"
+        return f"{counted(episodes, 'episode')}, at least {LEAST_EPISODES} are needed"
     if difference.low == difference.high:
         return "every run ended every episode in the same way: nothing varies"
     return None

@@ -15,7 +15,8 @@ from restock.train.run.run import Run
 
 def learning_curves(arms: dict[str, Sequence[Path]]) -> list[dict[str, Any]]:
     """A row an arm, condition and periodic evaluation: mean success over its runs, and the 95 %
-    interval (Student's t over runs), None from one run. Runs that cannot be read are left out.
+    interval (Student's t over runs), None where `paired_t` has none. Runs that cannot be read are
+    left out.
 
     Partly and wholly blocked aisles count by half each, however many of each were drawn.
     """
@@ -26,14 +27,14 @@ def learning_curves(arms: dict[str, Sequence[Path]]) -> list[dict[str, Any]]:
             for key, success in _of_run(path).items():
                 values.setdefault(key, []).append(success)
         for (condition, step), found in sorted(values.items()):
-            interval, _ = paired_t(np.array(found))
+            interval = paired_t(np.array(found))[0].within(0.0, 1.0)
             known = not np.isnan(interval.low)
             rows.append(
                 {
                     **{"arm": arm, "condition": condition, "env_steps": step},
                     **{"runs": len(found), "success": interval.value},
-                    "low": max(interval.low, 0.0) if known else None,
-                    "high": min(interval.high, 1.0) if known else None,
+                    "low": interval.low if known else None,
+                    "high": interval.high if known else None,
                 }
             )
     return rows

@@ -66,11 +66,10 @@ class LoggedMissions:
     @property
     def text(self) -> str:
         """What they are, in a sentence."""
-        parts = [f"missions of the logs: {self.ways} of {self.logged} {self.source} can be driven"]
+        said = f"missions of the logs: {self.ways} of {self.logged} can be driven"
+        parts = [f"{said} ({self.source})"]
         parts += [f"{count} not: {why}" for why, count in self.left_out.items()]
-        parts += [
-            f"{count} have no room for {kind}" for kind, count in self.no_room.items() if count
-        ]
+        parts += [f"no room for {kind}: {count}" for kind, count in self.no_room.items() if count]
         return "; ".join(parts)
 
 

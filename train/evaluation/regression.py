@@ -25,6 +25,7 @@ from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
+from restock.words import counted
 
 AGENT = "agent"
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
@@ -203,7 +204,7 @@ def _too_few(episodes: Sequence[int]) -> str | None:
     """Why so many episodes of each condition are too few for an interval, or None."""
     total, least = sum(episodes), min(episodes)
     if total < LEAST_EPISODES:
-        return f"{total} episode{'s' * (total > 1)}, at least {LEAST_EPISODES} are needed"
+        return f"{counted(total, 'episode')}, at least {LEAST_EPISODES} are needed"
     if len(episodes) > 1 and least < LEAST_OF_A_KIND:
         return f"{least} of a condition, at least {LEAST_OF_A_KIND} are needed"
     return None

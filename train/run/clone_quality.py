@@ -10,6 +10,7 @@ import pyarrow as pa
 from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.train.run.run_tables import EVAL_CLONES
+from restock.words import counted
 
 FILE = Path("eval") / "clones.parquet"  # in a run
 
@@ -51,7 +52,8 @@ class CloneQuality:
         """What a reader must know of it, in a sentence or two."""
         said = (
             f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
-            f" ({self.rows:,} rows of {self.episodes:,} episodes)"
+            f" ({counted(self.rows, 'row')} of"
+            f" {counted(self.episodes, 'episode')})"
         )
         if self.agreement is not None:
             said += (

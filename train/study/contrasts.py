@@ -18,9 +18,10 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.stats import holm, paired_t
+from restock.stats import LEAST_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
+from restock.words import counted
 
 CELLS = {  # what a measure may name: condition and block
     "nominal": (("nominal", None),),
@@ -57,11 +58,12 @@ class Contrast:
     arm_mean: float
     baseline_mean: float
     difference: float
-    low: float | None  # of its 95 % interval, Student's t; None from one pair
+    low: float | None  # of its 95 % interval, Student's t; None: see `no_interval`
     high: float | None
     sd: float | None  # of the paired differences
     p: float | None  # of no difference
     p_holm: float | None = None  # adjusted for all contrasts that are not the primary one
+    no_interval: str | None = None  # why there is neither an interval nor a p
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -139,6 +141,7 @@ def contrast(
         return None
     ahead = values[:, 0] - values[:, 1]
     interval, p = paired_t(ahead)
+    interval = interval.within(-1.0, 1.0)  # each measure is a share
     return Contrast(
         arm,
         baseline,
@@ -152,7 +155,15 @@ def contrast(
         _known(interval.high),
         float(ahead.std(ddof=1)) if len(ahead) > 1 else None,
         _known(p),
+        no_interval=_why_no_interval(ahead),
     )
+
+
+def _why_no_interval(ahead: F64) -> str | None:
+    """What `paired_t` lacks in paired differences (n,), or None."""
+    if (seeds := len(ahead)) < LEAST_PAIRS:
+        return f"{counted(seeds, 'seed')}, at least {LEAST_PAIRS} are needed"
+    return "the same in every seed: nothing varies" if nothing_varies(ahead) else None
 
 
 def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:

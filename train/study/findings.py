@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from restock.stats import paired_t, paired_t_power
+from restock.stats import LEAST_PAIRS, paired_t, paired_t_power
 from restock.train.comparison.compare import Comparison
 from restock.train.comparison.curves import learning_curves, training_cost
 from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
 from restock.train.run.measures import cell_name
 from restock.train.study import power as study_power
 from restock.train.study.contrasts import Contrast, RunCurve, contrast, with_holm
-from restock.train.study.power import LEAST_PAIRS, Power
+from restock.train.study.power import Power
 from restock.train.study.study import DONE, ArmConfig, StudyPlan
 
 # Columns of the table of arms, besides success by cell.
 SAFETY = ("bumps_per_km", "closest_person_m", "time_lost_s", "discounted_return")
+NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
@@ -115,7 +117,7 @@ def power_of(plan: StudyPlan) -> Power | None:
 
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
     """A row an arm and reference: success by cell, and safety and return in the rare missions,
-    unperturbed; each [mean, low, high] over the seeds, or the mean alone."""
+    unperturbed; each [mean, low, high] over the seeds, the ends None where `paired_t` has none."""
     planner_s, references = _references(plan)
     rows = []
     for arm in plan.study.arms:
@@ -200,10 +202,17 @@ def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None
     for name in dict.fromkeys(name for run in runs for name in run):
         values = np.array([run[name] for run in runs if not np.isnan(run.get(name, np.nan))])
         if len(values):
-            interval, _ = paired_t(values)
+            interval = paired_t(values)[0].within(*_range(name))
             ends = [interval.low, interval.high]
             found[name] = [interval.value, *(None if np.isnan(end) else end for end in ends)]
     return found
+
+
+def _range(name: str) -> tuple[float, float]:
+    """What a measure of `_measured` can be."""
+    if name.startswith("success "):
+        return 0.0, 1.0
+    return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf
 
 
 def _mean(values: Sequence[float | None]) -> float:

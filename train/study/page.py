@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from restock.stats import interval_text
+from restock.stats import LEAST_PAIRS, interval_text, no_interval_text, which_adjusted
 from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS
 from restock.train.study.findings import SAFETY
 
@@ -35,8 +35,13 @@ def power_sentence(power: dict[str, Any]) -> str:
         f"Power: {power['measure']} of {power['arm']} against {power['baseline']}, {power['seeds']}"
         f" seeds, paired differences of standard deviation {power['sd']:.3f}"
         f" ({power['spread_from']})."
-        f" A true difference of {power['least_effect']:.3f} is found with a probability of .8."
     )
+    if power["least_effect"] is None:
+        text += f" Below {LEAST_PAIRS} seeds there is no interval, so no difference is found."
+    else:
+        text += (
+            f" A true difference of {power['least_effect']:.3f} is found with a probability of .8."
+        )
     if power["effect"] is not None:
         text += f" One of {power['effect']:g} is found with {power['power']:.2f}"
         needed = power["seeds_needed"]
@@ -51,8 +56,8 @@ def _contrasts(contrasts: list[dict[str, Any]], rare: list[str]) -> list[str]:
         *("", "## Contrasts", ""),
         "Paired by seed, with Student's t interval of 95 % over seeds. `auc` is the area under the"
         " curve of success over environment steps, `success` the kept policy's at the end, `rare`"
-        f" the mean of {', '.join(rare).replace('_', ' ')}. The primary contrast was named before"
-        " the runs; p of the others is adjusted for their number (Holm).",
+        f" the mean of {', '.join(rare).replace('_', ' ')}. "
+        + which_adjusted(any(row["primary"] for row in contrasts)),
         "",
         "| | measure | arm | baseline | difference | seeds | p | p adjusted |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -61,11 +66,12 @@ def _contrasts(contrasts: list[dict[str, Any]], rare: list[str]) -> list[str]:
         name = f"{row['arm']} against {row['baseline']}"
         p = row["p"] if row["primary"] else row["p_holm"]
         apart = "**" if p is not None and p < 0.05 else ""
-        interval = f" [{row['low']:+.3f}, {row['high']:+.3f}]" if row["low"] is not None else ""
+        difference = interval_text(row["difference"], row["low"], row["high"], "+.3f")
+        why = no_interval_text(row.get("no_interval"))
         lines.append(
             f"| {f'**primary**: {name}' if row['primary'] else name} | {row['measure']}"
             f" | {row['arm_mean']:.3f} | {row['baseline_mean']:.3f}"
-            f" | {apart}{row['difference']:+.3f}{interval}{apart} | {row['pairs']}"
+            f" | {apart}{difference}{apart}{why} | {row['pairs']}"
             f" | {_p(row['p'])} | {'' if row['primary'] else _p(row['p_holm'])} |"
         )
     return lines
@@ -86,7 +92,8 @@ def _arms(arms: list[dict[str, Any]]) -> list[str]:
     lines = [
         *("", "## Success and safety at the end", ""),
         "Of the kept policies on the unperturbed episodes, means with 95 % over seeds; from bumps"
-        " on, in the rare missions. Time is lost against the planner, where both arrived.",
+        " on, in the rare missions. Time is lost against the planner, where both arrived. From"
+        f" fewer than {LEAST_PAIRS} seeds, and where all came to the same, there are values alone.",
         "",
         f"| | {' | '.join(heads)} |",
         f"| --- |{' --- |' * len(names)}",

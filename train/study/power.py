@@ -13,11 +13,10 @@ from typing import Annotated, Any
 
 import msgspec
 
-from restock.stats import paired_t_power
+from restock.stats import LEAST_PAIRS, paired_t_power
 from restock.toml import Checked
 
 ENOUGH = 0.8
-LEAST_PAIRS = 3  # finished runs of both arms that tell the spread
 MOST_SEEDS = 1000
 SUCCESS = 0.7  # that the noise of episodes is reckoned at
 
@@ -54,7 +53,8 @@ class Power:
         return self.power is not None and self.power < ENOUGH
 
     def as_json(self) -> dict[str, Any]:
-        return {**asdict(self), "too_small": self.too_small}
+        least = self.least_effect if math.isfinite(self.least_effect) else None
+        return {**asdict(self), "least_effect": least, "too_small": self.too_small}
 
 
 def spread(config: PowerConfig, *, at_end: bool, kinds: int, episodes: int) -> tuple[float, str]:
@@ -74,10 +74,11 @@ def spread(config: PowerConfig, *, at_end: bool, kinds: int, episodes: int) -> t
 
 
 def least_effect(sd: float, seeds: int) -> float:
-    """The least true difference that is found with a probability of `ENOUGH`."""
+    """The least true difference that is found with a probability of `ENOUGH`; infinity below
+    `LEAST_PAIRS` seeds, which find none."""
     from scipy.optimize import brentq
 
-    if seeds < 2:
+    if seeds < LEAST_PAIRS:
         return float("inf")
     most = sd
     while paired_t_power(most, sd, seeds) < ENOUGH:
@@ -87,7 +88,7 @@ def least_effect(sd: float, seeds: int) -> float:
 
 def seeds_needed(effect: float, sd: float) -> int | None:
     """The fewest seeds that find an effect with a probability of `ENOUGH`."""
-    tried = range(2, MOST_SEEDS + 1)
+    tried = range(LEAST_PAIRS, MOST_SEEDS + 1)
     place = bisect_left(tried, ENOUGH, key=lambda seeds: paired_t_power(effect, sd, seeds))
     return tried[place] if place < len(tried) else None
 
@@ -99,11 +100,16 @@ def warning(power: Power) -> str:
         if power.seeds_needed
         else ("no number of seeds would be enough")
     )
+    least = (
+        f"the least effect that they find with a probability of {ENOUGH:g} is"
+        f" {power.least_effect:.3f}"
+        if math.isfinite(power.least_effect)
+        else f"below {LEAST_PAIRS} seeds there is no interval"
+    )
     return (
         f"the study is too small for its contrast: {power.measure} of {power.arm} against"
         f" {power.baseline}, a difference of {power.effect:g} is found with a probability of"
-        f" {power.power:.2f} with {power.seeds} seeds; the least effect that they find with a "
-        f"probability of {ENOUGH:g} is {power.least_effect:.3f}; {more}"
+        f" {power.power:.2f} with {power.seeds} seeds; {least}; {more}"
     )
 
 

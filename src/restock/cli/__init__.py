@@ -125,15 +125,20 @@ def _dispatch(args: list[str]) -> int:
     import tyro
 
     from restock.cli.command_line import prepared
+    from restock.cli.help import printed
 
+    asked = bool({"-h", "--help"} & set(args))
     try:
-        parsed = tyro.cli(
-            prepared(command_of(verb), explained=bool({"-h", "--help"} & set(args))),
-            prog=f"restock {verb}",
-            args=_without_ros(args[1:]) if verb == "node" else args[1:],
-            use_underscores=False,
-            config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
-        )
+        command = prepared(command_of(verb), explained=asked)
+        with printed(help_asked=asked):
+            parsed = tyro.cli(
+                command,
+                prog=f"restock {verb}",
+                description=command.__doc__ if asked else None,
+                args=_without_ros(args[1:]) if verb == "node" else args[1:],
+                use_underscores=False,
+                config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
+            )
     except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
     code: int | None = parsed.run()

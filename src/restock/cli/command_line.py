@@ -21,6 +21,14 @@ _EXPLAINED: list[type[Any]] = []
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
+@dataclasses.dataclass(frozen=True)
+class Names:
+    """In a field's annotation: the names it takes, for the completion of a shell. Others than
+    these are refused by the verb, or are files."""
+
+    names: tuple[str, ...]
+
+
 def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     """The dataclass with its types written so that its help is plain and its parsing quick.
 
@@ -40,6 +48,7 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     if explained and command not in _EXPLAINED:
         _EXPLAINED.append(command)
         texts = _texts(command)
+        command.__doc__ = _joined(inspect.getdoc(command) or "")
         for field in dataclasses.fields(command):
             for job in _jobs_in(field.type):
                 prepared(job, explained=True)
@@ -62,6 +71,12 @@ def _texts(command: type[Any]) -> dict[str, str]:
             ):
                 texts[name] = " ".join(text.split())
     return texts
+
+
+def _joined(text: str) -> str:
+    """A docstring with each paragraph in one line; what it indents, such as examples, stays."""
+    paragraphs = text.split("\n\n")
+    return "\n\n".join(one if one.startswith(" ") else " ".join(one.split()) for one in paragraphs)
 
 
 def _jobs_in(hint: Any) -> Iterator[type[Any]]:

@@ -9,9 +9,18 @@ import dataclasses
 import sys
 import typing
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
+
+from restock.cli.command_line import Names
+
+# option -> the folder of the TOML files whose names it takes; it takes files, too
+SHIPPED = {
+    "--mixture": ("restock.replay.mixture", "mixtures"),
+    "--profile": ("restock.ingest.profile", "profiles"),
+}
 
 
 class Words(NamedTuple):
@@ -63,9 +72,21 @@ def words_of(command: type[Any]) -> Words:
             flag = "--no-" + flag[2:]
         if flag:
             options.append(flag)
+        names = next((extra.names for extra in extras if isinstance(extra, Names)), ())
         if literal is not None:
-            choices.setdefault(flag, tuple(map(str, typing.get_args(literal))))
+            names = tuple(map(str, typing.get_args(literal)))
+        if names := names or _shipped(flag):
+            choices.setdefault(flag, names)
     return Words(tuple(options), choices, jobs)
+
+
+def _shipped(flag: str) -> tuple[str, ...]:
+    """The names of the files that come with Restock and that an option takes."""
+    if flag not in SHIPPED:
+        return ()
+    package, folder = SHIPPED[flag]
+    names = (entry.name for entry in (files(package) / folder).iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
 
 
 def _is(hint: Any, origin: Any) -> bool:
@@ -167,7 +188,7 @@ def zsh() -> str:
             *_cases(verbs),
             "  esac",
             "  if [[ -n $choices ]]; then",
-            "    compadd -- ${=choices}",
+            "    compadd -- ${=choices} || _files",  # a name, or a file
             "  elif [[ $current == -* ]]; then",
             "    compadd -- ${=options}",
             "  elif ((CURRENT == place)) && [[ -n $first ]]; then",

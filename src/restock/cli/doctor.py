@@ -19,6 +19,7 @@ import tyro
 from restock import native
 from restock.errors import ExitCode, RestockError
 from restock.files import cores
+from restock.imports import install_command
 
 EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 FOR_DEVELOPERS = {"dev", "test", "site", "fuzz", "bench"}
@@ -107,8 +108,7 @@ def _packages() -> list[Finding]:
             installed, state = "not installed", "missing" if extra else "wrong"
         if state == "ok" and not wanted.contains(installed, prereleases=True):
             installed, state = f"{installed}, and {wanted} is needed", "wrong"
-        package = f"restock[{extra[1]}]" if extra else "restock"
-        remedy = "" if state == "ok" else f"pip install '{package}'"
+        remedy = "" if state == "ok" else install_command(extra[1] if extra else "")
         found.append(Finding(part, name, state, installed, remedy))
     return found
 

@@ -5,27 +5,21 @@ from __future__ import annotations
 import csv
 import json
 import math
-import re
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from restock.cli.table_layout import FAR, PIPE_WIDTH, Layout, Row, grouped, is_number
+from restock.cli.table_layout import cell as cell  # for those who print
 from restock.errors import visible
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-Row = Mapping[str, Any]
-
-
-PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
-FAR = 3  # columns between two columns of a table, where there is room
-NARROW = 8  # columns that a cell of long words is left with at least, on a narrow terminal
-SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, for who searches it
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
     **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),
@@ -38,13 +32,24 @@ _STYLES = {
 }
 
 
-def stdout() -> Console:
-    """The console for data. Prose is not wrapped when it is not a terminal."""
+@cache
+def _console_type() -> type[Console]:
+    """rich's console, which leaves it to `cli.main` what a closed pipe means (rich: exit 1)."""
     from rich.console import Console  # slow to import, and a count needs none
 
+    class PipedConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return PipedConsole
+
+
+def stdout() -> Console:
+    """The console for data. Prose is not wrapped when it is not a terminal."""
+    console = _console_type()
     if sys.stdout.isatty():
-        return Console(file=sys.stdout, highlight=False)
-    return Console(
+        return console(file=sys.stdout, highlight=False)
+    return console(
         file=sys.stdout, highlight=False, width=PIPE_WIDTH, soft_wrap=True, force_terminal=False
     )
 
@@ -56,9 +61,7 @@ def table_width() -> int:
 
 def stderr() -> Console:
     """The console for progress and messages."""
-    from rich.console import Console
-
-    return Console(file=sys.stderr, highlight=False)
+    return _console_type()(file=sys.stderr, highlight=False)
 
 
 def say(message: str) -> None:
@@ -127,14 +130,14 @@ def print_table(
     from rich.table import Table
 
     console, piped = stdout(), not sys.stdout.isatty()
-    layout = _Layout.piped(rows, names) if piped else _Layout.of(rows, names, console.width)
+    layout = Layout.piped(rows, names) if piped else Layout.of(rows, names, console.width)
     if piped:
         console.width = max(PIPE_WIDTH, layout.width())
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, layout.apart - 1, 0, 0))
     if layout.apart == FAR:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name, header, width in zip(names, layout.headers, layout.widths, strict=True):
-        numeric = any(_is_number(row[name]) for row in rows)
+        numeric = any(is_number(row[name]) for row in rows)
         table.add_column(
             header,
             justify="right" if numeric else "left",
@@ -155,84 +158,25 @@ def print_table(
     sys.stdout.write(text.strip("\n") + "\n")
 
 
+def print_parted(
+    rows: Sequence[Row],
+    columns: Sequence[str] | None = None,
+    *,
+    key: Sequence[str],
+    title: str | None = None,
+) -> None:
+    """A table, and where it is too wide others below it with the other columns, each with `key`."""
+    names = list(columns if columns is not None else rows[0] if rows else ())
+    for place, group in enumerate(grouped(rows, names, key, table_width())):
+        if place:
+            sys.stdout.write("\n")
+        print_table(rows, group, title=None if place else title)
+
+
 def print_wrapped(text: str) -> None:
     """A paragraph after an empty line, wrapped as tables are: to the terminal, or PIPE_WIDTH."""
     lines = textwrap.wrap(text, table_width(), break_on_hyphens=False, subsequent_indent="  ")
     stdout().print("\n".join(["", *lines]), markup=False, soft_wrap=True)
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """How a table is fitted into what is too narrow for it."""
-
-    apart: int  # columns between two columns
-    headers: Sequence[str]
-    widths: Sequence[int | None]
-
-    def width(self) -> int:
-        """Columns that it takes where every column's width is known, with its edges."""
-        return sum(width or 0 for width in self.widths) + self.apart * (len(self.widths) - 1) + 2
-
-    @classmethod
-    def piped(cls, rows: Sequence[Row], names: Sequence[str]) -> _Layout:
-        """For a file or a pipe: no word and no cell up to SHORT is cut, however wide that is."""
-        least, full = [], []
-        for name in names:
-            numeric = any(_is_number(row[name]) for row in rows)
-            texts = [name, *(cell(row[name]) for row in rows)]
-            full.append(_longest([line for text in texts for line in text.split("\n")]))
-            whole = _longest([text for text in texts if len(text.split()) == 1])
-            least.append(full[-1] if numeric else max(whole, min(full[-1], SHORT)))
-        room = PIPE_WIDTH - 2 - FAR * (len(names) - 1)
-        return cls(FAR, list(names), list(_filled(least, full, room)))
-
-    @classmethod
-    def of(cls, rows: Sequence[Row], names: Sequence[str], width: int) -> _Layout:
-        """As it is where it fits; closer, and with wrapped headers, where not."""
-        texts = [[cell(row[name]) for row in rows] for name in names]
-        lines = [[line for text in some for line in text.split("\n")] for some in texts]
-        full = [_longest([name, *some]) for name, some in zip(names, lines, strict=True)]
-        width -= 2  # its edges
-        if sum(full) + FAR * (len(names) - 1) <= width:
-            return cls(FAR, list(names), [None] * len(names))
-        least = []
-        for name, some in zip(names, lines, strict=True):
-            numeric = any(_is_number(row[name]) for row in rows)
-            cells = _longest(some if numeric else [word for line in some for word in line.split()])
-            least.append(max(cells, _longest(_parted(name, cells).split("\n"))))
-        for apart in (FAR, 2, 1):
-            if (room := width - apart * (len(names) - 1)) >= sum(least):
-                break
-        # Too narrow even so: the columns with the longest words give way.
-        for place in sorted(range(len(names)), key=lambda place: -least[place]):
-            least[place] -= max(min(sum(least) - room, least[place] - NARROW), 0)
-        widths = list(_filled(least, full, room))
-        headers = [_parted(name, width) for name, width in zip(names, widths, strict=True)]
-        return cls(apart, headers, widths)
-
-
-def _filled(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
-    """Widths between the least and what is wanted: the columns share the room that is left."""
-    widths = list(least)
-    while (left := room - sum(widths)) > 0:
-        short = [place for place, width in enumerate(widths) if width < full[place]]
-        if not short:
-            break
-        for place in short[:left]:
-            widths[place] += max(min(left // len(short), full[place] - widths[place]), 1)
-    return widths
-
-
-def _parted(name: str, width: int) -> str:
-    """A header as lines, parted at underscores and spaces; no narrower than its longest part."""
-    parts = re.findall(r"[^_ ]+[_ ]*|[_ ]+", name)
-    width = max([width, *(len(part.rstrip()) for part in parts)])
-    lines = [""]
-    for part in parts:
-        if lines[-1] and len(lines[-1] + part.rstrip()) > width:
-            lines.append("")
-        lines[-1] += part
-    return "\n".join(line.rstrip(" ") for line in lines)
 
 
 def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
@@ -246,13 +190,6 @@ def told(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]
     """The columns that any row has a value in, for tables whose columns often have none."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]
-
-
-def _longest(parts: Sequence[str]) -> int:
-    """Columns of the longest of some lines or words, as `cell` writes them."""
-    from rich.cells import cell_len
-
-    return max((cell_len(part.replace(r"\[", "[")) for part in parts), default=0)
 
 
 def _styled(text: str) -> str:
@@ -275,7 +212,7 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
 
 def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
     """A table for files and pipes, as `print_table` lays it out: a line a row, however wide."""
-    numeric = [any(_is_number(row[name]) for row in rows) for name in columns]
+    numeric = [any(is_number(row[name]) for row in rows) for name in columns]
     texts = [
         [cell(row[name]).replace(r"\[", "[").replace("\n", r"\n") for name in columns]
         for row in rows
@@ -304,25 +241,6 @@ def clock_cells(clock: Row | None) -> dict[str, str]:
     offset = None if clock is None else clock["offset_ns"]
     cells = ["" if offset is None else f"{offset * 1e-9:,.3f}", "" if clock is None else odd(clock)]
     return dict(zip(CLOCK_COLUMNS, cells, strict=True))
-
-
-def cell(value: Any) -> str:
-    """A value as a table shows it."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, int):
-        return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
-    if isinstance(value, list | tuple):
-        return ", ".join(cell(item) for item in value)
-    return visible(str(value), keep="\n\t").replace("[", r"\[")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 class Advance:

@@ -62,6 +62,7 @@ from restock.train.twin.calibration.segments import (
     whole_periods_s,
 )
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.words import counted
 
 Report = Callable[[str], None]
 
@@ -188,7 +189,8 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
     if len(chosen) < FEWEST_SEGMENTS:
         counts = {"held out": len(ordinary) - len(chosen), **left_out}
         raise StoreError(
-            f"{len(chosen)} segments of {config.horizon_s:g} s to fit, fewer than"
+            f"{counted(len(chosen), 'segment')} of {config.horizon_s:g} s to fit,"
+            " fewer than"
             f" {FEWEST_SEGMENTS} (of {len(segments)}:"
             f" {', '.join(f'{count} {reason}' for reason, count in counts.items())})",
             where=str(store.path),

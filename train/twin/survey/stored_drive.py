@@ -20,6 +20,7 @@ from restock.replay.store.store import Store
 from restock.train.twin.floors.placed import Drive
 from restock.train.twin.survey.logged_drives import COMPARED, logged_drives
 from restock.train.twin.survey.poses import Poses, Times
+from restock.words import counted
 
 _POSES = (
     "SELECT stamp_ns, logged_ns, pose_x_m, pose_y_m, pose_yaw_rad FROM transitions"
@@ -60,7 +61,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
             there = [_named(recording, rows, str(path))]
         identity, source, toml, _ = (there or rows)[0]
         alike = [row for row in rows if row[2] == toml]
-        said = f"poses of the rows of {len(alike)} recordings"
+        said = f"poses of the rows of {counted(len(alike), 'recording')}"
         everywhere = _poses(store, [row[0] for row in alike], said)
         profile = _profile(toml, source)
         names = {row[0]: row[1] or row[0] for row in alike[:COMPARED] if row[0] != identity}

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +16,8 @@ import tyro
 from restock.errors import ExitCode, RecordingError, visible
 
 NAMED = 10  # attachments, metadata records and their entries that are listed
+HEAD = 18  # bytes: the longest head of a zstd frame
+_MODE = re.compile(r"^\s*compression_mode:\s*[\"']?(\w*)", re.MULTILINE)
 LONGEST = 60  # characters of an entry's value that are shown
 
 
@@ -69,6 +75,7 @@ class InfoCommand:
                             clocks=self.clocks,
                             watch=advance.part,
                         )
+                        entry["compression"] = compression_of(entry, salvage=self.salvage)
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")
                     code = ExitCode.USAGE
@@ -83,13 +90,130 @@ class InfoCommand:
         return code
 
 
+def compression_of(entry: Mapping[str, Any], *, salvage: bool = False) -> dict[str, Any] | None:
+    """How rosbag2 compressed a described recording: `mode` (file or message), `format`, how many of
+    its files or messages, `stored_bytes`, and `plain_bytes` (None where messages do not say).
+
+    None where it compressed neither; MCAP chunks are another matter. Messages are looked at only
+    where there may be compressed ones: rosbag2's metadata says so, or there is no metadata.
+    """
+    from restock.ingest.containers.discover import kind_of
+
+    files = [Path(name) for name in entry["files"]]
+    packed = [file for file in files if kind_of(file) == "zstd"]
+    if packed:
+        return _document("file", map(_file_sizes, packed))
+    if not _may_have_messages(entry, files[0]):
+        return None
+    return _document("message", (size for file in files for size in _message_sizes(file, salvage)))
+
+
+def _may_have_messages(entry: Mapping[str, Any], file: Path) -> bool:
+    from restock.ingest.containers.discover import LARGEST_METADATA, METADATA
+
+    if entry["format"] == "ros1" or any(chunks["compression"] for chunks in entry["chunks"]):
+        return False
+    said = ""
+    with suppress(OSError), (file.parent / METADATA).open(encoding="utf-8", errors="replace") as it:
+        said = it.read(LARGEST_METADATA)
+    if said and (Path(entry["path"]).is_dir() or file.name in said):
+        return any(mode.upper() == "MESSAGE" for mode in _MODE.findall(said))
+    return entry["format"] == "rosbag2-sqlite3" or "rosbag2" in entry["metadata"]
+
+
+def _file_sizes(file: Path) -> tuple[int, int]:
+    """rosbag2 does not always know a file's size when it starts: then it is decompressed for it.
+    That was done once, to describe it: it is not implausibly large."""
+    import zstandard
+
+    from restock.ingest.containers.compression import BLOCK
+
+    with file.open("rb") as content:
+        size = _plain_size(content.read(HEAD))
+        if size is None:
+            content.seek(0)
+            decoder, size = zstandard.ZstdDecompressor().decompressobj(), 0
+            with suppress(zstandard.ZstdError):  # damaged: up to there
+                while not decoder.eof and (block := content.read(BLOCK)):
+                    size += len(decoder.decompress(block))
+    return file.stat().st_size, size
+
+
+def _message_sizes(file: Path, salvage: bool) -> Iterator[tuple[int, int | None]]:
+    """The compressed messages of a file; none where there is none among the first that are read."""
+    from restock.ingest.containers.discover import ZSTD_MAGIC, kind_of
+    from restock.ingest.containers.mcap_file import McapFile
+    from restock.ingest.containers.sqlite_file import open_sqlite
+
+    sqlite = kind_of(file) == "sqlite3"
+    storage = open_sqlite(file, salvage=salvage) if sqlite else McapFile(file, salvage=salvage)
+    with closing(storage):
+        for _, batch in storage.batches(list(storage.channels)):
+            payloads = [one for one in batch.payloads() if one.startswith(ZSTD_MAGIC)]
+            if not payloads:
+                return
+            yield from ((len(one), _plain_size(one[:HEAD])) for one in payloads)
+
+
+def _plain_size(head: bytes) -> int | None:
+    """What the head of a zstd frame says of its content, if it does."""
+    import zstandard
+
+    try:
+        size = zstandard.frame_content_size(head)
+    except zstandard.ZstdError:
+        return None
+    return size if size >= 0 else None
+
+
+def _document(mode: str, sizes: Iterable[tuple[int, int | None]]) -> dict[str, Any] | None:
+    every = list(sizes)
+    if not every:
+        return None
+    plain = [size for _, size in every if size is not None]
+    return {
+        "mode": mode,
+        "format": "zstd",
+        "number": len(every),
+        "stored_bytes": sum(stored for stored, _ in every),
+        "plain_bytes": sum(plain) if len(plain) == len(every) else None,
+    }
+
+
+def _size(count: int) -> str:
+    """Bytes, in MB; in kB where they are less than one."""
+    return f"{count / 1e6:.1f} MB" if count >= 999_950 else f"{count / 1e3:.1f} kB"
+
+
+def _share(stored: int, plain: int | None) -> str:
+    return f"{_size(stored)}, {stored / plain:.0%} of {_size(plain)}" if plain else _size(stored)
+
+
 def _packed(chunks: dict[str, Any]) -> str:
     """How a file's messages are packed, in a line."""
     stored, plain = chunks["stored_bytes"], chunks["plain_bytes"]
-    share = f", {stored / plain:.0%} of {plain / 1e6:.1f} MB" if chunks["compression"] else ""
     kind = chunks["compression"] or "not compressed"
     number = f"{chunks['chunks']:,} chunk{'s' if chunks['chunks'] != 1 else ''}"
-    return visible(f"{number}, {kind}: {stored / 1e6:.1f} MB{share if plain else ''}")
+    return visible(f"{number}, {kind}: {_share(stored, plain if chunks['compression'] else None)}")
+
+
+def _compressed(compression: dict[str, Any]) -> str:
+    """How rosbag2 compressed the recording, in a line."""
+    number = compression["number"]
+    what = f"{number:,} {compression['mode']}{'s' if number != 1 else ''}"
+    share = _share(compression["stored_bytes"], compression["plain_bytes"])
+    return f"{what} compressed with {compression['format']}: {share}"
+
+
+def _names(names: list[str]) -> str:
+    """Names, each once, and how often where it is more."""
+    counted = Counter(names)
+    listed = [
+        f"{name or '(unnamed)'}{f' ({count})' if count > 1 else ''}"
+        for name, count in counted.items()
+    ]
+    more = f" and {len(listed) - NAMED:,} more" if len(listed) > NAMED else ""
+    return ", ".join(listed[:NAMED]) + more
 
 
 def _qos(profile: dict[str, Any]) -> str:
@@ -123,7 +247,7 @@ def _print(entry: dict[str, Any]) -> None:
         f"{entry['messages']:,} messages",
         f"{entry['duration_s']:.1f} s" if entry["duration_s"] is not None else "",
         f"{entry['start']} to {entry['end']}" if entry["start"] else "",
-        f"{entry['size_bytes'] / 1e6:.1f} MB",
+        _size(entry["size_bytes"]),
     )
     sys.stdout.write("  ".join(part for part in about if part) + "\n")
     clock = output.CLOCK_COLUMNS if clocked else []
@@ -131,8 +255,11 @@ def _print(entry: dict[str, Any]) -> None:
     coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
     qos = ["offered QoS"] if any(row["offered QoS"] for row in rows) else []
     shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos]
+    if (compression := entry["compression"]) is not None:
+        sys.stdout.write(_compressed(compression) + "\n")
+    inside = "inside, " if compression is not None else ""
     for packed in entry["chunks"]:
-        sys.stdout.write(_packed(packed) + "\n")
+        sys.stdout.write(f"{inside}{_packed(packed)}\n")
     output.print_table(rows, shown)
     output.print_skipped({name: topic["skipped"] for name, topic in entry["topics"].items()})
     for what, names in (
@@ -140,9 +267,7 @@ def _print(entry: dict[str, Any]) -> None:
         ("metadata records", entry["metadata"]),
     ):
         if names:
-            more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
-            listed = ", ".join(name or "(unnamed)" for name in names[:NAMED])
-            sys.stdout.write(f"{what}, {len(names):,}: {listed}{more}\n")
+            sys.stdout.write(f"{what}, {len(names):,}: {_names(names)}\n")
     for said in entry["says"]:
         entries = list(said["entries"].items())
         pairs = [f"{name}={value[:LONGEST]}" for name, value in entries[:NAMED]]

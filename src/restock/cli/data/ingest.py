@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from restock.errors import ConfigError, ExitCode, RecordingError, RestockError
+from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.ingest.prepared import IngestResult
@@ -191,7 +192,9 @@ def show(outcome: IngestResult) -> None:
         markup=False,
         soft_wrap=True,
     )
-    episodes = f"{_count(row['transitions'], 'transition')} in {_count(row['episodes'], 'episode')}"
+    episodes = (
+        f"{counted(row['transitions'], 'transition')} in {counted(row['episodes'], 'episode')}"
+    )
     tags = in_words(row["tags"] or {})
     if outcome.status in ("unchanged", "tagged"):
         how = f"now with tags {tags or 'none'}, " if outcome.status == "tagged" else ""
@@ -215,7 +218,7 @@ def show(outcome: IngestResult) -> None:
     output.print_skipped({topic["topic"]: topic["reason"] for topic in used})
     if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
-        topics = _count(len(rest), "further topic")
+        topics = counted(len(rest), "further topic")
         console.print(f"{topics} ({sum(rest):,} messages): not used by the profile")
     if row["signals"]:
         output.print_table(
@@ -278,8 +281,8 @@ def show(outcome: IngestResult) -> None:
     for line in _unknown(row):
         console.print(line, markup=False, soft_wrap=True)
     console.print(
-        f"{_count(row['ticks'], 'tick')} = {_count(row['transitions'], 'transition')}"
-        f" + {_count(row['episode_ends'], 'episode end')}"
+        f"{counted(row['ticks'], 'tick')} = {counted(row['transitions'], 'transition')}"
+        f" + {counted(row['episode_ends'], 'episode end')}"
         f" + {sum(drop['count'] for drop in row['drops']):,} dropped"
     )
     if row["drops"]:
@@ -301,7 +304,3 @@ def _unknown(row: Mapping[str, Any]) -> list[str]:
     for one in row["unknown_conditions"] or []:
         by_reason.setdefault(one["because"], []).append(one["condition"])
     return [f"unknown (null, {why}): {', '.join(names)}" for why, names in by_reason.items()]
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"

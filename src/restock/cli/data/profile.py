@@ -5,21 +5,24 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RecordingError
+from restock.errors import ConfigError, ExitCode, RecordingError, visible
 from restock.files import write_text
+from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.ingest.containers.recording import Recording
     from restock.ingest.prepared import IngestResult
     from restock.ingest.profile.profile import Profile
+    from restock.ingest.propose.drives import Drives
+    from restock.ingest.propose.kinds import RobotTraits
 
 OFTEN = 0.5  # of the transitions: a label that holds on more is worth a look
 
@@ -32,14 +35,16 @@ class ProfileCommand:
     clocks, frames and commanded speeds, with a comment at each guess. Fields that might become
     custom columns are listed, commented out. The profile is printed, or written to --out. For
     several recordings, or a folder of them, it proposes one profile for all recordings of one kind
-    of robot, and lists the others.
+    of robot, and lists the others. Of more than 12 recordings of that kind it reads the 12 largest,
+    and lists those that it did not read.
 
     `restock profile check PROFILE RECORDING` shows which inputs would be used, which are missing
     (and what the recording has instead), how many transitions would result, how many of them each
     condition would label, and what removes most rows, with advice. Nothing is written.
 
     Exit codes: `new` exits with 3 if the proposal cannot be used as it is (it is still written, and
-    says why); `check` exits with 2 if the profile does not fit.
+    says why), and `check` with 2 if the profile does not fit. Both exit with 3 if data of a
+    recording was lost, or a recording could not be read; the output says what.
     """
 
     action: Annotated[Literal["new", "check"], tyro.conf.Positional]
@@ -71,8 +76,8 @@ class ProfileCommand:
     """Also read what is intact in damaged or truncated files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands", "kinds", "wheeled"}; `check`: {"inputs", "problems", "advice",
-    "outcome", …}."""
+    "problems", "advice", "commands", "kinds", "wheeled", "read", "unread", "unreadable", "losses"};
+    `check`: {"inputs", "problems", "advice", "inside_outline", "outcome", …}."""
 
     @property
     def _typestore(self) -> str | None:
@@ -94,39 +99,47 @@ class ProfileCommand:
     def _new(self) -> int:
         from restock.cli import output
         from restock.ingest.containers.discover import recordings_in
-        from restock.ingest.propose.drives import drives_to_read, propose_for_drives
+        from restock.ingest.propose.drives import names_of, propose_for_drives
         from restock.ingest.propose.evidence.footprint import parse_footprint
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
-        chosen, left_out = drives_to_read([r for path in self.paths for r in recordings_in(path)])
+        paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
+        drives, unreadable = self._drives(paths)
+        chosen = paths if drives is None else [drives.paths[one] for one in drives.read]
+        unread = [] if drives is None else drives.unread
         with ExitStack() as opened:
-            recordings = self._readable(chosen, opened)
+            recordings = [opened.enter_context(self._open(path)) for path in chosen]
             with output.progress("proposing", None) as advance:
                 for recording in recordings:
                     recording.watch = advance.part
                 proposal = propose_for_drives(
                     recordings,
                     re.sub(r"\W+", "_", stem).strip("_") or "robot",
+                    drives=drives,
                     footprint=footprint,
                     urdf=self.urdf,
                     odometry_as_command=self.odometry_as_command,
                     hindsight_goals=self.hindsight_goals,
                 )
-        if left_out:
+            losses = _losses(recordings, proposal.toml)
+        toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
+        if unread:
+            of = len(chosen) + len(unread)
             output.say(
-                f"reading the {len(chosen)} largest of {len(chosen) + left_out:,} recordings"
+                f"read the {len(chosen)} largest of {of:,} recordings of that kind of robot; "
+                f"not read: {names_of(unread)}"
             )
         if self.out is not None:
-            write_text(self.out, proposal.toml)
+            write_text(self.out, toml)
             rows = f"{proposal.transitions:,} transitions of {proposal.ticks:,} ticks"
             output.say(f"wrote {self.out}" + (f": {rows}" if proposal.ticks else ""))
         if self.json:
             output.print_json(
                 {
-                    "toml": proposal.toml,
+                    "toml": toml,
                     "missing": proposal.missing,
                     "signals": proposal.signals,
                     "ticks": proposal.ticks,
@@ -136,32 +149,55 @@ class ProfileCommand:
                     "commands": proposal.commands,
                     "kinds": [asdict(kind) for kind in proposal.kinds],
                     "wheeled": proposal.wheeled,
+                    "read": [str(path) for path in chosen],
+                    "unread": [str(path) for path in unread],
+                    "unreadable": [str(path) for path in unreadable],
+                    "losses": losses,
                 }
             )
         elif self.out is None:
-            sys.stdout.write(proposal.toml)
+            sys.stdout.write(toml)
         for each in proposal.advice:
             output.say(str(each))
+        for loss in losses:
+            output.say(f"lost: {loss}")
         for problem in proposal.problems:
             sys.stderr.write(f"restock: {', '.join(self.paths)}: cannot be used yet: {problem}\n")
         if self.out is not None and not proposal.problems:
             checking = shlex.join(["profile", "check", str(self.out), str(chosen[0])])
             output.say(f"next: restock {checking}")
-        return ExitCode.LOSSY if proposal.problems else ExitCode.OK
+        return ExitCode.LOSSY if proposal.problems or losses or unreadable else ExitCode.OK
 
-    def _readable(self, paths: Sequence[Path], opened: ExitStack) -> list[Recording]:
-        """The recordings that can be read; the others are named, where there is any."""
-        recordings, errors = [], []
+    def _drives(self, paths: Sequence[Path]) -> tuple[Drives | None, list[Path]]:
+        """Several recordings by their kind of robot, and those that cannot be read, which are
+        named; None for a single recording.
+
+        Raises:
+            RecordingError: none can be read.
+        """
+        from restock.cli import output
+        from restock.ingest.propose.drives import drives_by_kind
+        from restock.ingest.propose.kinds import robot_traits
+
+        if len(paths) == 1:
+            return None, []
+        traits: dict[Path, RobotTraits] = {}
+        unreadable: dict[Path, RecordingError] = {}
         for path in paths:
             try:
-                recordings.append(opened.enter_context(self._open(path)))
+                with (
+                    self._open(path) as recording,
+                    output.progress(f"which robot: {path.name}", None) as advance,
+                ):
+                    recording.watch = advance.part
+                    traits[path] = robot_traits(recording)
             except RecordingError as error:
-                errors.append(error)
-        if not recordings and errors:
-            raise errors[0]
-        for unread in errors:
-            sys.stderr.write(f"restock: left out of the proposal: {unread}\n")
-        return recordings
+                unreadable[path] = error
+        if unreadable and not traits:
+            raise next(iter(unreadable.values()))
+        for why in unreadable.values():
+            sys.stderr.write(f"restock: left out of the proposal: {why}\n")
+        return drives_by_kind([*traits], [*traits.values()]), [*unreadable]
 
     def _open(self, path: Path | str) -> Recording:
         from restock.cli import output
@@ -193,6 +229,7 @@ class ProfileCommand:
             output.print_table(inputs)
         outcome, code = None, ExitCode.OK
         advice: list[str] = []
+        inside: float | None = None
         if not problems:
             try:
                 with output.progress("checking", None) as advance:
@@ -205,11 +242,13 @@ class ProfileCommand:
                     )
             except RecordingError as error:
                 problems = [error.what]
-            advice = self._advice(profile, outcome)
+            advice, inside = self._advice(profile, outcome)
         if problems:
             code = ExitCode.USAGE
+        elif outcome is not None and outcome.lossy:
+            code = ExitCode.LOSSY
         if self.json:
-            document |= {"problems": problems, "advice": advice}
+            document |= {"problems": problems, "advice": advice, "inside_outline": inside}
             document["outcome"] = as_json(outcome) if outcome else None
             output.print_json(document)
         elif outcome is not None:
@@ -220,8 +259,11 @@ class ProfileCommand:
             sys.stderr.write(f"restock: {self.paths[1]}: {problem}\n")
         return code
 
-    def _advice(self, profile: Profile, outcome: IngestResult | None) -> list[str]:
-        """What of the profile removes most rows or labels most of them, and what to try."""
+    def _advice(
+        self, profile: Profile, outcome: IngestResult | None
+    ) -> tuple[list[str], float | None]:
+        """What of the profile removes most rows or labels most of them, and what to try; and at
+        what share of the ticks the lidar sees something inside the robot's outline."""
         from restock.cli import output
         from restock.ingest.propose.trial import try_profile
         from restock.ingest.steps.needs import as_recorded, read_topics
@@ -233,7 +275,9 @@ class ProfileCommand:
         ):
             recording.watch = advance.part
             as_read = as_recorded(profile, recording.topics)
-            trial = try_profile(as_read, read_topics(recording, as_read))
+            topics = read_topics(recording, as_read)
+            trial = try_profile(as_read, topics)
+            inside = None if trial.problem else _inside_outline(as_read, topics)
         lines = [str(each) for each in trial.advice]
         rows = outcome.manifest["transitions"] if outcome else 0
         lines += [
@@ -242,7 +286,44 @@ class ProfileCommand:
             for name, count in (outcome.conditions if outcome else {}).items()
             if name != NOMINAL and count > OFTEN * rows
         ]
-        return lines
+        return lines, inside
+
+
+def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
+    """What is missing of these recordings' files and of the topics that a profile takes: a line
+    each. Of a profile that cannot be used yet, of all topics that were read.
+
+    Topics are read one after the other, so that a count of a whole file would be of some alone.
+    """
+    from restock.ingest.profile.profile import parse_profile
+
+    topics = None
+    with suppress(ConfigError):
+        topics = parse_profile(toml, where="the proposal").topics
+    return [
+        visible(f"{recording.path}: {loss.topic or 'the file'}: {loss.reason}")
+        + (f" ({counted(n, 'message')})" if loss.topic and (n := loss.messages) else "")
+        for recording in recordings
+        for loss in recording.lost_messages
+        if loss.topic is None or topics is None or loss.topic in topics
+    ]
+
+
+def _inside_outline(profile: Profile, topics: Mapping[str, Any]) -> float | None:
+    """The share of usable ticks with a return of the lidar inside the robot's outline; None where
+    there is no lidar."""
+    from restock.ingest.steps.steps import steps_of
+
+    scan = profile.inputs.scan
+    if scan is None or scan.topic not in topics:
+        return None
+    steps = steps_of(profile, topics)
+    inside = [
+        clearance <= 0
+        for clearance, problem in zip(steps.signals["clearance_m"], steps.problem, strict=True)
+        if problem == ""
+    ]
+    return float(sum(inside) / len(inside)) if inside else None
 
 
 def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:

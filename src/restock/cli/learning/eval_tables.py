@@ -10,16 +10,12 @@ from restock.stats import interval_text
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
 
-_WIDE = 140  # columns of a terminal from which on the table of an evaluation has all of these
-_WIDER = ("discounted return", "people, least (mean) m", "lost s")
-
 
 def show_measures(rows: list[dict[str, Any]]) -> None:
-    """A table a perturbation: success, return and safety side by side, policies beneath each
-    other within a condition."""
-    from restock.cli.output import print_table, say, stdout
+    """A table a perturbation: success, return and safety, policies beneath each other within a
+    condition. Where it is too wide it is parted, so that no measure is left out."""
+    from restock.cli.output import print_parted, say
 
-    wide = stdout().width >= _WIDE
     for perturbation in dict.fromkeys(row["perturbation"] for row in rows):
         own = [row for row in rows if row["perturbation"] == perturbation]
         cells = list(dict.fromkeys(row["condition"] for row in own))
@@ -28,14 +24,11 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         if not any(row["held back"] for row in shown):
             for row in shown:
                 del row["held back"]
-        if not wide:
-            shown = [{k: v for k, v in row.items() if k not in _WIDER} for row in shown]
-        print_table(
+        print_parted(
             shown,
+            key=("condition", "policy"),
             title=f"perturbation {perturbation} [95 % over episodes]; time of the successful ones",
         )
-    if not wide:
-        say(f"not shown in {stdout().width} columns, only with --json: {', '.join(_WIDER)}")
     if not any(row["policy"] == "planner" for row in rows) and not any(
         row["time_lost_episodes"] for row in rows
     ):

@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import tyro
 
+from restock.cli.command_line import Names
+
 # name -> the files that it is of
 CONFIGS: Mapping[str, str] = {
     "train": "`restock train --config`",
@@ -34,7 +36,9 @@ class SchemaCommand:
     VS Code extension Even Better TOML). --out writes all schemas into a folder.
     """
 
-    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
+    name: Annotated[
+        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]"), Names(tuple(CONFIGS))
+    ] = None
     """The name of the config."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Write NAME.schema.json into this folder; without NAME, all schemas."""

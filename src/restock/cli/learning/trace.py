@@ -82,7 +82,9 @@ class TraceCommand:
                 return
             narrow = sys.stdout.isatty() and output.too_wide(listed)
             columns = _NARROW if narrow else None
-            output.print_table(listed, columns, title="audited rows, largest TD error first")
+            output.print_parted(
+                listed, columns, key=("row",), title="audited rows, largest TD error first"
+            )
             if narrow:
                 output.say("more columns are shown in a wider terminal, a file or a pipe")
             if listed:
@@ -202,7 +204,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
         )
         output.stdout().print()
     if origin.messages:
-        output.print_table(
+        output.print_parted(
             [
                 {
                     "input": message.input,
@@ -215,6 +217,7 @@ def _print_origin(origin: Origin, with_messages: bool) -> None:
                 }
                 for message in origin.messages
             ],
+            key=("input",),
             title="the messages from which it was made",
         )
     elif origin.topics:

@@ -44,6 +44,7 @@ class CoverageCommand:
         """Ask, print, and write the page."""
         from restock.cli import output
         from restock.errors import ConfigError
+        from restock.files import refuse_folder
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
 
@@ -51,6 +52,7 @@ class CoverageCommand:
             raise ConfigError(
                 "applies only to the page", where="--figures", remedy="give --out FILE, too"
             )
+        refuse_folder(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             if self.out is not None:

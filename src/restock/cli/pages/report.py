@@ -45,6 +45,7 @@ class ReportCommand:
 
     def run(self) -> int | None:
         from restock.errors import ConfigError
+        from restock.files import refuse_folder
         from restock.ingest.store.location import Location
         from restock.replay.store.store import is_store
         from restock.report import build_report, write_card, write_gap_page
@@ -63,6 +64,7 @@ class ReportCommand:
             else:
                 sys.stdout.write(markdown)
             return None
+        refuse_folder(self.out, "--out")
         with progress("report", None):
             if is_store(Location.of(self.run_directory)):
                 path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)

@@ -56,13 +56,15 @@ class CheckCommand:
         """Look at all of it, say what was found, and exit 1 where something fails."""
         from restock.cli import output
         from restock.cli.pipeline.findings import markdown
-        from restock.files import write_text
+        from restock.files import refuse_folder, write_text
         from restock.replay.store.audit import junit_suites
 
         if self.baseline is not None and self.run_dir is None:
             raise ConfigError(
                 "applies only to a run", where="--baseline", remedy="also give --run RUN"
             )
+        refuse_folder(self.junit, "--junit")
+        refuse_folder(self.summary, "--summary")
         parts = self._parts()
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = sum(one.status in failing for part in parts for one in part.findings)
@@ -100,7 +102,7 @@ class CheckCommand:
                 rows = compare_with_baseline(self.run_dir, self.baseline, margin=self.margin)
                 found = of_regression(rows, baseline=self.baseline)
             except RestockError as error:
-                found = refused("comparable", error)
+                found = refused("comparable", error, option=f"--baseline {self.baseline}")
             parts.append(Part("regression", found))
         return parts
 
@@ -114,7 +116,7 @@ class CheckCommand:
             with Store(path, version=version) as first, Store(self.store) as second:
                 return of_difference(diff_stores(first, second).document(), old=old)
         except RestockError as error:
-            return refused("comparable", error)
+            return refused("comparable", error, option=f"--against {old}")
 
     def _show(self, parts: list[Part]) -> None:
         from restock.cli import output

@@ -113,12 +113,13 @@ def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Find
     return found
 
 
-def refused(name: str, error: RestockError) -> list[Finding]:
-    """What could not be looked at, as a failure: a pipeline must not pass over it."""
+def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
+    """What could not be looked at, as a failure: a pipeline must not pass over it. `option` is the
+    one that asked for it, with its value."""
     row = {"what": error.what, "where": error.where or ""}
-    return [
-        _finding(name, "error", error.what, error.remedy or "correct it, or leave it out", [row])
-    ]
+    where = f"{error.where}: " if error.where and error.where not in option else ""
+    advice = error.remedy or f"correct {option.split()[0]}, or leave it out"
+    return [_finding(name, "error", f"{option}: {where}{error.what}", advice, [row])]
 
 
 def _finding(

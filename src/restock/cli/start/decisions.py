@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shlex
 from collections.abc import Collection
@@ -16,6 +17,7 @@ from restock.errors import ConfigError
 from restock.files import read_json
 
 if TYPE_CHECKING:
+    from restock.cli.start.start import StartCommand
     from restock.ingest.task.task import Task
 
 STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is made for
@@ -24,6 +26,9 @@ UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of
 INTERVALS = 20  # at least so many points of every curve
 BLOCKED = "blocked_aisle"
 DRIVERS = "behaviour_policies"  # of a row of the coverage
+INSIDE = 0.5  # of the ticks: with returns inside the outline at more, it is not the robot's
+NOT_AGAIN = ("paths", "out", "dry_run", "json")  # of a call: not what the way depends on
+OF_ONE_ROBOT = ("urdf", "footprint")
 
 
 def fullest(document: Document) -> str | None:
@@ -50,14 +55,19 @@ def edited(profile: Path | str | None, out: Path) -> bool:
     return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
 
 
-def several_kinds(kinds: list[Any], out: Path) -> Stop:
-    """Recordings of several kinds of robots: one call for each, the profile's own first."""
+def several_kinds(kinds: list[Any], asked: StartCommand) -> Stop:
+    """Recordings of several kinds of robots: one call for each, the profile's own first.
+
+    With the options that were given; what describes one robot is for the first kind alone.
+    """
+    out = asked.out
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
     told = [f"{len(kind['recordings'])} of {kind['robot']}" for kind in kinds]
-    calls = [
-        f"restock start {shlex.join(kind['recordings'])} --out {folder}"
-        for kind, folder in zip(kinds, folders, strict=True)
-    ]
+    calls = []
+    for kind, folder in zip(kinds, folders, strict=True):
+        options = _options(asked, but=() if folder == out else OF_ONE_ROBOT)
+        words = [*kind["recordings"], "--out", str(folder), *options]
+        calls.append(f"restock start {shlex.join(words)}")
     return Stop(
         f"these are recordings of {len(kinds)} kinds of robots, but a profile describes one kind: "
         f"{' | '.join(told)}",
@@ -65,11 +75,74 @@ def several_kinds(kinds: list[Any], out: Path) -> Stop:
     )
 
 
+def _options(asked: StartCommand, *, but: Collection[str]) -> list[str]:
+    """The options of a call that are not the default, as they are typed."""
+    words = []
+    for field in dataclasses.fields(asked):
+        value = getattr(asked, field.name)
+        if field.name in (*NOT_AGAIN, *but) or value == field.default:
+            continue
+        flag = f"--{field.name.replace('_', '-')}"
+        for one in value if isinstance(value, tuple) else (value,):
+            words += [flag] if one is True else [flag, str(one)]
+    return words
+
+
 def of_other_kinds(out: Path) -> list[str]:
-    """The recordings that the proposal in this folder is not for."""
+    """The recordings that the proposal in this folder is not for: those of other kinds of robots,
+    and those that it could not read."""
     proposed = out / FOLDER / "propose.json"
-    kinds = read_json(proposed).get("kinds", []) if proposed.is_file() else []
-    return [path for kind in kinds[1:] for path in kind["recordings"]]
+    document = read_json(proposed) if proposed.is_file() else {}
+    others = [path for kind in document.get("kinds", [])[1:] for path in kind["recordings"]]
+    return [*others, *document.get("unreadable", [])]
+
+
+def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bool) -> Stop | None:
+    """The lidar sees things inside the robot most of the time: its outline is not the robot's.
+
+    `proposed`: the profile is as it was proposed, and may be proposed again.
+    """
+    inside, task = checked.get("inside_outline"), _task(profile)
+    if task is None or inside is None or inside <= INSIDE:
+        return None
+    body = task.body
+    size = f"{body.length_m:g} x {body.width_m:g} m"
+    return Stop(
+        f"the robot's outline ({size}) is wrong: the lidar sees something inside it at "
+        f"{inside:.0%} of the ticks",
+        (
+            "measure the robot, and add --footprint LxW to this command"
+            if proposed
+            else f"measure the robot, edit length_m and width_m of [task.body] in {profile}, and "
+            "run the same command again",
+            "or add --accept to it, if the outline is right",
+        ),
+    )
+
+
+def not_live(profile: Path | str | None) -> str | None:
+    """Why the node refuses this profile on a robot, and which one it needs; None: it takes it."""
+    from restock.ingest.profile.profile import load_profile
+
+    if profile is None:
+        return None
+    loaded = load_profile(str(profile))
+    pose = loaded.inputs.pose
+    refused, topics, source = [], [], ""
+    if loaded.frames is not None:
+        refused, topics = ["its pose from transforms"], ["[inputs.pose]"]
+    elif pose is not None and pose.by_fix:
+        refused, topics = ["its pose from satellite fixes"], ["[inputs.pose]"]
+    if loaded.goal_source == "hindsight":
+        refused.append("its goals in hindsight")
+        topics += ["[inputs.goal]", "[inputs.plan]"]
+        source = ' with goal.source = "logged",'
+    if not refused:
+        return None
+    return (
+        f"the node on the robot refuses its profile, which takes {' and '.join(refused)}. Give the "
+        f"node a profile with the same [task],{source} and with topics under {', '.join(topics)}"
+    )
 
 
 def horizon(profile: Path | str | None) -> float:
@@ -258,10 +331,12 @@ __all__ = [
     "mistrust",
     "no_room",
     "no_ways",
+    "not_live",
     "of_other_kinds",
     "possible_kinds",
     "practice_settings",
     "robot_line",
     "several_kinds",
     "updates_settings",
+    "wrong_outline",
 ]

@@ -143,6 +143,7 @@ def tell(to: Settings, console: Console) -> None:
         print_table(rows)
         console.print(story.trained(to))
     show("Shares of conditions, before and after mixing", story.shelves(to.panel))
+    show("Failing before, arriving after: films", story.films(to))
     show("One rare event, from its message to an update", story.rare_event(to))
     show("What to try next", story.next_steps(to))
 
@@ -161,6 +162,7 @@ def plan_of(to: Settings) -> list[Stage]:
         stages.even_out(to),
         stages.evaluate_logs_alone(to),
         stages.evaluate_beside_uniform(to),
+        stages.film(to),
         stages.report(to),
     ]
 

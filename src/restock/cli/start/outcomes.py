@@ -34,7 +34,15 @@ def info(document: Document) -> list[str]:
 
 def propose(document: Document) -> list[str]:
     """What the proposed profile makes of the recording."""
-    lines = [f"{document['transitions']:,} transitions of {count(document['ticks'], 'tick')}"]
+    made, ticks = count(document["transitions"], "transition"), count(document["ticks"], "tick")
+    lines = [f"{made} of {ticks}"]
+    if unread := document.get("unread"):
+        read = len(document["read"])
+        lines[0] += f", by the {read} largest of {read + len(unread):,} recordings of this robot"
+    lines += _some(
+        [f"left out, as it cannot be read: {one}" for one in document.get("unreadable", [])]
+    )
+    lines += _some([f"lost: {loss}" for loss in document.get("losses", [])])
     lines += [f"to consider: `{each['key']}`: {each['text']}" for each in document["advice"]]
     return lines
 
@@ -44,10 +52,9 @@ def check(document: Document) -> list[str]:
     lines = [*document["problems"]]
     if (outcome := document["outcome"]) is None:
         return lines
-    lines.append(
-        f"{outcome['transitions']:,} transitions in {count(outcome['episodes'], 'episode')} of"
-        f" {_time(outcome['duration_s'])}"
-    )
+    made = count(outcome["transitions"], "transition")
+    episodes = count(outcome["episodes"], "episode")
+    lines.append(f"{made} in {episodes} of {_time(outcome['duration_s'])}")
     missing = [f"{item['input']} ({item['instead']})" for item in outcome["stand_ins"]]
     shown = [line for line in missing if line.split()[0] in _TELLING]
     if shown:

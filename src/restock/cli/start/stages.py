@@ -55,6 +55,7 @@ def check(to: Settings, recording: str) -> Stage:
         "would result.",
         ["profile", "check", str(to.profile), recording, *to.reading],
         reads=to.profile_file,
+        expected=(0, 3),  # 3: data was lost, which ingest says of all recordings
         outcome=outcomes.check,
     )
 
@@ -300,8 +301,8 @@ def evaluate_logs_alone(to: Settings) -> Stage:
         "Evaluate the policy from the logs alone",
         "On the missions that the fine-tuned one drives next.",
         [
-            *("eval", str(to.logs_alone), "--episodes", str(to.episodes)),
-            *("--policies", "agent", "--perturbations", "none"),
+            *("eval", str(to.run), "--episodes", str(to.episodes)),
+            *("--policies", from_logs_alone(to), "--perturbations", "none"),
         ],
     )
 
@@ -316,6 +317,20 @@ def evaluate_beside_uniform(to: Settings) -> Stage:
         " policy, clean and with less friction and more latency than in training.",
         command=[*alone.command, "--policies", policies],
     )
+
+
+def film(to: Settings) -> Stage:
+    return Stage(
+        "film",
+        "Film failures, and missions that only the fine-tuned policy completes",
+        "Episodes of the evaluation, driven again: failing before on the left, and after.",
+        [*("eval", str(to.run), "--no-drive", "--video"), *("--policies", "agent")],
+    )
+
+
+def from_logs_alone(to: Settings) -> str:
+    """The policy from the logs alone, as evaluations name it."""
+    return f"run:{to.logs_alone}"
 
 
 def fed_uniformly(to: Settings) -> str:

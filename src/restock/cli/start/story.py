@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.cli.start.settings import Settings
-from restock.cli.start.stages import fed_uniformly
+from restock.cli.start.stages import fed_uniformly, from_logs_alone
 from restock.stats import wilson
 
 if TYPE_CHECKING:
@@ -48,18 +48,14 @@ def before_and_after(to: Settings) -> list[dict[str, str]]:
     """
     from restock.train.run.kept_evaluations import read_evaluations
 
-    before, after = read_evaluations(to.logs_alone), read_evaluations(to.run)
+    rows = read_evaluations(to.run).to_pylist()
     driven = {
-        name: [
-            row
-            for row in table.to_pylist()
-            if row["policy"] == policy and row["perturbation"] == "none"
-        ]
-        for name, table, policy in (
-            ("logs alone", before, "agent"),
-            ("fed uniformly", after, fed_uniformly(to)),
-            ("fine-tuned", after, "agent"),
-            ("planner", after, "planner"),
+        name: [row for row in rows if row["policy"] == policy and row["perturbation"] == "none"]
+        for name, policy in (
+            ("logs alone", from_logs_alone(to)),
+            ("fed uniformly", fed_uniformly(to)),
+            ("fine-tuned", "agent"),
+            ("planner", "planner"),
         )
     }
     if not driven["fed uniformly"]:
@@ -125,6 +121,15 @@ def shelves(panel: Path) -> list[str]:
             f"  {stratum.share:>10.1%}  {bar}".rstrip()
         )
     return [*lines, "█ as in the logs   ▒ added by the quota   · removed by the quota"]
+
+
+def films(to: Settings) -> list[str]:
+    """Where the films are that show who failed beside the fine-tuned policy."""
+    from restock.train.evaluation.film import FOLDER
+
+    found = sorted((to.run / FOLDER).glob("*-rescue.webp"))
+    told = ["The policy that failed is on the left; the report shows them, too."] if found else []
+    return [*map(str, found), *told]
 
 
 def rare_event(to: Settings) -> list[str]:
@@ -242,4 +247,13 @@ def next_steps(to: Settings) -> list[str]:
     ]
 
 
-__all__ = ["OPENING", "RARE", "before_and_after", "next_steps", "rare_event", "shelves", "trained"]
+__all__ = [
+    "OPENING",
+    "RARE",
+    "before_and_after",
+    "films",
+    "next_steps",
+    "rare_event",
+    "shelves",
+    "trained",
+]

@@ -25,6 +25,7 @@ from restock.cli.start.decisions import (
     robot_line,
     several_kinds,
     updates_settings,
+    wrong_outline,
 )
 from restock.cli.start.outcomes import count
 from restock.cli.start.settings import Settings
@@ -108,15 +109,17 @@ class Way:
         asked, to = self.asked, self.to
         recording = fullest({"recordings": readable}) or asked.paths[0]
         own = asked.profile is not None
-        if not own and not edited(to.profile, asked.out):
+        proposed = not own and not edited(to.profile, asked.out)
+        if proposed:
             self._propose(asked.paths if len(readable) > 1 else (recording,))
         elif asked.urdf is not None or asked.footprint is not None:
             self._warn(
                 f"{to.profile} was edited: --urdf and --footprint apply only to a proposed "
                 "profile, and have no effect"
             )
-        if others := [] if own or self.work.plan else of_other_kinds(asked.out):
-            mine = [row for row in readable if row["path"] not in others]
+        others = [] if own or self.work.plan else of_other_kinds(asked.out)
+        mine = [row for row in readable if row["path"] not in others]
+        if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
             recording = fullest({"recordings": mine}) or recording
         checked = self.work.do(stages.check(to, recording))
@@ -127,6 +130,9 @@ class Way:
                 f"edit {to.profile}{known if len(readable) > 1 else ''}",
                 self.again,
             )
+        outline = wrong_outline(checked.document, to.profile, proposed=proposed)
+        if outline is not None and not asked.accept:
+            raise Stopped(outline.why, *outline.remedies)
         if not self.work.plan:
             self.work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
 
@@ -156,7 +162,7 @@ class Way:
         if asked.accept:
             return
         if kinds := document.get("kinds"):
-            stop = several_kinds(kinds, asked.out)
+            stop = several_kinds(kinds, asked)
             raise Stopped(stop.why, *stop.remedies)
         if driving := document.get("commands", []):
             raise Stopped(
@@ -277,7 +283,7 @@ class Way:
         else:
             self.work.say(
                 "\n[yellow]These logs are too short to hold any of them out, so the policy cannot "
-                "be evaluated. Ingest more recordings.[/]"
+                f"be evaluated{'' if floor is None else ' on logs'}. Ingest more recordings.[/]"
             )
         if not do(stages.report(to)).good:
             raise Stopped("there is no report", self.again)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.words import counted
+
 if TYPE_CHECKING:
     from restock.ingest.task.robot import Robot
     from restock.train.twin.calibration.fitted_twin import FittedTwin
@@ -164,7 +166,8 @@ def _show(fit: FittedTwin) -> None:
         for item in fit.estimates
     ]
     title = (
-        f"{', '.join(fit.recordings)}  {fit.segments} segments of {fit.clusters} clusters"
+        f"{', '.join(fit.recordings)}  {counted(fit.segments, 'segment')} of "
+        f"{counted(fit.clusters, 'cluster')}"
         f"  timestep {fit.timestep_s:g} s"
     )
     output.print_table(rows, title=title)
@@ -199,4 +202,6 @@ def _show(fit: FittedTwin) -> None:
 
 def _count(reason: str, count: int) -> str:
     kind, _, of_steps = reason.partition("steps: ")
-    return f"{count:,} segments {kind}" if kind else f"{count:,} steps ({of_steps})"
+    return (
+        f"{counted(count, 'segment')} {kind}" if kind else f"{counted(count, 'step')} ({of_steps})"
+    )

@@ -16,6 +16,7 @@ from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 from restock.report.fleet.drift import findings_section
 from restock.report.fleet.drift import headline as drift_headline
+from restock.report.fleet.shopping import amount, shopping_section, to_log
 from restock.report.look import charts, floor_map
 from restock.report.look.blocks import (
     Drawing,
@@ -28,10 +29,10 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.look.queries import ask, statements
+from restock.words import counted, plural
 
 MOST_DOTS = 1500
 MOST_CELLS_ACROSS = 90  # of the map
-MOST_GAPS = 20  # in the table
 PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
 
 
@@ -63,13 +64,20 @@ def coverage_page(
     (totals,) = found["totals"]
     sections = [
         _shelves(found["shelves"]),
-        _shopping(gaps),
+        shopping_section(gaps),
         _weeks(found["weeks"]),
         _robots(found["robots"]),
         _map(found),
         _drift(drift),
     ]
-    plan = gaps["plan"]
+    robots = {row["robot"] for row in found["robots"]}
+    numbers = {
+        "transition": totals["rows"],
+        "episode": totals["episodes"],
+        "recording": totals["recordings"],
+        "robot": len(robots),
+        "gap": len(gaps["gaps"]),
+    }
     return {
         "kicker": "coverage of a store",
         "title": f"Coverage of {gaps['store']}",
@@ -77,16 +85,8 @@ def coverage_page(
         "lead": f"How much of each condition the logs hold, and what mixture {gaps['mixture']} "
         "and the audits ask for and do not find.",
         "cards": [
-            {"value": count(totals["rows"]), "label": "transitions"},
-            {"value": count(totals["episodes"]), "label": "episodes"},
-            {"value": count(totals["recordings"]), "label": "recordings"},
-            {"value": count(len({row["robot"] for row in found["robots"]})), "label": "robots"},
-            {"value": count(len(gaps["gaps"])), "label": "gaps"},
-            {
-                "value": _amount(plan["total"]),
-                "label": f"{gaps['unit']} to log next (95 %: {_amount(plan['total_low'])} to"
-                f" {_amount(plan['total_high'])})",
-            },
+            *({"value": count(n), "label": plural(n, noun)} for noun, n in numbers.items()),
+            to_log(gaps),
         ],
         "sections": [section for section in sections if section is not None],
         "footer": f"restock {__version__} · written {datetime.now(UTC):%Y-%m-%d %H:%M} UTC from"
@@ -116,8 +116,8 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     plan = gaps["plan"]
     if plan["orders"]:
         text += (
-            f"; {_amount(plan['total'])} {gaps['unit']} [{_amount(plan['total_low'])}, "
-            f"{_amount(plan['total_high'])}] would fill the gaps that can be filled"
+            f"; {amount(plan['total'])} {gaps['unit']} [{amount(plan['total_low'])}, "
+            f"{amount(plan['total_high'])}] would fill the gaps that can be filled"
         )
     return text.removeprefix("; ")
 
@@ -194,66 +194,6 @@ def _bars(rows: Rows) -> Drawing:
     return charts.draw(chart)
 
 
-def _shopping(gaps: dict[str, Any]) -> Section:
-    unit, plan = gaps["unit"], gaps["plan"]
-    if gaps["closed"]:
-        return Section("shopping", "What to log next", intro="Nothing: there are no gaps.")
-    orders = [
-        {
-            "kind": words(order["kind"] or "logging"),
-            "zone": words(order["zone"] or ""),
-            "robot": order["robot"] or "",
-            **({"missions": count(order["missions"])} if unit == "missions" else {}),
-            "hours": f"{order['hours']:.2f}",
-            "fills": "; ".join(words(name) for name in dict.fromkeys(order["fills"])),
-        }
-        for order in plan["orders"]
-    ]
-    ordered = sorted(gaps["gaps"], key=lambda gap: gap["there"] / max(gap["needed"], 1))
-    table = [
-        {
-            "gap": words(gap["cell"]),
-            "there": count(gap["there"]),
-            "needed": count(gap["needed"]),
-            "of": gap["counted"],
-            unit: ""
-            if gap["amount"] is None
-            else f"{_amount(gap['amount'])} [{_amount(gap['amount_low'])},"
-            f" {_amount(gap['amount_high'])}]",
-            "best": "no rate is known" if gap["best"] is None else words(gap["best"]),
-            "asked by": gap["asked_by"],
-        }
-        for gap in ordered[:MOST_GAPS]
-    ]
-    left = len(gaps["gaps"]) - len(table)
-    return Section(
-        "shopping",
-        "What to log next",
-        intro=f"The least number of {unit} that fills every gap with {gaps['confidence']:.0%},"
-        " at the rates of the store's own episodes; intervals are 95 %. `restock gaps"
-        " --missions-out FILE` writes it as missions to drive.",
-        tables=[
-            Table(_without_empty(orders), {"missions", "hours"}, title="What to drive"),
-            Table(
-                table,
-                {"there", "needed", unit},
-                title="What is missing",
-                caption=f"{left:,} more gaps: `restock gaps --json` has all." if left else "",
-            ),
-        ],
-    )
-
-
-def _without_empty(rows: Rows) -> Rows:
-    """Without the columns that say nothing in any row."""
-    told = {name for row in rows for name, value in row.items() if value != ""}
-    return [{name: value for name, value in row.items() if name in told} for row in rows]
-
-
-def _amount(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
-
-
 def _weeks(rows: Rows) -> Section | None:
     if not rows:
         return None
@@ -283,7 +223,7 @@ def _weeks(rows: Rows) -> Section | None:
     return Section(
         "weeks",
         "When was it logged?",
-        intro=f"Rows by week of logging (Mondays), {weeks} week{'s' * (weeks != 1)}.",
+        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}.",
         figures=[Figure(charts.draw(chart), "Rows by week")],
         two=True,
     )
@@ -299,9 +239,7 @@ def _robots(rows: Rows) -> Section | None:
         charts.WORDS_COLOURS,
     )
     cells = {(row["robot"], words(row["condition"])): row for row in rows}
-    hours = {
-        robot: sum(row["hours"] or 0.0 for row in rows if row["robot"] == robot) for robot in robots
-    }
+    hours = {row["robot"]: row["hours"] or 0.0 for row in rows}
     table = [
         {
             "robot": robot,

@@ -7,13 +7,14 @@ FROM coverage_by_condition;
 
 -- name: weeks
 -- A condition's part of a week's rows, over all robots.
-SELECT week, condition, CAST(sum(rows) AS BIGINT) AS rows, sum(hours) AS hours
+SELECT week, condition, CAST(sum(rows) AS BIGINT) AS rows
 FROM coverage_by_week
 WHERE rows > 0
 GROUP BY week, condition
 ORDER BY week, condition;
 
 -- name: robots
+-- Hours are the robot's, over all conditions: the same in each of its rows.
 SELECT coalesce(robot, 'untagged') AS robot, condition, rows, share, hours
 FROM coverage_by_robot
 WHERE rows > 0

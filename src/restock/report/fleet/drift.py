@@ -19,6 +19,7 @@ from restock.report.fleet.drift_signals import (
 )
 from restock.report.look import charts
 from restock.report.look.blocks import MOST_ROWS, Figure, Rows, Section, Table, words
+from restock.words import counted
 
 MOST_ROBOTS = 12  # in a chart: those with findings first
 MOST_PERIODS = 26  # the newest
@@ -51,9 +52,9 @@ def drift_page(drift: Drift) -> dict[str, Any]:
         "kicker": "drift of a fleet",
         "title": f"Drift of {drift.store}",
         "headline": headline(drift),
-        "lead": f"{_count(len(robots), 'robot')} over {_count(len(periods), drift.every)}:"
+        "lead": f"{counted(len(robots), 'robot')} over {counted(len(periods), drift.every)}:"
         f" each {drift.every} of a robot compared with its first "
-        f"{_count(drift.reference, drift.every)}, and with the other robots of its site.",
+        f"{counted(drift.reference, drift.every)}, and with the other robots of its site.",
         "cards": [
             {"value": f"{number:,}", "label": label}
             for number, label in (
@@ -334,7 +335,7 @@ def _comparisons_section(own: Rows) -> Section | None:
             Table(
                 rows[:120],
                 numbers=numbers,
-                title=_count(min(len(rows), 120), "comparison"),
+                title=counted(min(len(rows), 120), "comparison"),
                 folded=len(rows) > MOST_ROWS,
             ),
             Table(meanings(newest.values()), title="What the signals are", folded=True),
@@ -351,10 +352,6 @@ def _newest(rows: Rows) -> Rows:
     """The rows of the newest periods."""
     kept = sorted({row["period"] for row in rows})[-MOST_PERIODS:]
     return [row for row in rows if row["period"] in kept]
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _list(names: list[str]) -> str:

@@ -12,6 +12,7 @@ from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
 MOST_ROWS = 24  # of a table that need not be folded
+BROAD, WIDE = 4, 6  # columns: with more, a phone and a tablet show rows as lists
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,11 @@ class Table:
 
     @property
     def stacks(self) -> str:
-        """A class of CSS: on a phone its rows become lists of column and value."""
-        return "broad" if len(self.columns) > 4 else ""
+        """Classes of CSS: on a phone, and if wide on a tablet, its rows become lists of column and
+        value."""
+        if len(self.columns) > WIDE:
+            return "broad wide"
+        return "broad" if len(self.columns) > BROAD else ""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from restock.report.run.facts import Facts
 from restock.train.evaluation.film import label_of
 from restock.train.run.measures import cell_name
 from restock.train.twin.floors.floors import open_floors
+from restock.words import counted
 
 FOLDER, DOCUMENT = "eval/films", "films.json"
 BODY_M = (0.62, 0.44)  # of the robot as it is drawn, length and breadth
@@ -64,8 +65,8 @@ def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
     return Figure(
         _strip(plan, film),
         f"{name}: {film['kind']}",
-        f"Seed {film['episode_seed']}, policy {film['version']}: {how}; {film['bumps']}"
-        f" bump{'s' * (film['bumps'] != 1)}. The frames are at {times} s.",
+        f"Seed {film['episode_seed']}, policy {film['version']}: {how}; "
+        f"{counted(film['bumps'], 'bump')}. The frames are at {times} s.",
         moving=f"data:image/webp;base64,{data}",
     )
 

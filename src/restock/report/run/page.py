@@ -23,6 +23,7 @@ from restock.report.run.sections import (
 )
 from restock.report.run.twin_gap import run_section
 from restock.report.run.ways import ways_section
+from restock.words import counted
 
 
 def page(facts: Facts) -> dict[str, Any]:
@@ -79,9 +80,10 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
     if kept is not None:
         cards.append(
             {
-                "value": ("no goal" if kept["success"] is None else f"{kept['success']:.0%}")
-                + f" at {kept['env_steps']:,}",
-                "label": "kept checkpoint: greedy success, at environment step",
+                "value": f"{kept['env_steps']:,}",
+                "label": "environment step of the kept policy, the best of"
+                f" {counted(len({row['env_steps'] for row in facts.learning}), 'evaluation')}"
+                " in training",
             }
         )
     return cards

@@ -23,6 +23,7 @@ from restock.report.run import shares
 from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import losses
 from restock.report.run.logs_alone import table as off_policy_table
+from restock.words import counted
 
 _YEARS_FROM_DAYS = 512  # ages are in years from there on
 
@@ -308,8 +309,8 @@ def floor_section(facts: Facts) -> Section | None:
                 f"{layout.name}"
                 + (f", the first of {facts.floors} with logs." if facts.floors > 1 else ".")
                 + (
-                    f" Not drawn: what was logged in other frames, {facts.elsewhere} "
-                    f"recording{'s' * (facts.elsewhere != 1)}."
+                    f" Not drawn: what was logged in other frames, "
+                    f"{counted(facts.elsewhere, 'recording')}."
                     if facts.elsewhere
                     else ""
                 )

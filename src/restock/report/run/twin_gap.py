@@ -36,6 +36,7 @@ from restock.train.twin.calibration.twin_gap import (
     TwinGap,
     read_gap,
 )
+from restock.words import counted
 
 COLOURS = {
     "nominal twin": "#b45309",
@@ -93,12 +94,13 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
         "kicker": "gap between twin and logs",
         "title": f"Twin and logs of {about['store']}",
         "headline": headline(gap),
-        "lead": f"{_count(about['rows'], 'logged step')} of {_count(about['episodes'], 'episode')},"
-        f" driven again in the twin. Verdicts are on the {source_name(about['judged'])}.",
+        "lead": f"{counted(about['rows'], 'logged step')} of"
+        f" {counted(about['episodes'], 'episode')}, driven again in the twin. Verdicts are on"
+        f" the {source_name(about['judged'])}.",
         "cards": [
             {
                 "value": f"{sum(v.verdict == kind for v in gap.verdicts)} {kind}",
-                "label": f"of {_count(len(gap.verdicts), 'condition')}: {meaning}",
+                "label": f"of {counted(len(gap.verdicts), 'condition')}: {meaning}",
             }
             for kind, meaning in _MEANING.items()
         ],
@@ -288,7 +290,7 @@ def _signals_section(gap: TwinGap) -> Section | None:
             Table(
                 rows,
                 numbers={"segments", *sources},
-                title=_count(len(rows), "median"),
+                title=counted(len(rows), "median"),
                 folded=len(rows) > MOST_ROWS,
             )
         ],
@@ -318,10 +320,6 @@ def _observations(gap: TwinGap) -> Rows:
         | {source_name(source): f"{sum(values) / len(values):.4f}" for source, values in by.items()}
         for name, by in sums.items()
     ]
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _interval(interval: ConfidenceInterval, unit: str) -> str:

@@ -8,7 +8,8 @@ from typing import Any
 from restock import __version__
 from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
 from restock.report.study import charts
-from restock.stats import interval_text
+from restock.stats import LEAST_PAIRS, interval_text
+from restock.words import counted
 
 MOST_NAMED = 3
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
@@ -176,7 +177,8 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
     bands = (
         f"Bands are 95 % over up to {most} seeds (Student's t)."
         if any(row["low"] is not None for row in rows)
-        else "One seed each, so there is no band; another seed would give another curve."
+        else f"There is no band from fewer than {LEAST_PAIRS} seeds, and none where all came to"
+        " the same; another seed would give another curve."
     )
     return Section(
         "curves",
@@ -247,7 +249,7 @@ def cost_cards(rows: Rows) -> list[dict[str, str]]:
         told = [text for text in known.values() if text is not None]
         told += [f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else []
         if told:
-            seeds = f"{row['runs']} seed{'s' * (row['runs'] != 1)}"
+            seeds = f"{counted(row['runs'], 'seed')}"
             cards.append(
                 {
                     "value": told[0],

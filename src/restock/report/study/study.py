@@ -15,7 +15,7 @@ from restock.report.study.comparison import (
     outcome_sections,
     why_refused,
 )
-from restock.stats import interval_text
+from restock.stats import LEAST_PAIRS, interval_text, no_interval_text, which_adjusted
 
 SAFETY = {
     "bumps_per_km": ("bumps per km", ".1f"),
@@ -70,7 +70,7 @@ def _headline(study: dict[str, Any]) -> str:
     value = f"{100 * primary['difference']:+.1f} points".replace("-", "−")
     pair = f"{primary['arm']} against {primary['baseline']} in {_measure(primary['measure'])}"
     if primary["low"] is None:
-        return f"{pair}: {value}, from one seed without an interval"
+        return f"{pair}: {value}{no_interval_text(primary.get('no_interval'))}"
     ends = [f"{100 * primary[end]:+.1f}".replace("-", "−") for end in ("low", "high")]
     shown = "a difference" if primary["low"] > 0 or primary["high"] < 0 else "no difference shown"
     return f"{pair}: {value} [{ends[0]}, {ends[1]}] over {primary['pairs']} seeds, {shown}"
@@ -117,7 +117,8 @@ def _contrasts(contrasts: Rows, rare: list[str]) -> Section | None:
             "contrast": f"{row['arm']} against {row['baseline']}"
             + (" (primary)" if row["primary"] else ""),
             "measure": _measure(row["measure"]),
-            "difference [95 %]": interval_text(row["difference"], row["low"], row["high"], "+.3f"),
+            "difference [95 %]": interval_text(row["difference"], row["low"], row["high"], "+.3f")
+            + no_interval_text(row.get("no_interval")),
             "arm": f"{row['arm_mean']:.3f}",
             "baseline": f"{row['baseline_mean']:.3f}",
             "seeds": str(row["pairs"]),
@@ -126,12 +127,12 @@ def _contrasts(contrasts: Rows, rare: list[str]) -> Section | None:
         }
         for row in contrasts
     ]
+    primary = any(row["primary"] for row in contrasts)
     return Section(
         "contrasts",
         "Contrasts",
-        intro="Paired by seed, with Student's t over seeds. The primary contrast was named before"
-        " the runs; p of the others is adjusted for their number (Holm). The rare conditions are"
-        f" {', '.join(words(name) for name in rare)}.",
+        intro=f"Paired by seed, with Student's t over seeds. {which_adjusted(primary)} The rare"
+        f" conditions are {', '.join(words(name) for name in rare)}.",
         tables=[Table(rows, set(rows[0]) - {"contrast", "measure"})],
     )
 
@@ -167,7 +168,8 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
         "Success and safety at the end",
         intro="The kept policies on the unperturbed episodes, means with 95 % intervals over "
         "seeds; safety in the rare missions. Time lost is against the planner, where both "
-        "arrived.",
+        f"arrived. From fewer than {LEAST_PAIRS} seeds, and where all came to the same, there are "
+        "values alone.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         two=True,
         tables=[Table(rows, set(rows[0]) - {"arm"})],
@@ -178,8 +180,8 @@ def _ends(value: list[float | None]) -> dict[str, float | None]:
     mean, low, high = value
     return {
         "value": mean,
-        "low": None if low is None else max(low, 0.0),
-        "high": None if high is None else min(high, 1.0),
+        "low": low,
+        "high": high,
     }
 
 

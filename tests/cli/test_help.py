@@ -1,0 +1,87 @@
+"""What `--help` prints: prose as wide as the boxes below it, no empty lines in them, and colours
+on a terminal only, where they are wanted."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from restock import cli
+
+COLUMNS = (72, 80, 90, 120)
+
+
+def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
+    """A help without the line of its usage."""
+    assert cli.main([*words, "--help"]) == 0
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert usage.startswith(f"usage: restock {' '.join(words)}")
+    return lines
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_prose_is_wrapped_and_parted_by_single_empty_lines(
+    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for columns in COLUMNS:
+        monkeypatch.setenv("COLUMNS", str(columns))
+        lines = lines_of(capsys, verb)
+        long = [line for line in lines if len(line) > columns]
+        assert [line for line in long if not line.startswith("    ")] == []  # an example
+        assert [line for line in lines if not line.strip("│ ") and line] == []  # in a box
+        assert ["", ""] not in [lines[at : at + 2] for at in range(len(lines))]
+
+
+def test_a_paragraph_has_none_of_the_line_breaks_of_the_source(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "90")
+    lines = lines_of(capsys, "profile")
+    start = next(place for place, line in enumerate(lines) if "profile check PROFILE" in line)
+    paragraph = lines[start : lines.index("", start)]
+    assert len(paragraph) > 2
+    assert min(map(len, paragraph[:-1])) > 70
+    lines = lines_of(capsys, "completion")
+    assert sum(line.startswith("    ") for line in lines) == 2  # examples stay as they are
+
+
+def test_the_jobs_of_a_verb_are_listed_a_line_or_two_each(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "90")
+    text = "\n".join(lines_of(capsys, "twin"))
+    assert "• layout  Describe a floor" in text
+    assert "--png" not in text
+    assert "--png" in "\n".join(lines_of(capsys, "twin", "layout"))
+
+
+def on_a_terminal(*words: str, **environment: str) -> str:
+    """What a command prints on a terminal, stdout and stderr."""
+    ours, theirs = pty.openpty()
+    others = {name: value for name, value in os.environ.items() if name != "NO_COLOR"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "restock", *words],
+        env=others | {"TERM": "xterm-256color", "COLUMNS": "90"} | environment,
+        stdout=theirs,
+        stderr=theirs,
+    )
+    os.close(theirs)
+    read = b""
+    try:
+        while part := os.read(ours, 1 << 16):
+            read += part
+    except OSError:  # the other end is closed
+        pass
+    os.close(ours)
+    process.wait()
+    return read.decode()
+
+
+@pytest.mark.parametrize("words", [("mix", "--help"), ("mix", "--mxture", "a")], ids=" ".join)
+def test_no_color_takes_the_colours_off(words: tuple[str, ...]) -> None:
+    assert "\x1b[" in on_a_terminal(*words)
+    assert "\x1b" not in on_a_terminal(*words, NO_COLOR="1")

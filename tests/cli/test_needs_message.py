@@ -1,0 +1,44 @@
+"""What `restock ingest` says of a recording of another robot: what to do, and no wrong guesses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from restock.errors import RecordingError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.steps.needs import near, wanted_fields
+
+SCAN, PATH = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Path"
+
+
+def topics(**types: str) -> dict[str, SimpleNamespace]:
+    return {f"/{name}": SimpleNamespace(type=kind, expected=9) for name, kind in types.items()}
+
+
+@pytest.mark.parametrize(
+    ("available", "said"),
+    [
+        (topics(scan=SCAN), ""),
+        (topics(plam=SCAN), "did you mean /plam?"),  # spelled nearly like it
+        (topics(scan=SCAN, planner_global=PATH), "did you mean /planner_global?"),
+        (topics(far=PATH, global_plan=PATH), "did you mean /global_plan?"),
+        (topics(plan=PATH), ""),
+    ],
+    ids=["another type", "spelling", "type", "two of the type", "it is there"],
+)
+def test_a_topic_is_suggested_by_its_type_or_its_spelling(
+    available: dict[str, SimpleNamespace], said: str
+) -> None:
+    assert near("/plan", available, PATH) == said
+
+
+def test_a_recording_that_does_not_fit_is_told_how_to_go_on() -> None:
+    profile = load_profile("warehouse_amr")
+    with pytest.raises(RecordingError) as error:
+        wanted_fields(profile, topics(scan=SCAN), {"/scan": []})
+    assert "no topic /plan (plan)" in str(error.value)
+    assert "did you mean" not in str(error.value)
+    assert "`restock profile new RECORDING`" in str(error.value)
+    assert "`restock start RECORDING" in str(error.value)

@@ -1,0 +1,57 @@
+"""`restock profile`: what it says of data that was lost, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock import cli
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    """A recording that is cut short in the middle."""
+    bag = write_bag(Drive(), tmp_path / "bags" / "cut", storage="mcap")
+    (file,) = bag.glob("*.mcap")
+    os.truncate(file, int(0.8 * file.stat().st_size))
+    return bag
+
+
+def test_what_was_lost_is_told_with_the_proposal_and_with_the_check(
+    tmp_path: Path, cut: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a bag whose ingest ended with 3, `new` said nothing, and both ended with 0."""
+    file = tmp_path / "robot.toml"
+    assert cli.main(["profile", "new", str(cut), "--out", str(file), "--salvage"]) == 3
+    said = capsys.readouterr().err
+    (first, *_) = [line for line in said.splitlines() if line.startswith("lost: ")]
+    assert str(cut) in first
+    assert f"# LOST: {first.removeprefix('lost: ')}\n" in file.read_text()
+    assert "cannot be used yet" not in said
+
+    check = ["profile", "check", str(file), str(cut), "--salvage"]
+    assert cli.main(check) == 3
+    assert "lost: " in capsys.readouterr().out
+    assert cli.main([*check, "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["outcome"]["losses"]
+
+    whole = write_bag(Drive(), tmp_path / "whole")
+    assert cli.main(["profile", "new", str(whole), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["losses"] == []
+    assert cli.main(["profile", "check", str(file), str(whole)]) == 0
+
+
+def test_what_cannot_be_read_is_left_out_and_named(
+    tmp_path: Path, cut: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = write_bag(Drive(), tmp_path / "bags" / "whole")
+    assert cli.main(["profile", "new", str(tmp_path / "bags"), "--json"]) == 3
+    printed = capsys.readouterr()
+    said = json.loads(printed.out)
+    assert said["read"] == [str(whole)]
+    assert said["unreadable"] == [str(cut)]
+    assert f"left out of the proposal: {cut}" in printed.err

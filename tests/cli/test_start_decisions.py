@@ -1,0 +1,116 @@
+"""What `restock start` decides between its stages, and what it says of it at the end."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.driven_robot import Drive, up_to_the_panel, write_bag
+from support.profile_texts import WAREHOUSE
+
+from restock import cli
+from restock.cli.start.decisions import fit_is_worse, no_room, not_live
+from restock.cli.start.start import StartCommand
+from restock.cli.start.way import Way
+from restock.cli.start.work import Ended, Work
+from restock.errors import ConfigError
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.profile.profile import load_profile
+
+
+def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
+    """The exit code, and the document."""
+    code = cli.main(["start", *argv, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_where_no_mission_fits_there_is_no_training_in_the_twin_whatever_was_asked() -> None:
+    def floor(**document: Any) -> Ended:
+        return Ended("floor", "", "done", document=document)
+
+    assert no_room(floor(episodes=["nominal"])) is None
+    assert "no mission fits" in str(no_room(floor(episodes=[])))
+    # Without any floor the twin has its own, where that is asked for.
+    assert no_room(Ended("floor", "", "failed")) is None
+
+
+def test_a_fit_that_ends_farther_from_the_logs_is_told_with_its_figures() -> None:
+    def gap(*ends: tuple[str, str, float, float]) -> dict[str, Any]:
+        rows = [
+            {"condition": "nominal", "quantity": what, "source": source, "median": m, "p90": p}
+            for what, source, m, p in ends
+        ]
+        return {"paths": rows}
+
+    described = ("position", "nominal", 0.12, 0.3)
+    worse = gap(described, ("position", "calibrated", 0.26, 0.5))
+    assert "0.260 m from the log" in str(fit_is_worse(worse))
+    assert "without it 0.120 m" in str(fit_is_worse(worse))
+    assert fit_is_worse(gap(described, ("position", "calibrated", 0.13, 0.2))) is None
+    assert fit_is_worse(gap(described, ("position", "calibrated", 0.08, 0.4))) is None
+    assert fit_is_worse(gap(described, ("heading", "calibrated", 0.9, 0.9))) is None
+
+
+def test_a_lidar_that_sees_into_the_robot_stops_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A robot of 4 x 3 m in a small room went all the way to a policy."""
+    recording, out = write_bag(Drive(), tmp_path / "drive"), tmp_path / "out"
+    argv = (str(recording), "--out", str(out), *up_to_the_panel(tmp_path))
+    argv = (*argv, "--footprint", "8x8")  # the nearest return is 3 m away
+    code, document = start(capsys, *argv)
+    assert code == 3
+    assert document["stages"][-1]["name"] == "check"
+    assert "the robot's outline (8 x 8 m) is wrong" in document["stopped"]["why"]
+    assert "inside it at 100% of the ticks" in document["stopped"]["why"]
+    assert "add --footprint LxW to this command" in document["stopped"]["remedies"][0]
+    _, document = start(capsys, *argv, "--accept")
+    assert document["stages"][-1]["name"] == "mix"
+    # A profile that a person wrote is for that person to edit.
+    (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
+    _, document = start(capsys, *argv)
+    assert "length_m and width_m of [task.body]" in document["stopped"]["remedies"][0]
+
+
+@pytest.mark.parametrize(
+    ("status", "said"), [("done", "cannot be evaluated on logs."), (None, "cannot be evaluated.")]
+)
+def test_what_was_driven_in_the_twin_is_not_told_as_never_evaluated(
+    tmp_path: Path, status: str | None, said: str
+) -> None:
+    def verb(command: list[str]) -> int:
+        sys.stdout.write(json.dumps({"results": []}))
+        return 0
+
+    lines: list[str] = []
+    way = Way(StartCommand(("bag",), tmp_path / "out"), Work(tmp_path / "out", verb, lines.append))
+    floor = None if status is None else Ended("floor", "", "failed")  # on the twin's own
+    way._judge(floor, {"left_out": []})
+    assert any(f"the policy {said}" in line for line in lines)
+
+
+def test_a_profile_that_the_node_refuses_is_told_with_the_policy(tmp_path: Path) -> None:
+    """The export was suggested as if it could drive, though the node refuses such a profile."""
+    file = tmp_path / "p.toml"
+    hindsight = '[goal]\nsource = "hindsight"\n'
+    frames = '[frames]\nfixed = "map"\nbase = "base_link"\n'
+    logged = WAREHOUSE.split("[inputs.goal]")[0]
+    for text, needs in (
+        (WAREHOUSE, ()),
+        (f"{logged}\n{hindsight}", ("[inputs.goal], [inputs.plan]", 'goal.source = "logged"')),
+        (f"{WAREHOUSE}\n{frames}", ("[inputs.pose]",)),
+    ):
+        file.write_text(text)
+        profile = load_profile(str(file))
+        told = not_live(file)
+        if not needs:
+            assert told is None
+            LiveObserver(profile)
+            continue
+        assert told is not None
+        assert all(each in told for each in needs)
+        with pytest.raises(ConfigError):
+            LiveObserver(profile)
