@@ -39,7 +39,7 @@ DOCUMENT = "films.json"
 WORST, RESCUE = "worst failure", "rescue"
 RESCUED_FROM = ("planner", "cloned", "operator")  # and other runs: they come first
 OTHER_RUN = "run:"
-CAPTION_PIXELS, GAP_PIXELS = 26, 12
+CAPTION_PIXELS, GAP_PIXELS = 44, 12
 MOST_FRAMES = 60
 FRAME_MS = 100
 STRIP = 6  # frames of the strip, first and last among them
@@ -127,8 +127,13 @@ def film_evaluation(
         if differing := unlike(scene.row, result):
             missing.append(f"{scene.name}: driven again it has another {', '.join(differing)}")
             continue
-        if scene.other is not None and (before := _failure(plan, scene.other)) is not None:
-            frames = _beside(before, frames, [_told(scene.other), _told(scene.row)])
+        if scene.other is not None:
+            before = _failure(plan, scene.other)
+            if before is None:
+                other = scene.other["policy"]
+                missing.append(f"{scene.name}: {other}, which cannot be driven as it was")
+            else:
+                frames = _beside(before, frames, [_told(scene.other), _told(scene.row)])
         file = folder / f"{scene.name}.webp"
         write_bytes(file, _animation(frames))
         paths.append(file)
@@ -285,7 +290,7 @@ def _beside(
     """Two drives from their first steps on, each under its caption; the shorter one's last picture
     stays."""
     height, width = left[0].shape[:2]
-    font = ImageFont.load_default(size=16)
+    font = ImageFont.load_default(size=28)
     canvas = Image.new("RGB", (2 * width + GAP_PIXELS, height + CAPTION_PIXELS), "white")
     draw = ImageDraw.Draw(canvas)
     for column, caption in enumerate(captions):

@@ -38,6 +38,7 @@ to the update that learned from it, and what to try with your own recordings."""
 
 _CELLS = 30  # of a bar of 100 %
 RARE = "all rare ones"
+FULL_STEPS = 128_000  # of docs/learning.md, "And three minutes"
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:
@@ -91,7 +92,12 @@ def trained(to: Settings) -> str:
 
     steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
     most = max(steps, default=0)
-    lines = [f"Fine-tuned means {most:,} steps in the twin here; docs/learning.md has more."]
+    lines = [f"Fine-tuned means {most:,} steps in the twin here."]
+    if most < FULL_STEPS:
+        lines += [
+            f"That is little: after {FULL_STEPS:,} it completes .92 of the rare missions of the",
+            "sample logs (docs/learning.md). Give more --seconds, or run nothing else beside it.",
+        ]
     if not most:
         lines = ["The time was up before anything was driven: give more --seconds."]
     if to.uniform.is_dir():
