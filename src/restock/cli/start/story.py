@@ -93,7 +93,7 @@ def trained(to: Settings) -> str:
     steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
     most = max(steps, default=0)
     lines = [f"Fine-tuned means {most:,} steps in the twin here."]
-    if most < FULL_STEPS:
+    if most < FULL_STEPS / 2:
         lines += [
             f"That is little: after {FULL_STEPS:,} it completes .92 of the rare missions of the",
             "sample logs (docs/learning.md). Give more --seconds, or run nothing else beside it.",
