@@ -182,6 +182,7 @@ def test_a_kill_of_the_whole_command_leaves_whole_recordings(bags, tmp_path, wor
     assert unchanged == set(before)
 
 
+@pytest.mark.long  # 12 s; that a kill leaves whole recordings is tested always
 @needs_proc
 def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
     store = tmp_path / "s"

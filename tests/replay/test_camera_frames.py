@@ -109,6 +109,7 @@ def test_lerobot_has_the_frames_as_they_were_recorded(store_path: Path, tmp_path
     ]
 
 
+@pytest.mark.long  # another Python starts
 def test_lerobot_itself_reads_the_images(store_path: Path, tmp_path: Path) -> None:
     export_dataset(store_path, "lerobot", tmp_path / "a")
     images = read_with("lerobot", tmp_path / "a")["images"]

@@ -290,6 +290,7 @@ def test_minari_makes_the_twin_again_for_logs_of_its_task(tmp_path: Path) -> Non
     assert gymnasium.spec("restock/Warehouse-v0").kwargs == registered
 
 
+@pytest.mark.long  # another Python starts
 @pytest.mark.parametrize("continuous", one_in(2, [False, True]))
 def test_d3rlpy_reads_its_data_set_and_trains_on_it(
     store_path: Path, tmp_path: Path, continuous: bool
@@ -313,6 +314,7 @@ def test_d3rlpy_reads_its_data_set_and_trains_on_it(
         assert episode["terminal"] == [0.0] * (len(t) - 1) + [float(t.terminated)]
 
 
+@pytest.mark.long  # another Python starts
 def test_lerobot_reads_its_data_set(
     store_path: Path, tmp_path: Path, transitions: pa.Table
 ) -> None:
