@@ -25,19 +25,26 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from harness import finish, markdown, mean_interval, once, option_parser, run_restock, trained
+from harness import (
+    drive_missions,
+    finish,
+    markdown,
+    mean_interval,
+    once,
+    option_parser,
+    run_restock,
+    trained,
+)
 from numpy.typing import NDArray
 
 from restock.ingest.profile.profile import load_profile
 from restock.stats import interval_text, wilson
 from restock.train.dqn.start_policy import StartPolicy, start_network
-from restock.train.evaluation.evaluate import fixed_episodes, run_episodes
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.run.run import Run
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS
 
 RECORDING_MINUTES = 48
@@ -123,17 +130,7 @@ def _kept(file: Path, episodes: int, drive: Callable[[], pa.Table]) -> pa.Table:
 
 
 def _drive(make: Callable[[], Policy], episodes: int) -> pa.Table:
-    profile = load_profile("warehouse_amr")
-    env = WarehouseVectorEnv(
-        32, task=profile.task, seed=0, nav_command=profile.inputs.nav_command is not None
-    )
-    results = run_episodes(
-        env,
-        make(),
-        fixed_episodes(KINDS, episodes, EVALUATION_SEED),
-        control_period_s=profile.task.control_period_s,
-        time_limit_steps=profile.task.time_limit_steps,
-    )
+    results = drive_missions(make(), KINDS, episodes, EVALUATION_SEED)
     return pa.Table.from_pylist([result.row for result in results])
 
 

@@ -16,12 +16,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from harness import finish, markdown, option_parser
+from harness import drive_missions, finish, markdown, option_parser
 
 from restock.arrays import F64, Bools, Ints
-from restock.ingest.profile.profile import load_profile
 from restock.stats import interval_text, wilson
-from restock.train.evaluation.evaluate import fixed_episodes, run_episodes
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.model import PARKED_M
@@ -129,18 +127,7 @@ def main() -> int:
 
 def _driven(kind: str, sees: str, driver: Operator, episodes: int) -> dict[str, Any]:
     """What one driver's missions of a kind come to."""
-    profile = load_profile("warehouse_amr")
-    task = profile.task
-    env = WarehouseVectorEnv(
-        32, task=task, seed=0, nav_command=profile.inputs.nav_command is not None
-    )
-    results = run_episodes(
-        env,
-        driver,
-        fixed_episodes((kind,), episodes, EVALUATION_SEED),
-        control_period_s=task.control_period_s,
-        time_limit_steps=task.time_limit_steps,
-    )
+    results = drive_missions(driver, (kind,), episodes, EVALUATION_SEED)
     taken_s = [result.time_s for result in results if result.success]
     low, high = wilson(len(taken_s), len(results))
     return {

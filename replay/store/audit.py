@@ -32,6 +32,7 @@ from restock.files import first_line
 from restock.replay.store.definitions import install_named, rows_held
 from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
+from restock.words import between
 
 Severity = Literal["error", "warning", "info"]
 Status = Literal["pass", "fail", "warn", "info", "skipped"]
@@ -298,8 +299,7 @@ def rewrite(text: str) -> str:
         lines.append(
             f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")
         )
-    before, rest = text.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"\n\n{END}{rest.split(END, 1)[1]}"
+    return between(text, BEGIN, END, "\n".join([*lines, ""]))
 
 
 if __name__ == "__main__":

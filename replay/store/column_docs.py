@@ -21,6 +21,7 @@ from restock.ingest.task.schema import (
     recording_schema,
     transition_schema,
 )
+from restock.words import between
 
 BEGIN = "<!-- columns: written by `python -m restock.replay.store.column_docs docs/sql.md` -->"
 END = "<!-- end of columns -->"
@@ -137,8 +138,7 @@ def markdown() -> str:
 
 def rewrite(text: str) -> str:
     """A page with the tables between its two markers written again."""
-    before, rest = text.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+    return between(text, BEGIN, END, markdown())
 
 
 def _read() -> dict[str, dict[str, str]]:

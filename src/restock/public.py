@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from restock.words import between
+
 FACES = (
     "restock",
     "restock.ingest",
@@ -198,8 +200,7 @@ def _first_paragraph(node: ast.AST) -> str:
 
 def rewrite(text: str) -> str:
     """A page with the list between its two markers written again."""
-    before, rest = text.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+    return between(text, BEGIN, END, markdown())
 
 
 __all__ = ["FACES", "imported", "lazy", "markdown", "rewrite"]

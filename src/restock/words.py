@@ -1,4 +1,4 @@
-"""Numbers and nouns in sentences."""
+"""Text that is made: numbers and nouns in sentences, and what is written into pages."""
 
 from __future__ import annotations
 
@@ -11,3 +11,9 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """`1 gap`, `1,200 gaps`."""
     return f"{number:,} {plural(number, noun)}"
+
+
+def between(text: str, begin: str, end: str, written: str) -> str:
+    """A page's text with what is `written` between two of its markers, in place of what was."""
+    before, rest = text.split(begin, 1)
+    return f"{before}{begin}\n\n{written}\n{end}{rest.split(end, 1)[1]}"

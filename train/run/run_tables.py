@@ -13,6 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from restock.ingest.task.perturbation_columns import VALUES
+from restock.words import between
 
 BEGIN = "<!-- tables: written by `python -m restock.train.run.run_tables docs/run.md` -->"
 END = "<!-- end of tables -->"
@@ -480,8 +481,7 @@ def markdown() -> str:
 
 def rewrite(text: str) -> str:
     """A page with the tables between its two markers written again."""
-    before, rest = text.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+    return between(text, BEGIN, END, markdown())
 
 
 if __name__ == "__main__":

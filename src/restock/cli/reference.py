@@ -19,6 +19,7 @@ import tyro
 
 from restock.cli import VERBS, command_of, usage
 from restock.cli.command_line import _metavar, prepared
+from restock.words import between
 
 BEGIN = "<!-- verbs: written by `python -m restock.cli.reference docs/cli.md` -->"
 END = "<!-- end of verbs -->"
@@ -132,8 +133,7 @@ def _code(text: str) -> str:
 
 def rewrite(text: str) -> str:
     """A page with the list between its two markers written again."""
-    before, rest = text.split(BEGIN, 1)
-    return f"{before}{BEGIN}\n\n{markdown()}\n{END}{rest.split(END, 1)[1]}"
+    return between(text, BEGIN, END, markdown())
 
 
 if __name__ == "__main__":

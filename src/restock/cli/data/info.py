@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from restock.errors import ExitCode, RecordingError, visible
+from restock.words import counted
 
 NAMED = 10  # attachments, metadata records and their entries that are listed
 HEAD = 18  # bytes: the longest head of a zstd frame
@@ -193,24 +194,24 @@ def _packed(chunks: dict[str, Any]) -> str:
     """How a file's messages are packed, in a line."""
     stored, plain = chunks["stored_bytes"], chunks["plain_bytes"]
     kind = chunks["compression"] or "not compressed"
-    number = f"{chunks['chunks']:,} chunk{'s' if chunks['chunks'] != 1 else ''}"
+    number = counted(chunks["chunks"], "chunk")
     return visible(f"{number}, {kind}: {_share(stored, plain if chunks['compression'] else None)}")
 
 
 def _compressed(compression: dict[str, Any]) -> str:
     """How rosbag2 compressed the recording, in a line."""
     number = compression["number"]
-    what = f"{number:,} {compression['mode']}{'s' if number != 1 else ''}"
+    what = counted(number, compression["mode"])
     share = _share(compression["stored_bytes"], compression["plain_bytes"])
     return f"{what} compressed with {compression['format']}: {share}"
 
 
 def _names(names: list[str]) -> str:
     """Names, each once, and how often where it is more."""
-    counted = Counter(names)
+    often = Counter(names)
     listed = [
         f"{name or '(unnamed)'}{f' ({count})' if count > 1 else ''}"
-        for name, count in counted.items()
+        for name, count in often.items()
     ]
     more = f" and {len(listed) - NAMED:,} more" if len(listed) > NAMED else ""
     return ", ".join(listed[:NAMED]) + more

@@ -7,6 +7,7 @@ from typing import Any
 
 from restock.cli.start.stage import Document
 from restock.stats import interval_text
+from restock.words import counted
 
 ESTIMATORS = (
     ("logged", "as the logs were driven"),
@@ -16,17 +17,12 @@ ESTIMATORS = (
 )
 
 
-def count(number: int, noun: str) -> str:
-    """A number and its noun."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
 def info(document: Document) -> list[str]:
     """How much there is."""
     recordings = document["recordings"]
     seconds = sum(row["duration_s"] or 0.0 for row in recordings)
     messages = sum(row["messages"] for row in recordings)
-    lines = [f"{count(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
+    lines = [f"{counted(len(recordings), 'recording')}, {_time(seconds)}, {messages:,} messages"]
     return lines + _some(
         [f"damaged: {row['path']}: {what}" for row in recordings for what in row["damage"]]
     )
@@ -34,7 +30,7 @@ def info(document: Document) -> list[str]:
 
 def propose(document: Document) -> list[str]:
     """What the proposed profile makes of the recording."""
-    made, ticks = count(document["transitions"], "transition"), count(document["ticks"], "tick")
+    made, ticks = counted(document["transitions"], "transition"), counted(document["ticks"], "tick")
     lines = [f"{made} of {ticks}"]
     if unread := document.get("unread"):
         read = len(document["read"])
@@ -52,8 +48,8 @@ def check(document: Document) -> list[str]:
     lines = [*document["problems"]]
     if (outcome := document["outcome"]) is None:
         return lines
-    made = count(outcome["transitions"], "transition")
-    episodes = count(outcome["episodes"], "episode")
+    made = counted(outcome["transitions"], "transition")
+    episodes = counted(outcome["episodes"], "episode")
     lines.append(f"{made} in {episodes} of {_time(outcome['duration_s'])}")
     missing = [f"{item['input']} ({item['instead']})" for item in outcome["stand_ins"]]
     shown = [line for line in missing if line.split()[0] in _TELLING]
@@ -72,8 +68,8 @@ def ingest(document: Document) -> list[str]:
     transitions = sum(row["transitions"] for row in good)
     episodes = sum(row["episodes"] for row in good)
     lines = [
-        f"{count(transitions, 'transition')} in {count(episodes, 'episode')} of"
-        f" {count(len(good), 'recording')}"
+        f"{counted(transitions, 'transition')} in {counted(episodes, 'episode')} of"
+        f" {counted(len(good), 'recording')}"
     ]
     dropped: dict[str, int] = {}
     for row in good:
@@ -125,7 +121,7 @@ def audit(document: Document) -> list[str]:
 def mix(document: Document) -> list[str]:
     """Rows and what is short."""
     short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
-    lines = [f"panel {document['id']}: {count(document['rows'], 'row')} to learn from"]
+    lines = [f"panel {document['id']}: {counted(document['rows'], 'row')} to learn from"]
     if held := document["evaluation_split"]["rows"]:
         lines[0] += f", {held:,} held out for evaluation"
     if note := document["evaluation_split"]["note"]:
@@ -139,10 +135,10 @@ def mix(document: Document) -> list[str]:
 
 def floor(document: Document) -> list[str]:
     """What it was made from, how large it is, and which episodes fit."""
-    aisles = count(document["aisle_segments"], "aisle segment")
+    aisles = counted(document["aisle_segments"], "aisle segment")
     lines = [
         f"made from {document['made_from']}: {document['width_m']:g} x {document['depth_m']:g} m,"
-        f" {count(document['goals'], 'goal')}, {aisles}; room for"
+        f" {counted(document['goals'], 'goal')}, {aisles}; room for"
         f" {', '.join(document['episodes']) or 'no episode'}"
     ]
     return [*lines, *document["notes"]]
@@ -233,7 +229,7 @@ def on_logs(document: Document) -> list[str]:
     for measure in dict.fromkeys(row["measure"] for row in rows):
         own = {row["estimator"]: row for row in rows if row["measure"] == measure}
         known = [f"{said} {_estimate(own[name])}" for name, said in ESTIMATORS if name in own]
-        episodes = count(next(iter(own.values()))["episodes"], "held-out episode")
+        episodes = counted(next(iter(own.values()))["episodes"], "held-out episode")
         lines.append(f"{measure} of {episodes}: {', '.join(known)}")
         why = next((row["refused"] for row in own.values() if row["refused"]), None)
         if why:

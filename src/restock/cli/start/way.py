@@ -27,10 +27,10 @@ from restock.cli.start.decisions import (
     updates_settings,
     wrong_outline,
 )
-from restock.cli.start.outcomes import count
 from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import Ended, Work, escape
+from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand
@@ -243,7 +243,7 @@ class Way:
             else:
                 used.append(made)
         if left:
-            others = count(len(left), "recording")
+            others = counted(len(left), "recording")
             self._warn(f"{others} in other frames: their routes are on none of the floors")
         return tuple(used)
 
