@@ -119,12 +119,14 @@ def train(
             )
         session.collector.start(action, probability, policy)
 
-        # 4. … while the learner learns from what the ring held before this step.
+        # 4. … while ended episodes get their labels, and the learner learns from what the ring held
+        # before this step.
+        session.run.append("episodes", session.collector.label())
         for _ in range(_updates_due(session)):
             _update(session, session.batches.draw_online(progress.env_steps), "online", notify)
             progress.online_updates += 1
 
-        # 5. The step's transitions go into the ring; ended episodes get their labels.
+        # 5. The step's transitions go into the ring.
         ended = session.collector.finish(
             env_steps=progress.env_steps,
             gradient_steps=learner.gradient_steps,
@@ -137,7 +139,6 @@ def train(
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
-        session.run.append("episodes", session.collector.label())
         # … and where an interval of practice ends, the twin's next missions get its shares.
         session.practice.note(ended)
         session.run.append("practice", session.practice.advance(session.steps))

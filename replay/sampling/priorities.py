@@ -143,7 +143,7 @@ class Priorities(Stateful):
                 for rows, has_rule in zip(stratum_rows, ruled, strict=True)
             ]
         )
-        room = -(-self.sizes // CHUNK) * CHUNK
+        self._room = room = -(-self.sizes // CHUNK) * CHUNK  # places of each stratum
         self._first: Ints = np.concatenate([[0], np.cumsum(room)])[:-1].astype(np.int64)
         self._stratum = np.repeat(np.arange(len(room), dtype=np.int16), room)  # of each place
         self._rows: Ints = np.full(int(room.sum()), -1, np.int64)
@@ -203,7 +203,9 @@ class Priorities(Stateful):
         """
         self._any_new = self._any_new and bool(self._new.any())
         if self._stale_new and self._any_new:
-            self._priority[self._new] = self._largest[self._stratum[self._new]]
+            for first, room, largest in zip(self._first, self._room, self._largest, strict=True):
+                places = slice(first, first + room)
+                np.copyto(self._priority[places], largest, where=self._new[places])
         self._stale_new = False
         # einsum adds in the same order whatever the number of threads; BLAS may not.
         sums: F32 = np.einsum("ij->i", self._priority.reshape(-1, CHUNK))

@@ -30,7 +30,7 @@ from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.layout import DEFAULT
 
-_EPISODES_PER_QUERY = 8
+_EPISODES_PER_QUERY = 32  # planning one takes as long as labelling a thousand of their steps
 _NO_VALUES = ("{}",)  # of a twin that has only a name for them
 _NOT_SAID = ("",)  # of a twin that does not tell situations
 
