@@ -18,6 +18,7 @@ from restock.errors import ConfigError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.live.clock import LiveClock
 from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.not_live import not_live
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
@@ -58,31 +59,15 @@ class LiveObserver:
     Messages are held back to what the tick before held: memory does not grow.
 
     Raises:
-        ConfigError: the profile takes its pose, goals or plans from transforms, which are not
-            held here, or its goals in hindsight.
+        ConfigError: the profile takes what is `not_live`.
     """
 
     def __init__(self, profile: Profile) -> None:
-        if profile.frames is not None:
+        if lacking := not_live(profile):
             raise ConfigError(
-                "places messages by transforms ([frames]), which is not supported live",
+                "takes " + " and ".join(f"{one.takes}, {one.why}" for one in lacking),
                 where=f"profile {profile.name!r}",
-                remedy="name a topic with the pose in the map frame under [inputs.pose]",
-            )
-        if profile.inputs.pose is not None and profile.inputs.pose.by_fix:
-            raise ConfigError(
-                "takes its pose from satellite fixes, whose frame and heading are not computed "
-                "live",
-                where=f"profile {profile.name!r}",
-                remedy="name a topic with the pose in the map frame under [inputs.pose], such as"
-                " that of robot_localization's navsat_transform_node",
-            )
-        if profile.goal_source == "hindsight":
-            raise ConfigError(
-                "takes its goals in hindsight, which is not possible live",
-                where=f"profile {profile.name!r}",
-                remedy="name the topics of goal and plan under [inputs.goal] and [inputs.plan],"
-                ' with goal.source = "logged"',
+                remedy="; ".join(one.remedy for one in lacking),
             )
         self.profile, self.task = profile, profile.task
         self._inputs: dict[str, list[Input]] = {}

@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import pyarrow as pa
-import pyarrow.compute as pc
 from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
@@ -133,6 +132,8 @@ def _summarise(store: StoreWriter, live: Sequence[Ingest], made: dict[str, pa.Ta
 
 
 def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
+    import pyarrow.compute as pc  # slow to import
+
     return manifests.filter(pc.equal(manifests["ingest_id"], one.ingest_id))
 
 

@@ -12,7 +12,7 @@ from support.driven_robot import Drive, up_to_the_panel, write_bag
 from support.profile_texts import WAREHOUSE
 
 from restock import cli
-from restock.cli.start.decisions import fit_is_worse, no_room, not_live
+from restock.cli.start.decisions import fit_is_worse, no_room, node_refuses
 from restock.cli.start.start import StartCommand
 from restock.cli.start.way import Way
 from restock.cli.start.work import Ended, Work
@@ -105,7 +105,7 @@ def test_a_profile_that_the_node_refuses_is_told_with_the_policy(tmp_path: Path)
     ):
         file.write_text(text)
         profile = load_profile(str(file))
-        told = not_live(file)
+        told = node_refuses(file)
         if not needs:
             assert told is None
             LiveObserver(profile)

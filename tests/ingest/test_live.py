@@ -147,5 +147,5 @@ def test_memory_does_not_grow_with_messages() -> None:
 
 def test_a_profile_that_needs_transforms_is_refused() -> None:
     framed = msgspec.structs.replace(PROFILE, frames=Frames())
-    with pytest.raises(ConfigError, match="by transforms"):
+    with pytest.raises(ConfigError, match="from transforms"):
         LiveObserver(framed)

@@ -120,28 +120,19 @@ def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bo
     )
 
 
-def not_live(profile: Path | str | None) -> str | None:
+def node_refuses(profile: Path | str | None) -> str | None:
     """Why the node refuses this profile on a robot, and which one it needs; None: it takes it."""
+    from restock.ingest.profile.not_live import not_live
     from restock.ingest.profile.profile import load_profile
 
-    if profile is None:
+    if profile is None or not (lacking := not_live(load_profile(str(profile)))):
         return None
-    loaded = load_profile(str(profile))
-    pose = loaded.inputs.pose
-    refused, topics, source = [], [], ""
-    if loaded.frames is not None:
-        refused, topics = ["its pose from transforms"], ["[inputs.pose]"]
-    elif pose is not None and pose.by_fix:
-        refused, topics = ["its pose from satellite fixes"], ["[inputs.pose]"]
-    if loaded.goal_source == "hindsight":
-        refused.append("its goals in hindsight")
-        topics += ["[inputs.goal]", "[inputs.plan]"]
-        source = ' with goal.source = "logged",'
-    if not refused:
-        return None
+    takes = " and ".join(one.takes for one in lacking)
+    topics = ", ".join(one.topics for one in lacking)
+    settings = "".join(f" with {one.settings}," for one in lacking if one.settings)
     return (
-        f"the node on the robot refuses its profile, which takes {' and '.join(refused)}. Give the "
-        f"node a profile with the same [task],{source} and with topics under {', '.join(topics)}"
+        f"the node on the robot refuses its profile, which takes {takes}. Give the node a profile "
+        f"with the same [task],{settings} and with topics under {topics}"
     )
 
 
@@ -331,7 +322,7 @@ __all__ = [
     "mistrust",
     "no_room",
     "no_ways",
-    "not_live",
+    "node_refuses",
     "of_other_kinds",
     "possible_kinds",
     "practice_settings",

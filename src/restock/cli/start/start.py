@@ -77,7 +77,7 @@ class StartCommand:
         """The whole way; 3 where a person must decide, or a stage failed that it needs."""
         from restock.cli import main
         from restock.cli.output import print_json, stderr, stdout
-        from restock.cli.start.decisions import not_live
+        from restock.cli.start.decisions import node_refuses
         from restock.cli.start.way import Way
         from restock.cli.start.work import Work, escape
 
@@ -109,7 +109,7 @@ class StartCommand:
             if not self.dry_run:
                 onnx = f"restock export {self.out / 'run'} --to onnx --out policy.onnx"
                 say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
-                if (needs := not_live(self.profile or self.out / "profile.toml")) is not None:
+                if (needs := node_refuses(self.profile or self.out / "profile.toml")) is not None:
                     say(f"   {escape(needs)} (docs/deploy.md#without-the-node)")
                 say(f"The report: [bold]{escape(str(page))}[/bold] (open it in a browser)")
             return int(ExitCode.OK)
