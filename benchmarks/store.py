@@ -1,6 +1,7 @@
 """A fleet's store: what it costs to open it, to ask it, to audit it and to mix from it.
 
-    python benchmarks/store.py [--quick] [--json] [--check] [--size NAME] [--keep FOLDER] [--compact]
+    python benchmarks/store.py [--quick] [--json] [--check] [--size NAME] [--keep FOLDER]
+                               [--compact]
 
 Synthetic fleets are written by the project's own writer, some recordings a commit: few rows in
 many files, and as many rows as a fleet has. Each question is asked in a process of its own; wall
