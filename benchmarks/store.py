@@ -21,14 +21,21 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import duckdb
 from harness import finish, markdown, option_parser
-from store_fleet import disk_bytes, write_fleet
+from store_fleet import FIRST_DAY, disk_bytes, files_of_day, write_fleet
 
 LIMIT_S = 300  # a question that takes longer, per ten million rows, is not waited for
 BATCH = 100  # recordings a commit
+DAY = 2  # of the fleet, the first being 0
+ONE_DAY = (
+    f"stamp_ns >= epoch_ns(TIMESTAMP '{FIRST_DAY + timedelta(DAY):%Y-%m-%d}')"
+    f" AND stamp_ns < epoch_ns(TIMESTAMP '{FIRST_DAY + timedelta(DAY + 1):%Y-%m-%d}')"
+)
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,9 @@ QUESTIONS = {
     "coverage_by_condition": "FROM coverage_by_condition",
     "episodes": "SELECT ended, count(*), avg(success::INTEGER) FROM episodes GROUP BY ALL",
     "one_column": "SELECT condition, avg(reward) FROM transitions GROUP BY ALL",
+    # Of one day, and of that day's files alone: what partitioning by day could save at most.
+    "one_day": f"SELECT condition, avg(reward) FROM transitions WHERE {ONE_DAY} GROUP BY ALL",
+    "one_day_alone": "",
     "audit": "",
     "mix": "",
 }
@@ -88,6 +98,11 @@ def ask(store: Path, question: str) -> dict[str, float]:
                 code = restock([question, str(store)])
             elif question == "mix":
                 code = restock(["mix", str(store), "--out", f"{folder}/panel"])
+            elif question == "one_day_alone":
+                of_day = [str(file) for file in files_of_day(store, DAY)]
+                text = "SELECT condition, avg(reward) FROM read_parquet(?) GROUP BY ALL"
+                duckdb.execute(text, [of_day]).fetchall()
+                code = 0
             else:
                 with Store(store) as opened:
                     if text := QUESTIONS[question]:
@@ -139,6 +154,8 @@ def measure(name: str, folder: Path, *, rounds: int, compact: bool) -> dict[str,
 def _answers(store: Path, size: Size, rounds: int) -> dict[str, dict[str, float]]:
     answers = {}
     for question in size.only or QUESTIONS:
+        if question == "one_day_alone" and not any(files_of_day(store, DAY)):
+            continue  # joined, or of fewer days
         times = rounds if question not in ("audit", "mix") else 1
         several = [asked(store, question, size.limit_s) for _ in range(times)]
         done = sorted((one for one in several if one), key=lambda one: one["wall_s"])

@@ -21,6 +21,7 @@ from support.stores import manifest, recording_transitions
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.compaction import fold_if_many
+from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import STEP_BITS
@@ -41,6 +42,13 @@ def write_fleet(path: Path, recordings: int, rows: int, *, batch: int) -> None:
     while part := [one for _, one in zip(range(batch), fleet, strict=False)]:
         store.write_all(part)
     fold_if_many(store)
+
+
+def files_of_day(store: Path, day: int) -> list[Path]:
+    """The files of the recordings that began in a day of a fleet, counted from 0."""
+    hours = range(max(24 * day, 1), 24 * (day + 1))  # recording N begins N hours after FIRST_DAY
+    folders = [store / TRANSITIONS / f"{hour:016x}" for hour in hours]
+    return [file for folder in folders for file in folder.glob("*.parquet")]
 
 
 def drives(recordings: int, rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:

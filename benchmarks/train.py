@@ -54,7 +54,7 @@ from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Coded, Logs
 from restock.train.run.run import Run
 
-TARGETS = {"cleanrl": 1.6, "stable_baselines3": 1.9}  # times Restock's update, at least
+TARGETS = {"cleanrl": 2.5, "stable_baselines3": 3.0}  # times Restock's update, at least
 IN_PLACE_TARGET = 1.1  # times the same arithmetic on one batch that lies ready, at most
 FEED_TARGET = 0.06  # of an update, at most
 
