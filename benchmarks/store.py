@@ -64,7 +64,7 @@ SIZES = {
     "10 M rows": Size(
         *(1_400, 7_200, {**_OPEN, "audit": 30.0, "mix": 38.5}), {"audit": 2e9, "mix": 2.9e9}
     ),
-    "30 M rows": Size(4_200, 7_200, {}, asked_for=True),
+    "20 M rows": Size(2_800, 7_200, {}, asked_for=True),
     "100 M rows": Size(14_000, 7_200, {}, asked_for=True),
 }
 QUESTIONS = {
