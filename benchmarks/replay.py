@@ -247,16 +247,17 @@ def cold_panel(count: int, batches: int) -> dict[str, float]:
 
 def record_share(rounds: int, updates: int) -> dict[str, float]:
     """An update of the default recipe with and without the record of what was fed."""
-    import train as train_benchmark  # benchmarks/train.py
+    from own_updates import Restock, config
+    from train_peers import data
+
     from restock.train.run.run import Run
 
-    arrays = train_benchmark.data(np.random.default_rng(0))
-    settings = train_benchmark.config(128)
+    arrays, settings = data(np.random.default_rng(0)), config(128)
     with tempfile.TemporaryDirectory() as folder:
         run = Run.create(Path(folder) / "run", {})
         contenders = {
-            "plain": train_benchmark.Restock(settings, arrays, run=None, logs=True),
-            "recorded": train_benchmark.Restock(settings, arrays, run=run, logs=True),
+            "plain": Restock(settings, arrays, run=None, logs=True),
+            "recorded": Restock(settings, arrays, run=run, logs=True),
         }
         for contender in contenders.values():
             contender(updates)

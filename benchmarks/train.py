@@ -28,11 +28,10 @@ from typing import Any
 import numpy as np
 import torch
 from harness import finish, in_turns, medians, option_parser
+from own_updates import Restock, config
 from train_peers import (
     ACTIONS,
-    DISCOUNT,
     OBSERVATION,
-    ROWS,
     Arrays,
     Updates,
     cleanrl,
@@ -43,99 +42,13 @@ from train_peers import (
     torchrl,
 )
 
-from restock.replay.ring.ring import FreshRing
-from restock.train.dqn.config import TrainConfig, parse_config
-from restock.train.dqn.learner import Learner
-from restock.train.dqn.manual_backprop import UpdatePath
+from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.products import product, product_into
-from restock.train.feed.batch_record import FeedRecord
-from restock.train.feed.batches import Batches
-from restock.train.feed.held_rows import EpisodeLabels
-from restock.train.feed.logs import Coded, Logs
 from restock.train.run.run import Run
 
 TARGETS = {"cleanrl": 2.5, "stable_baselines3": 3.0}  # times Restock's update, at least
 IN_PLACE_TARGET = 1.1  # times the same arithmetic on one batch that lies ready, at most
 FEED_TARGET = 0.06  # of an update, at most
-
-
-def config(batch: int, **changes: Any) -> TrainConfig:
-    base = {"replay": {"batch_size": batch}, "optimizer": {"learning_rate": 3e-4}}
-    return parse_config({**base, **changes}, where="benchmark")
-
-
-class Restock:
-    """Restock's update; with `logs`, half of the batch from logs; with `run`, recorded."""
-
-    def __init__(
-        self,
-        settings: TrainConfig,
-        arrays: Arrays,
-        *,
-        run: Run | None = None,
-        logs: bool = False,
-        path: UpdatePath | None = None,
-    ) -> None:
-        ring = FreshRing(ROWS, 16, OBSERVATION, discount=DISCOUNT, conditions=("rare", "nominal"))
-        discount = DISCOUNT * (1 - arrays["done"])
-        columns = [arrays["observation"], arrays["next_observation"], arrays["action"]]
-        ring.rows[:] = np.concatenate([*columns, arrays["reward"], discount], axis=1)
-        ring.appended = ROWS
-        shelf = self._logs(torch.from_numpy(ring.rows.copy())) if logs else None
-        self.learner = Learner(settings, OBSERVATION, ACTIONS, path=path)
-        self.batches = Batches(
-            shelf,
-            ring,
-            batch_size=settings.replay.batch_size,
-            logs_share=0.5 if logs else 0.0,
-            seed=0,
-            device=torch.device("cpu"),
-        )
-        ring.strata.move(np.arange(ROWS), 1)  # as where episodes have ended
-        self.feed = None
-        if run is not None:
-            self.feed = FeedRecord(
-                run,
-                shelf,
-                ring,
-                audit_share=0.01,
-                seed=0,
-                actions=[f"action {index}" for index in range(ACTIONS)],
-                greedy=self.learner.greedy,
-                labels=EpisodeLabels(),
-            )
-
-    @staticmethod
-    def _logs(rows: torch.Tensor) -> Logs:
-        rare = np.arange(ROWS) < ROWS // 50
-        codes = Coded(rare.astype(np.int32), ["nominal", "rare"])
-        return Logs(
-            rows=rows,
-            strata=["nominal", "rare"],
-            timings=["pre", "pre"],
-            stratum_rows=[np.flatnonzero(~rare), np.flatnonzero(rare)],
-            shares=np.array([0.8, 0.2]),
-            weights=None,
-            as_of_ns=0,
-            transition_id=np.arange(ROWS),
-            stamp_ns=np.zeros(ROWS, np.int64),
-            condition=codes,
-            behaviour_policy=codes,
-            behaviour_version=codes,
-            episode=codes,
-        )
-
-    def __call__(self, updates: int) -> None:
-        learner = self.learner
-        for _ in range(updates):
-            batch = self.batches.draw_online()
-            loss = learner.update(batch.rows, weight=batch.weight, logged=batch.logged)
-            step = learner.gradient_steps
-            if self.feed is not None:
-                self.feed.batch(step, step * 4, batch, loss, learner.target.last_sync)
-            learner.target.after(step)
-            if self.feed is not None and step % 500 == 0:
-                self.feed.flush(step * 4, step, "online")
 
 
 def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:

@@ -79,7 +79,9 @@ def cleanrl(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates:
     return update
 
 
-def stable_baselines3(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates | None:
+def stable_baselines3(
+    batch: int, arrays: Arrays, *, equal: bool = False, device: str = "cpu"
+) -> Updates | None:
     """Its target is copied every 10,000 steps by default: never, within a benchmark."""
     try:
         import gymnasium
@@ -105,7 +107,7 @@ def stable_baselines3(batch: int, arrays: Arrays, *, equal: bool = False) -> Upd
             "net_arch": [256, 256],
             "optimizer_kwargs": {"fused": True} if equal else {},
         },
-        device="cpu",
+        device=device,
     )
     model.set_logger(Logger(None, []))
     buffer: Any = model.replay_buffer

@@ -183,6 +183,8 @@ class FreshRing(Stateful):
         self._pending = PendingSteps(
             num_envs, observation_size, discount=discount, n_step=n_step, meta=META
         )
+        # Slots written since a mirror of the rows last took them away; None: there is no mirror.
+        self.written: list[Ints] | None = None
         self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)  # of the episode under way
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
         self._next_key = num_envs
@@ -261,6 +263,8 @@ class FreshRing(Stateful):
         rows, meta = self._pending.pack(envs, next_observation, terminated)
         slots = self._reserve.take(len(envs))
         self.rows[slots] = rows
+        if self.written is not None:
+            self.written.append(slots)
         for name, values in meta.items():
             self.meta[name][slots] = values
         if self.conditions:

@@ -104,9 +104,8 @@ def by_dataset(workers: int) -> Way:
 
 def by_batches(panel: Panel) -> Iterator[Drawn]:
     ring = FreshRing(64, 4, panel.observation_size, discount=panel.discount)
-    device = torch.device("cpu")
     logs = Logs.of_panel(panel)
-    batches = Batches(logs, ring, batch_size=BATCH, logs_share=1.0, seed=0, device=device)
+    batches = Batches(logs, ring, batch_size=BATCH, logs_share=1.0, seed=0)
     for number in range(10**9):
         batch = batches.draw_online(number * 10)
         np.testing.assert_array_equal(batch.rows.numpy(), panel.rows[batch.log_rows])

@@ -181,7 +181,7 @@ def test_the_way_is_chosen_by_the_network_and_the_device() -> None:
 
     assert of() == of(layer_norm=False, hidden=(8,)) == BY_HAND[-1]
     assert of(dueling=True) == of(quantiles=8) == of(ensemble=2) == "autograd"
-    assert update_path(parse_config({}, where="test").network, "cuda") == "autograd"
+    assert update_path(parse_config({}, where="test").network, "cuda") == "manual"
     assert learner(None).path == BY_HAND[-1]
 
 

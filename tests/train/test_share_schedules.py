@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from support.stores import CONDITIONS, recording_transitions
 from support.toy_run import assert_same_run, config, run_to_end, session
 from support.toy_twin import TASK as TOY_TASK
@@ -136,7 +135,7 @@ def test_a_panel_read_in_chunks_gives_the_rows_it_names(table: pa.Table, tmp_pat
     built = panel(table, tmp_path / "p", text)
     ring = FreshRing(64, 4, TOY_TASK.observation_size, discount=0.9)
     logs = Logs.of_panel(built, PlannedDraws(offline=4_000))
-    parts = {"batch_size": 64, "logs_share": None, "seed": 0, "device": torch.device("cpu")}
+    parts = {"batch_size": 64, "logs_share": None, "seed": 0}
     batches = Batches(logs, ring, **parts)  # type: ignore[arg-type]
     again = Batches(logs, ring, **parts)  # type: ignore[arg-type]
     counted = np.zeros(len(built), np.int64)

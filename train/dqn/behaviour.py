@@ -182,6 +182,31 @@ class Behaviour(Stateful):
 
     def learn(self, labelled: Labelled) -> None:
         """One gradient step."""
+        device = self.ratio.device
+        self._fill_gradient(Labelled(labelled.observation.to(device), labelled.action.to(device)))
+        self.updates += 1
+        self.optimizer.step(self._slow, self.averaging_rate(self.updates))
+
+    def move(self, labelled: Labelled, rate: Tensor) -> None:
+        """The same on the device alone; the caller keeps the counts."""
+        self._fill_gradient(labelled)
+        self.optimizer.move(self._slow, rate)
+
+    def averaging_rate(self, update: int) -> float:
+        """Of the average, at update number `update` (from 1)."""
+        return averaging_rate(self._averaging, update)
+
+    def count(self, updates: int) -> None:
+        """That so many updates were made by `move`."""
+        self.updates += updates
+        self.optimizer.count(updates)
+
+    @property
+    def moved(self) -> list[Tensor]:
+        """All that `move` moves."""
+        return [*self.optimizer.moved, self._slow]
+
+    def _fill_gradient(self, labelled: Labelled) -> None:
         if self._by_hand is not None:
             (logits,) = self._by_hand.forward(labelled.observation)
             self._by_hand.backward(imitation_gradient(logits, labelled.action))
@@ -189,8 +214,6 @@ class Behaviour(Stateful):
             self.optimizer.gradient.zero_()
             loss = imitation_loss(self.network(labelled.observation), labelled.action)
             loss.backward()  # type: ignore[no-untyped-call]
-        self.updates += 1
-        self.optimizer.step(self._slow, averaging_rate(self._averaging, self.updates))
 
     @torch.no_grad()
     def plausible(self, observation: Tensor) -> Tensor:

@@ -103,17 +103,29 @@ class FlatAdam(Stateful):
         self.values, self.gradient = self._flat.values, self._flat.gradient
         self.learning_rate, self.max_grad_norm = learning_rate, max_grad_norm
         self._compiled = compiled
-        self.forget()
+        # Written in place from here on: a CUDA graph keeps hold of them.
+        self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
+        self._step = torch.zeros((), device=self.values.device)  # `adam` counts in a tensor
+        self._steps = 0
 
     @torch.no_grad()
     def step(self, average: Tensor | None = None, rate: float = 0.0) -> None:
         """Move the parameters by the gradient that they have; then `average` to them, by `rate`."""
-        if self.max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
-        self._steps += 1
-        if self._compiled:
-            self._compiled_step(average, rate)
+        self.count(1)
+        if not self._compiled:
+            self.move(average, rate)
             return
+        self._clip()
+        self._compiled_step(average, rate)
+
+    def count(self, steps: int) -> None:
+        """That so many steps were made, by `move` alone."""
+        self._steps += steps
+
+    @torch.no_grad()
+    def move(self, average: Tensor | None, rate: float | Tensor) -> None:
+        """As `step`, by operations on the device alone, which a CUDA graph can repeat."""
+        self._clip()
         moved, squares = self._moments
         adam(
             *([self.values], [self.gradient], [moved], [squares], [], [self._step]),
@@ -128,6 +140,10 @@ class FlatAdam(Stateful):
         )
         if average is not None:
             average.lerp_(self.values, rate)
+
+    def _clip(self) -> None:
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_([self.values], self.max_grad_norm)
 
     def _compiled_step(self, average: Tensor | None, rate: float) -> None:
         self._step.fill_(self._steps)
@@ -144,9 +160,14 @@ class FlatAdam(Stateful):
 
     def forget(self) -> None:
         """Begin again without moments: the parameters were replaced."""
-        self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
-        self._step = torch.zeros((), device=self.values.device)  # `adam` counts in a tensor
+        for tensor in (*self._moments, self._step):
+            tensor.zero_()
         self._steps = 0
+
+    @property
+    def moved(self) -> list[Tensor]:
+        """All that `move` moves, but for the average."""
+        return [self.values, *self._moments, self._step]
 
     @property
     def moments(self) -> dict[str, dict[str, Tensor]]:
@@ -165,11 +186,10 @@ class FlatAdam(Stateful):
         if not entries:
             return
         ordered = [entries[str(index)] for index in range(len(entries))]
-        self._step = ordered[0]["step"].to(self.values.device, copy=True)
+        self._step.copy_(ordered[0]["step"])
         self._steps = int(self._step)
-        self._moments = [
-            self._flat.flat_of([entry[name] for entry in ordered]) for name in _MOMENTS
-        ]
+        for moment, name in zip(self._moments, _MOMENTS, strict=True):
+            moment.copy_(self._flat.flat_of([entry[name] for entry in ordered]))
 
 
 __all__ = ["FlatAdam", "FlatParameters", "averaging_rate"]

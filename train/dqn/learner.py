@@ -38,20 +38,24 @@ from restock.train.dqn.manual_backprop import (
 )
 from restock.train.dqn.native_backprop import NativeBackprop, native_td_loss
 from restock.train.dqn.network import Network, clone, make_network
-from restock.train.dqn.target import TargetUpdate
+from restock.train.dqn.target import Polyak, TargetUpdate
 
 _ByHand = ManualBackprop | NativeBackprop
 
 
 @dataclass(frozen=True)
-class _Terms:
-    """What `Learner.update` was given beside the rows."""
+class Terms:
+    """What an update is given beside the rows (B, W)."""
 
-    weight: Tensor | None
-    logged: int
-    conservative: float
-    return_to_go: Tensor | None
-    expert: Tensor | None
+    weight: Tensor | None  # (B,) importance weights; None: ones
+    logged: int  # how many of the first rows the terms below apply to
+    conservative: float | Tensor  # weight of the CQL term, or that of each such row (logged,)
+    return_to_go: Tensor | None  # (logged,)
+    expert: Tensor | None  # (logged,) bool
+
+    @property
+    def has_conservative(self) -> bool:
+        return isinstance(self.conservative, Tensor) or self.conservative > 0
 
 
 class Learner(Stateful):
@@ -98,12 +102,12 @@ class Learner(Stateful):
             compiled=self.path == "native",
         )
         self._policy = FlatParameters(self.policy_network, learns=False).values
-        slow = FlatParameters(self.target_network, learns=False).values
-        self.target = TargetUpdate(config.target, [self.optimizer.values], [slow])
+        self._slow = FlatParameters(self.target_network, learns=False).values
+        self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
         self.averaging = config.evaluation.averaging
         learns = self.optimizer
         self._backprop = make_backprop(self.path, self.network, learns.values, learns.gradient)
-        self._target_backprop = make_backprop(self.path, self.target_network, slow)
+        self._target_backprop = make_backprop(self.path, self.target_network, self._slow)
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
         self._acting: PolicyNetwork = self.network
@@ -146,19 +150,61 @@ class Learner(Stateful):
             expert: (logged,) bool, whether the margin term applies, or None: to none.
             labelled: what the behaviour network learns from, where there is one.
         """
-        terms = _Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
-        if self._backprop is not None and self._target_backprop is not None:
-            loss = self._by_hand(self._backprop, self._target_backprop, rows, terms)
-        else:
-            loss = self._by_autograd(rows, terms)
+        terms = Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
+        loss = self._fill_gradient(rows, terms)
         self.gradient_steps += 1
         # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
-        self.optimizer.step(self._policy, averaging_rate(self.averaging, self.gradient_steps))
+        self.optimizer.step(self._policy, self.averaging_rate(self.gradient_steps))
         if self.behaviour is not None and labelled is not None:
             self.behaviour.learn(labelled)
         return loss
 
-    def _by_autograd(self, rows: Tensor, terms: _Terms) -> Loss:
+    def move(
+        self,
+        rows: Tensor,
+        terms: Terms,
+        labelled: Labelled | None,
+        rate: Tensor,
+        behaviour_rate: Tensor,
+    ) -> Loss:
+        """An update by operations on the device alone, which a CUDA graph can repeat.
+
+        With the target's, where that follows at every update. Rates () are of the averages. The
+        counts are the caller's to keep, by `count`.
+        """
+        loss = self._fill_gradient(rows, terms)
+        self.optimizer.move(self._policy, rate)
+        if self.behaviour is not None and labelled is not None:
+            self.behaviour.move(labelled, behaviour_rate)
+        if isinstance(self.target.rule, Polyak):
+            self.target.pull()
+        return loss
+
+    def count(self, updates: int, *, labelled: bool) -> None:
+        """That so many updates were made by `move`."""
+        self.gradient_steps += updates
+        self.optimizer.count(updates)
+        if self.behaviour is not None and labelled:
+            self.behaviour.count(updates)
+        if isinstance(self.target.rule, Polyak):
+            self.target.last_sync = self.gradient_steps
+
+    def averaging_rate(self, update: int) -> float:
+        """Of the average of weights, at update number `update` (from 1)."""
+        return averaging_rate(self.averaging, update)
+
+    @property
+    def moved(self) -> list[Tensor]:
+        """All that `move` moves."""
+        slow = [] if self.behaviour is None else self.behaviour.moved
+        return [*self.optimizer.moved, self._policy, self._slow, *slow]
+
+    def _fill_gradient(self, rows: Tensor, terms: Terms) -> Loss:
+        if self._backprop is not None and self._target_backprop is not None:
+            return self._by_hand(self._backprop, self._target_backprop, rows, terms)
+        return self._by_autograd(rows, terms)
+
+    def _by_autograd(self, rows: Tensor, terms: Terms) -> Loss:
         """Fill the gradient from a graph: any network."""
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
@@ -179,9 +225,11 @@ class Learner(Stateful):
                     q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
                 )
             losses.append(loss)
-            if terms.conservative > 0:
-                term = conservative_penalty(q[:logged], action[:logged], terms.return_to_go)
-                penalties.append(terms.conservative * term * share)
+            if terms.has_conservative:
+                term = conservative_penalty(
+                    q[:logged], action[:logged], terms.return_to_go, terms.conservative
+                )
+                penalties.append(term * share)
             if terms.expert is not None:
                 term = margin_penalty(
                     q[:logged], action[:logged], terms.expert, self.loss.margin_size
@@ -196,7 +244,7 @@ class Learner(Stateful):
         return loss
 
     @torch.no_grad()
-    def _by_hand(self, online: _ByHand, slow: _ByHand, rows: Tensor, terms: _Terms) -> Loss:
+    def _by_hand(self, online: _ByHand, slow: _ByHand, rows: Tensor, terms: Terms) -> Loss:
         """Fill the gradient by hand: the plain network, with every term of the loss."""
         size, settings, logged = self.network.observation_size, self.loss, terms.logged
         observation, next_observation, action, reward, discount = unpack(rows, size)
@@ -225,9 +273,12 @@ class Learner(Stateful):
             loss = dqn_loss(q, action, target, weight=weight, huber_delta=delta)
             gradient = dqn_gradient(loss.td, action, q.shape[1], weight=weight, huber_delta=delta)
         share = logged / len(rows)
-        if terms.conservative > 0:
+        if terms.has_conservative:
             term = conservative_gradient(q[:logged], action[:logged], terms.return_to_go)
-            gradient[:logged].add_(term, alpha=terms.conservative * share)
+            if isinstance(terms.conservative, Tensor):
+                gradient[:logged].addcmul_(term, terms.conservative.unsqueeze(1), value=share)
+            else:
+                gradient[:logged].add_(term, alpha=terms.conservative * share)
         if terms.expert is not None:
             term = margin_gradient(q[:logged], action[:logged], terms.expert, settings.margin_size)
             gradient[:logged].add_(term, alpha=settings.margin * share)

@@ -146,17 +146,20 @@ def munchausen_target(
     return reward + scale * taken + discount * soft
 
 
-def conservative_penalty(q: Tensor, action: Tensor, return_to_go: Tensor | None = None) -> Tensor:
-    """Discrete CQL's regulariser, () : mean of logsumexp_a Q(s, a) - Q(s, a_logged).
+def conservative_penalty(
+    q: Tensor, action: Tensor, return_to_go: Tensor | None = None, weight: float | Tensor = 1.0
+) -> Tensor:
+    """Discrete CQL's regulariser, () : mean of weight * (logsumexp_a Q(s, a) - Q(s, a_logged)).
 
     Pushes down the values of actions that the logs never took (arXiv:2006.04779, CQL(H)). With
     `return_to_go` (B,), not below what the logs are known to have got from there: Cal-QL's
-    calibration (arXiv:2303.05479), so that online learning does not begin by unlearning.
+    calibration (arXiv:2303.05479), so that online learning does not begin by unlearning. `weight`
+    is of all rows or of each, (B,).
     """
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
     if return_to_go is not None:
         q = torch.maximum(q, return_to_go.unsqueeze(1))
-    return (q.logsumexp(dim=1) - chosen).mean()
+    return ((q.logsumexp(dim=1) - chosen) * weight).mean()
 
 
 def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> Tensor:

@@ -10,8 +10,8 @@ Per layer, with x the layer's input (B, I), z = x W^T + b and g the gradient tha
     dW = g^T x,  db = sum_i g_i,  g = g W       and the product
 
 `tests/train/test_manual_backprop.py` compares it with autograd in double precision. It does the
-plain network alone: dueling heads, quantiles and ensembles keep to autograd, as CUDA does. Where
-the compiled update is (`native_backprop.py`), that does the same in its place.
+plain network alone: dueling heads, quantiles and ensembles keep to autograd. Where the compiled
+update is (`native_backprop.py`), that does the same in its place.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ UpdatePath = Literal["native", "manual", "autograd"]
 def update_path(network: NetworkConfig, device: str, threads: int = 1) -> UpdatePath:
     """Which way a run's gradients are made; `config.json` says it as `update_path`.
 
-    The compiled way computes on one thread: a run that asks for more has PyTorch's operations.
+    The compiled way computes on one thread of the CPU: a run that asks for more, or for another
+    device, has PyTorch's operations.
     """
-    plain = not network.dueling and not network.quantiles and network.ensemble == 1
-    if not plain or torch.device(device).type != "cpu":
+    if network.dueling or network.quantiles or network.ensemble > 1:
         return "autograd"
-    return "native" if threads == 1 and native.is_used() else "manual"
+    on_cpu = torch.device(device).type == "cpu"
+    return "native" if on_cpu and threads == 1 and native.is_used() else "manual"
 
 
 class _Affine:

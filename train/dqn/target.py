@@ -79,12 +79,17 @@ class TargetUpdate(Stateful):
         """Call after update number `gradient_step` (from 1); returns whether the target moved."""
         if not self.rule.syncs_at(gradient_step):
             return False
+        self.pull()
+        self.last_sync = gradient_step
+        return True
+
+    @torch.no_grad()
+    def pull(self) -> None:
+        """What the rule does to the target where it is due."""
         if isinstance(self.rule, Polyak):
             torch._foreach_lerp_(self._target, self._online, self.rule.tau)
         else:
             torch._foreach_copy_(self._target, self._online)
-        self.last_sync = gradient_step
-        return True
 
     @torch.no_grad()
     def distance(self) -> float:

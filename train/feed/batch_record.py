@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
@@ -104,17 +105,26 @@ class FeedRecord(Stateful):
         self._before: tuple[NDArray[np.int64], ...] = self._last
 
     def batch(
-        self, step: int, env_steps: int, batch: ReplayBatch, loss: Loss, last_sync: int
+        self,
+        step: int,
+        env_steps: int,
+        batch: ReplayBatch,
+        loss: Loss,
+        last_sync: int,
+        *,
+        tail: Tensor | None = None,
     ) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
 
         Inside the update loop: only what will not be there any more when the interval is closed.
+        `tail` (B, 3) is the rows' action, reward and discount, where whoever learnt has them.
         """
         slots, logged = batch.slots, batch.logged
         td, q = loss.td.cpu().numpy(), loss.q.cpu().numpy()
         weight = np.ones_like(td) if batch.weight is None else batch.weight.cpu().numpy()
-        tail = batch.rows[:, -3:].cpu().numpy().copy()  # the buffer is filled again
-        action, reward, discount = tail[:, 0].astype(np.int16), tail[:, 1], tail[:, 2]
+        last = batch.rows[:, -3:].cpu() if tail is None else tail
+        action, reward, discount = last.numpy().T.copy()  # the buffer is filled again
+        action = action.astype(np.int16)
         if logged:
             self._logged.append(
                 batch.log_rows,

@@ -7,7 +7,9 @@ what each stratum has of it, the share controller says (`restock.replay.sampling
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -34,7 +36,7 @@ _NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 class ReplayBatch:
     """One batch: the logged rows first, then the fresh ones."""
 
-    rows: Tensor  # (B, W) float32, on the learner's device
+    gather: Callable[[], Tensor]  # its rows, while the ring holds them
     weight: Tensor | None  # (B,) float32
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
@@ -44,6 +46,11 @@ class ReplayBatch:
     @property
     def logged(self) -> int:
         return len(self.log_rows)
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """Packed, (B, W) float32."""
+        return self.gather()
 
 
 class Batches(Stateful):
@@ -68,19 +75,15 @@ class Batches(Stateful):
         batch_size: int,
         logs_share: float | None,
         seed: int,
-        device: torch.device,
     ) -> None:
-        self.logs, self.ring, self.device = logs, ring, device
+        self.logs, self.ring = logs, ring
         self.batch_size = batch_size
         self._rng = np.random.default_rng([seed, 1])
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
-        self._logs_on_device: Tensor | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
         if logs is not None:
             self._draws = logs.sampler(batch_size, logs_share, seed)
-            if not self._draws.reads_chunks:
-                self._logs_on_device = logs.rows.to(device)
             if logs.panel is not None:
                 self._max_age = logs.panel.header.mixture.max_age_env_steps
 
@@ -88,6 +91,16 @@ class Batches(Stateful):
     def controller(self) -> ShareController | None:
         """The shares in force, and what was drawn; None without logs."""
         return self._draws.controller if self._draws is not None else None
+
+    @property
+    def needs_td(self) -> bool:
+        """Whether the next batch depends on the TD errors of the last."""
+        return self._draws is not None and self._draws.needs_td
+
+    @property
+    def reads_chunks(self) -> bool:
+        """Whether the logs' rows are not in memory."""
+        return self._draws is not None and self._draws.reads_chunks
 
     def describe(self) -> list[dict[str, Any]]:
         """Rows for the run's table `shares`; none without logs."""
@@ -140,27 +153,24 @@ class Batches(Stateful):
         return young[self._rng.integers(len(young), size=count)]
 
     def _gather(self, drawn: BatchDraw, slots: Ints) -> ReplayBatch:
-        logged, size = len(drawn.rows), len(drawn.rows) + len(slots)
-        parts = []
-        if logged:
-            parts.append(self._gather_logs(drawn.rows))
-        if len(slots):
-            fresh = gather_rows(self._fresh, torch.from_numpy(slots))
-            parts.append(fresh.to(self.device))
-        rows = parts[0] if len(parts) == 1 else torch.cat(parts)
         weight = None
         if drawn.weight is not None:
-            weight = torch.ones(size)
-            weight[:logged] = torch.from_numpy(drawn.weight)
-            weight = weight.to(self.device)
-        return ReplayBatch(rows, weight, drawn.rows, drawn.strata, slots, drawn.quota)
+            weight = torch.ones(len(drawn.rows) + len(slots))
+            weight[: len(drawn.rows)] = torch.from_numpy(drawn.weight)
+        read: Tensor | None = None
+        if self.reads_chunks and self._draws is not None and len(drawn.rows):
+            # They are at hand until the next draw.
+            read = torch.empty((len(drawn.rows), self._fresh.shape[1]))
+            self._draws.gather(drawn.rows, read.numpy())
 
-    def _gather_logs(self, rows: Ints) -> Tensor:
-        """Rows (L,) of the panel, (L, W), on the device."""
-        if self._logs_on_device is not None:
-            return gather_rows(self._logs_on_device, torch.from_numpy(rows).to(self.device))
-        if self._draws is None:
-            raise RuntimeError("there are no logs to sample from")
-        packed = torch.empty((len(rows), self._fresh.shape[1]))
-        self._draws.gather(rows, packed.numpy())
-        return packed.to(self.device)
+        def gather() -> Tensor:
+            parts = []
+            if read is not None:
+                parts.append(read)
+            elif self.logs is not None and len(drawn.rows):
+                parts.append(gather_rows(self.logs.rows, torch.from_numpy(drawn.rows)))
+            if len(slots):
+                parts.append(gather_rows(self._fresh, torch.from_numpy(slots)))
+            return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+        return ReplayBatch(gather, weight, drawn.rows, drawn.strata, slots, drawn.quota)

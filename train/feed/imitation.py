@@ -34,7 +34,6 @@ class Imitation(Stateful):
 
     Args:
         batch_size: M.
-        device: where the batches are wanted.
         mirror: of the task, where rows are mirrored.
 
     Raises:
@@ -51,10 +50,9 @@ class Imitation(Stateful):
         *,
         batch_size: int,
         seed: int,
-        device: torch.device,
         mirror: Mirror | None = None,
     ) -> None:
-        self.logs, self.ring, self.device, self._mirror = logs, ring, device, mirror
+        self.logs, self.ring, self._mirror = logs, ring, mirror
         self.batch_size, self._seed = batch_size, seed
         self._rng = np.random.default_rng([seed, 7])
         self._offline = self._online = _Drawn(np.empty(0, np.int64), np.empty(0))
@@ -99,9 +97,7 @@ class Imitation(Stateful):
             turned = self._rng.random(len(observation)) < 0.5
             observation[turned] = self._mirror.observation(observation[turned])
             action[turned] = self._mirror.action(action[turned])
-        return Labelled(
-            torch.from_numpy(observation).to(self.device), torch.from_numpy(action).to(self.device)
-        )
+        return Labelled(torch.from_numpy(observation), torch.from_numpy(action))
 
     def _logged_states(self, rows: Ints) -> tuple[F32, Ints]:
         """Observations (n, D) of rows of the logs, and the actions (n,) that were taken."""

@@ -246,7 +246,7 @@ class MixedFeed:
             return
         unknown = np.full(len(packed), np.nan, np.float32)
         batch = ReplayBatch(
-            rows=torch.from_numpy(packed),
+            lambda: torch.from_numpy(packed),
             weight=None if weight is None else torch.from_numpy(weight),
             log_rows=drawing.rows,
             log_stratum=drawing.strata,

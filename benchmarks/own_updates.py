@@ -1,0 +1,116 @@
+"""Restock's updates from a full buffer, as its benchmarks time them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays
+
+from restock.replay.ring.ring import FreshRing
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner
+from restock.train.dqn.manual_backprop import UpdatePath
+from restock.train.feed.batch_record import FeedRecord
+from restock.train.feed.batches import Batches
+from restock.train.feed.held_rows import EpisodeLabels
+from restock.train.feed.logs import Coded, Logs, LogTerms
+from restock.train.run.run import Run
+from restock.train.update_blocks import Made, UpdateBlocks
+
+
+def config(batch: int, **changes: Any) -> TrainConfig:
+    base = {"replay": {"batch_size": batch}, "optimizer": {"learning_rate": 3e-4}}
+    return parse_config({**base, **changes}, where="benchmark")
+
+
+class Restock:
+    """Restock's update; with `logs`, half of the batch from logs; with `run`, recorded.
+
+    In `blocks`, as a run on a GPU makes them.
+    """
+
+    def __init__(
+        self,
+        settings: TrainConfig,
+        arrays: Arrays,
+        *,
+        run: Run | None = None,
+        logs: bool = False,
+        path: UpdatePath | None = None,
+        blocks: bool = False,
+    ) -> None:
+        ring = FreshRing(ROWS, 16, OBSERVATION, discount=DISCOUNT, conditions=("rare", "nominal"))
+        discount = DISCOUNT * (1 - arrays["done"])
+        columns = [arrays["observation"], arrays["next_observation"], arrays["action"]]
+        ring.rows[:] = np.concatenate([*columns, arrays["reward"], discount], axis=1)
+        ring.appended = ROWS
+        shelf = self._logs(torch.from_numpy(ring.rows.copy())) if logs else None
+        self.learner = Learner(settings, OBSERVATION, ACTIONS, path=path)
+        self.batches = Batches(
+            shelf,
+            ring,
+            batch_size=settings.replay.batch_size,
+            logs_share=0.5 if logs else 0.0,
+            seed=0,
+        )
+        ring.strata.move(np.arange(ROWS), 1)  # as where episodes have ended
+        self.blocks: UpdateBlocks | None = None
+        if blocks:
+            none = LogTerms(None, None)
+            self.blocks = UpdateBlocks(settings, self.learner, self.batches, None, none)
+        self.feed = None
+        if run is not None:
+            self.feed = FeedRecord(
+                run,
+                shelf,
+                ring,
+                audit_share=0.01,
+                seed=0,
+                actions=[f"action {index}" for index in range(ACTIONS)],
+                greedy=self.learner.greedy,
+                labels=EpisodeLabels(),
+            )
+
+    @staticmethod
+    def _logs(rows: torch.Tensor) -> Logs:
+        rare = np.arange(ROWS) < ROWS // 50
+        codes = Coded(rare.astype(np.int32), ["nominal", "rare"])
+        return Logs(
+            rows=rows,
+            strata=["nominal", "rare"],
+            timings=["pre", "pre"],
+            stratum_rows=[np.flatnonzero(~rare), np.flatnonzero(rare)],
+            shares=np.array([0.8, 0.2]),
+            weights=None,
+            as_of_ns=0,
+            transition_id=np.arange(ROWS),
+            stamp_ns=np.zeros(ROWS, np.int64),
+            condition=codes,
+            behaviour_policy=codes,
+            behaviour_version=codes,
+            episode=codes,
+        )
+
+    def __call__(self, updates: int) -> None:
+        learner = self.learner
+        for batch, loss, tail in self._made(updates):
+            step = learner.gradient_steps
+            if self.feed is not None:
+                self.feed.batch(step, step * 4, batch, loss, learner.target.last_sync, tail=tail)
+            if learner.target.last_sync != step:
+                learner.target.after(step)
+            if self.feed is not None and step % 500 == 0:
+                self.feed.flush(step * 4, step, "online")
+
+    def _made(self, updates: int) -> Iterator[Made]:
+        draw, learner = self.batches.draw_online, self.learner
+        if self.blocks is not None:
+            yield from self.blocks.make(updates, draw, conservative=0.0, labelled=False)
+            return
+        for _ in range(updates):
+            batch = draw()
+            rows = batch.rows.to(learner.device)
+            yield batch, learner.update(rows, weight=batch.weight, logged=batch.logged), None

@@ -1,0 +1,180 @@
+"""Updates in blocks: as one by one on the CPU, and on a GPU as a graph that is replayed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.toy_run import assert_same_run, config, logs, run_to_end, session, tables
+from support.toy_twin import TASK
+
+from restock.errors import MixtureError
+from restock.replay.ring.ring import FreshRing
+from restock.train.loop import train
+from restock.train.session import Session
+from restock.train.update_blocks import LONGEST, DeviceTable, UpdateBlocks
+
+OFFLINE = {"env_steps": 0, "offline_updates": 3 * LONGEST + 5}
+# What the policy would do in audited rows is asked at the end of a block.
+OF_POLICY = {"actions", "audit"}
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request: pytest.FixtureRequest) -> str:
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return str(request.param)
+
+
+def in_blocks(path: Path, device: str, *, resume: bool = False, **changes: Any) -> Session:
+    """Not trained yet."""
+    live = session(path, config(device=device, **changes), resume=resume)
+    if live.blocks is None:
+        live.blocks = UpdateBlocks(
+            live.config, live.learner, live.batches, live.imitation, live.log_terms
+        )
+    return live
+
+
+def trained(live: Session) -> Session:
+    train(live)
+    live.close()
+    return live
+
+
+WAYS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "conservative": {"loss": {"conservative": 0.5}},
+    "hard target": {"target": {"rule": "hard", "every": 13}},
+    "margin": {"loss": {"margin": 0.5, "margin_policies": ["operator"]}},
+    "clipped": {"optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1}},
+    "dueling": {"network": {"hidden": [16], "dueling": True}, "loss": {"conservative": 0.5}},
+    "quantiles": {"network": {"hidden": [16], "quantiles": 4}, "loss": {"conservative": 0.5}},
+    "ensemble": {"network": {"hidden": [16], "ensemble": 2}, "loss": {"margin": 0.5}},
+    "munchausen": {"loss": {"munchausen": 0.9}},
+    "teacher": {"teacher": {"source": "logs", "hidden": [16], "offline_updates": 20}},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_updates_in_blocks_are_those_one_by_one(way: str, device: str, tmp_path: Path) -> None:
+    """What is fed, to the bit; what is learnt, but for rounding."""
+    changes = {**WAYS[way], "schedule": OFFLINE}
+    one = run_to_end(tmp_path / "one", config(**changes))
+    blocks = trained(in_blocks(tmp_path / "blocks", device, **changes))
+    assert blocks.learner.gradient_steps == one.learner.gradient_steps == OFFLINE["offline_updates"]
+    assert blocks.learner.target.last_sync == one.learner.target.last_sync
+    for name in ("network", "target_network", "policy"):
+        expected = getattr(one.learner, name).state_dict()
+        for key, value in getattr(blocks.learner, name).state_dict().items():
+            np.testing.assert_allclose(
+                value.cpu(), expected[key], rtol=2e-3, atol=2e-4, err_msg=f"{name} {key}"
+            )
+    fed, expected_fed = tables(blocks.run.path), tables(one.run.path)
+    rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "weight", "reward"]
+    assert fed["audit"].select(rows).equals(expected_fed["audit"].select(rows))
+    assert len(fed["audit"]) > 0
+    assert fed["sampled_episodes"].equals(expected_fed["sampled_episodes"])
+
+
+def test_a_run_in_blocks_is_the_run_one_by_one(tmp_path: Path) -> None:
+    """Online too: the ring, the target's clock, the intervals and what is recorded."""
+    one = run_to_end(tmp_path / "one", config())
+    blocks = trained(in_blocks(tmp_path / "blocks", "cpu"))
+    for name, value in one.learner.policy.state_dict().items():
+        assert torch.equal(value, blocks.learner.policy.state_dict()[name]), name
+    np.testing.assert_array_equal(one.ring.rows, blocks.ring.rows)
+    fed, expected = tables(blocks.run.path), tables(one.run.path)
+    for name in expected.keys() - OF_POLICY:
+        assert fed[name].equals(expected[name]), name
+    audit = [name for name in expected["audit"].column_names if name != "greedy_action"]
+    assert fed["audit"].select(audit).equals(expected["audit"].select(audit))
+
+
+def test_a_draw_that_depends_on_td_errors_waits_for_them(device: str, tmp_path: Path) -> None:
+    live = in_blocks(tmp_path / "run", device)
+    assert live.blocks is not None
+    live.batches._draws.needs_td = True  # type: ignore[union-attr]
+    order = []
+
+    def draw() -> Any:
+        order.append("drawn")
+        return live.batches.draw_offline()
+
+    for _ in live.blocks.make(5, draw, conservative=0.0, labelled=False):
+        order.append("learnt")
+    assert order == ["drawn", "learnt"] * 5
+    live.close()
+
+
+def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path) -> None:
+    whole = trained(in_blocks(tmp_path / "whole", device))
+    assert_same_run(whole, trained(in_blocks(tmp_path / "again", device)))
+    stopped = in_blocks(tmp_path / "stopped", device)
+    asked = iter(range(150))
+    with pytest.raises(Exception, match="restock train --resume"):
+        train(stopped, stop=lambda: next(asked, None) is None)
+    stopped.close()
+    resumed = trained(in_blocks(tmp_path / "stopped", device, resume=True))
+    assert_same_run(whole, resumed)
+
+
+def test_rows_on_the_device_follow_the_ring(device: str) -> None:
+    ring = FreshRing(64, 4, TASK.observation_size, discount=0.9, n_step=2)
+    shelf = logs()
+    table = DeviceTable(shelf.rows, ring, torch.device(device))
+    rng = np.random.default_rng(0)
+    for step in range(40):  # more than once around
+        observation = rng.random((4, TASK.observation_size)).astype(np.float32)
+        ended = rng.random(4) < 0.1
+        ring.append(
+            observation=observation,
+            action=rng.integers(3, size=4),
+            reward=rng.random(4),
+            terminated=ended,
+            truncated=np.zeros(4, np.bool_),
+            next_observation=observation,
+            env_step=step,
+            gradient_step=0,
+        )
+        if step % 3 == 0:
+            table.follow()
+            np.testing.assert_array_equal(table.rows[: table.logs].cpu(), shelf.rows)
+            np.testing.assert_array_equal(table.rows[table.logs :].cpu(), ring.rows)
+
+
+def test_what_was_drawn_before_the_logs_are_used_up_is_learnt(device: str, tmp_path: Path) -> None:
+    live = in_blocks(tmp_path / "run", device)
+    left = iter(range(LONGEST + 3))
+
+    def draw() -> Any:
+        if next(left, None) is None:
+            raise MixtureError("used up")
+        return live.batches.draw_offline()
+
+    made = live.blocks.make(99, draw, conservative=0.0, labelled=False) if live.blocks else iter(())
+    counts = []
+
+    def make() -> None:
+        counts.extend(live.learner.gradient_steps for _ in made)
+
+    with pytest.raises(MixtureError, match="used up"):
+        make()
+    assert counts == list(range(1, LONGEST + 4))
+    assert live.learner.gradient_steps == LONGEST + 3
+    live.close()
+
+
+def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Path) -> None:
+    shelf = logs()
+    shelf.rows[7, 2] = torch.nan
+    live = session(tmp_path / "run", config(device=device, schedule=OFFLINE), logs=shelf)
+    live.blocks = UpdateBlocks(live.config, live.learner, live.batches, None, live.log_terms)
+    with pytest.raises(Exception, match=r"update \d+.*panel row 7 ") as raised:
+        train(live)
+    at = int(str(raised.value).split("at update ")[1].split(";")[0])
+    assert at == live.learner.gradient_steps
+    live.close()
