@@ -2,19 +2,22 @@
 
 Double DQN (arXiv:1509.06461) with n-step returns and half of each online batch from logs (RLPD,
 arXiv:2302.02948), after an offline phase on the logs and warm-up rollouts without updates (WSRL,
-arXiv:2412.07762). Read `train` from top to bottom: it is the whole of it.
+arXiv:2412.07762). Read `_train` from top to bottom: it is the whole of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from restock.errors import ExitCode, RestockError
+from restock.train.dqn.config import GIVEN
+from restock.train.dqn.loss import Loss
 from restock.train.dqn.network import clone
 from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
@@ -27,12 +30,15 @@ from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measure
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
+from restock.train.feed.teacher import TeacherFailed
 from restock.train.finite import check_loss, check_parameters
 from restock.train.guard import enforce, falls
 from restock.train.jump_start import POLICIES
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
+from restock.train.update_blocks import Made
 
+_OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
 Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
 
 
@@ -65,21 +71,39 @@ def train(
 
     Args:
         stop: asked between steps; True ends the run with a checkpoint.
-        notify: told of every row of `progress` and every evaluation.
+        notify: told of every row of `progress`, every evaluation, and a teacher without opinions.
 
     Raises:
         TrainingInterrupted: `stop` said so.
+        TeacherFailed: the teacher did, before the step that it was asked for; a checkpoint was
+            written.
         NotFinite: a loss or gradient is NaN or infinite; names the rows of the batch.
     """
+    try:
+        return _train(session, stop, notify)
+    except TeacherFailed as error:
+        _save(session)
+        session.write_held()
+        again = f"; then continue with `restock train --resume {session.run.path}`"
+        raise TeacherFailed(
+            f"{error.what}; a checkpoint was written",
+            where=error.where,
+            remedy=f"{error.remedy}{'' if session.config.teacher.source == GIVEN else again}",
+        ) from error
+
+
+def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainResult:
     config, progress, learner = session.config, session.progress, session.learner
     schedule, epsilon_at = config.schedule, config.epsilon.at
     offline_updates = schedule.offline_updates if session.logs is not None else 0
 
     # 1. Offline, the logs alone: what their teacher finds plausible, then values.
     _clone_teacher(session, stop)
-    while learner.gradient_steps < offline_updates and _time_left(session):
+    while (left := offline_updates - learner.gradient_steps) > 0 and _time_left(session):
         _interrupt(session, stop)
-        _update(session, session.batches.draw_offline(), "offline", notify)
+        _updates(
+            session, min(left, 1 if session.blocks is None else _OFFLINE_BLOCK), "offline", notify
+        )
     if progress.evaluated_at < 0 and offline_updates:
         if session.interval.updates:
             _close_interval(session, "offline", notify)
@@ -122,9 +146,9 @@ def train(
         # 4. … while ended episodes get their labels, and the learner learns from what the ring held
         # before this step.
         session.run.append("episodes", session.collector.label())
-        for _ in range(_updates_due(session)):
-            _update(session, session.batches.draw_online(progress.env_steps), "online", notify)
-            progress.online_updates += 1
+        due = _updates_due(session)
+        _updates(session, due, "online", notify)
+        progress.online_updates += due
 
         # 5. The step's transitions go into the ring.
         ended = session.collector.finish(
@@ -159,6 +183,7 @@ def train(
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify)
+    _note_silence(session, notify)
     _save(session)
     session.write_held()
     return TrainResult(
@@ -190,29 +215,84 @@ def _updates_due(session: Session) -> int:
     return int(collected * session.config.schedule.updates_per_env_step) - progress.online_updates
 
 
-def _update(session: Session, batch: ReplayBatch, phase: str, notify: Notify) -> None:
-    """One gradient step, its record, and the target's progress."""
-    learner, interval = session.learner, session.interval
-    expert, return_to_go = session.log_terms.rows(batch.log_rows)
-    loss = learner.update(
-        batch.rows,
-        weight=batch.weight,
-        logged=batch.logged,
-        conservative=_conservative_weight(session, phase),
-        return_to_go=return_to_go,
-        expert=expert,
-        labelled=session.imitation.draw_online()
-        if session.imitation is not None and phase == "online"
-        else None,
+def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
+    """So many gradient steps, the record of each, and the target's progress."""
+    while count > 0:
+        made = _until_due(session, count)
+        sync = session.learner.target.last_sync
+        for batch, loss, tail in _made(session, made, phase):
+            _note(session, batch, loss, sync, tail, phase)
+            sync = session.learner.target.last_sync
+        _follow(session, phase, notify)
+        count -= made
+
+
+def _until_due(session: Session, count: int) -> int:
+    """Of `count` updates those up to where an interval is closed or a target copied."""
+    if session.blocks is None:
+        return 1
+    step, rule = session.learner.gradient_steps, session.learner.target.rule
+    due = [session.config.record.every_updates]
+    if isinstance(rule, Hard):
+        due.append(rule.every)
+    return min(count, *(every - step % every for every in due))
+
+
+def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
+    """So many updates."""
+    progress, learner = session.progress, session.learner
+    conservative = _conservative_weight(session, phase)
+    imitation = session.imitation if phase == "online" else None
+
+    def draw() -> ReplayBatch:
+        if phase == "offline":
+            return session.batches.draw_offline()
+        return session.batches.draw_online(progress.env_steps)
+
+    if session.blocks is not None:
+        yield from session.blocks.make(
+            count, draw, conservative=conservative, labelled=imitation is not None
+        )
+        return
+    for _ in range(count):
+        batch = draw()
+        expert, return_to_go = session.log_terms.rows(batch.log_rows)
+        loss = learner.update(
+            batch.rows,
+            weight=batch.weight,
+            logged=batch.logged,
+            conservative=conservative,
+            return_to_go=return_to_go,
+            expert=expert,
+            labelled=None if imitation is None else imitation.draw_online(),
+        )
+        yield batch, loss, None
+
+
+def _note(
+    session: Session,
+    batch: ReplayBatch,
+    loss: Loss,
+    last_sync: int,
+    tail: Tensor | None,
+    phase: str,
+) -> None:
+    """The record of the update just counted; `last_sync` is the target's, before it."""
+    steps, interval = session.steps, session.interval
+    session.feed.batch(
+        steps["gradient_steps"], steps["env_steps"], batch, loss, last_sync, tail=tail
     )
-    step = learner.gradient_steps
-    session.feed.batch(step, session.progress.env_steps, batch, loss, learner.target.last_sync)
     value = float(loss.value.detach())
     check_loss(session, batch, loss, value, phase)
     session.batches.learnt(batch, loss.td)
     interval.updates += 1
     interval.loss += value
-    every = session.config.record.every_updates
+
+
+def _follow(session: Session, phase: str, notify: Notify) -> None:
+    """The target's progress after an update, and the end of an interval."""
+    learner, interval = session.learner, session.interval
+    step, every = learner.gradient_steps, session.config.record.every_updates
     rule = learner.target.rule
     last_of_interval = (step - 1) // every != (step - 1 + getattr(rule, "every", 1)) // every
     if isinstance(rule, Hard) and rule.syncs_at(step) and last_of_interval:
@@ -220,7 +300,8 @@ def _update(session: Session, batch: ReplayBatch, phase: str, notify: Notify) ->
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:
             interval.lag_before_sync = session.probe.measure(learner)[1]
-    learner.target.after(step)
+    if learner.target.last_sync != step:  # of a block it has followed already
+        learner.target.after(step)
     if step % every == 0:
         _close_interval(session, phase, notify)
 
@@ -282,6 +363,17 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     session.events.scalars(progress.env_steps, "train", row)
     session.interval = Interval(env_steps_before=progress.env_steps, wall_s_before=wall_s)
     notify("progress", row)
+    if not session.silence_noted:
+        _note_silence(session, notify)
+
+
+def _note_silence(session: Session, notify: Notify) -> None:
+    """Tell whoever watches that the teacher has answered nothing so far."""
+    teacher = session.collector.teacher
+    if teacher is None or teacher.answered or teacher.asked == session.silence_noted:
+        return
+    session.silence_noted = teacher.asked
+    notify("teacher", {"asked": teacher.asked, "answered": 0})
 
 
 def _evaluate_off_policy(session: Session) -> None:

@@ -45,6 +45,7 @@ from restock.train.run.run import Run
 from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.update_blocks import UpdateBlocks
 
 
 @dataclass
@@ -126,11 +127,13 @@ class Session(Stateful):
     jump_start: JumpStart | None
     practice: Practice
     imitation: Imitation | None  # what the behaviour network learns from
+    blocks: UpdateBlocks | None = None  # makes updates, where the learner is not on the CPU
     progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
     last: Score | None = None
     start: StartPolicy | None = None  # what was chosen to drive first; None: what is learnt
+    silence_noted: int = 0  # states that the teacher had answered none of, when that was noted
     _started: float = field(default_factory=time.monotonic)
 
     @property
@@ -271,7 +274,6 @@ def open_session(
         batch_size=config.replay.batch_size,
         logs_share=config.replay.logs_share,
         seed=seed,
-        device=learner.device,
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
     collector = Collector(env, ring, conditions, task, executor, teacher)
@@ -325,7 +327,6 @@ def open_session(
             ring,
             batch_size=config.replay.batch_size,
             seed=seed,
-            device=learner.device,
             mirror=Mirror.of(task) if config.teacher.mirror else None,
         )
         if config.teacher.filters
@@ -336,6 +337,10 @@ def open_session(
         session.restore()
     else:
         session.collector.reset(seed)
+    if learner.device.type != "cpu":
+        session.blocks = UpdateBlocks(
+            config, learner, batches, session.imitation, session.log_terms
+        )
     session.practice.check_reference()
     from_step = session.progress.env_steps if resume else None
     sinks = tracker_sinks(run, config.record.trackers)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import quantile_target, td_target
 from restock.train.feed.imitation import Imitation
-from restock.train.feed.teacher import open_teacher
+from restock.train.feed.teacher import TeacherFailed, open_teacher
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.prepare import train as train_new
@@ -296,7 +297,6 @@ def test_half_of_the_rows_are_drawn_mirrored_with_the_opposite_action(tmp_path: 
         ring,
         batch_size=400,
         seed=0,
-        device=torch.device("cpu"),
         mirror=mirror,
     )
     drawn = imitation.draw_online()
@@ -359,6 +359,105 @@ def test_a_teacher_that_gives_no_action_is_refused(
         train(live)
     live.close()
     assert live.progress.online_updates == 0
+
+
+TEACHERS = """
+import numpy as np
+
+def broken(env, observation):
+    return np.ones(int("three"))
+
+def unlike():
+    pass
+
+def ended(env, observation):
+    raise SystemExit(0)
+
+class Made:
+    def __init__(self, needed):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "line"),
+    [
+        ("broken", "teachers_of_mine:broken raised ValueError: invalid literal", 5),
+        ("unlike", "teachers_of_mine:unlike raised TypeError: unlike.. takes 0", 7),
+        ("ended", "teachers_of_mine:ended raised SystemExit: 0", 11),
+        ("Made", "making the teacher teachers_of_mine:Made raised TypeError", 13),
+    ],
+)
+@pytest.mark.parametrize("overlap", [True, False])
+def test_an_error_of_the_users_teacher_names_its_line(
+    name: str, message: str, line: int, overlap: bool, tmp_path: Path, monkeypatch: Any
+) -> None:
+    (tmp_path / "teachers_of_mine.py").write_text(TEACHERS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "teachers_of_mine", raising=False)
+    source = f"teachers_of_mine:{name}"
+    settings = config(teacher={**TAUGHT["teacher"], "source": source}, env={"overlap": overlap})
+    with pytest.raises(ConfigError, match=message) as refused:
+        train(session(tmp_path / "a", settings))
+    assert str(refused.value.where).endswith(f"teachers_of_mine.py:{line}")
+
+
+def test_a_module_that_raises_names_its_line(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, text, said in (
+        ("module_that_ends", "import sys\nsys.exit(0)\n", "raised SystemExit"),
+        ("module_that_fails", "\nint('three')\n", "raised ValueError"),
+        ("module_unreadable", "\ndef act(:\n", "raised SyntaxError"),
+    ):
+        (tmp_path / f"{name}.py").write_text(text)
+        with pytest.raises(ConfigError, match=f"importing {name}:act {said}") as refused:
+            session(tmp_path / name, config(teacher={"source": f"{name}:act"}))
+        assert str(refused.value.where).endswith(f"{name}.py:2")
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(overlap: bool, tmp_path: Path) -> None:
+    calls = 0
+
+    def late(env: Any, observation: np.ndarray) -> np.ndarray | None:
+        nonlocal calls
+        calls += 1
+        return None if calls > 100 else forward(env, observation)
+
+    settings = config(**TAUGHT, env={"overlap": overlap})
+    live = session(tmp_path / "a", settings, teacher=late)
+    with pytest.raises(TeacherFailed, match=r"returned nothing.*; a checkpoint was written"):
+        train(live)
+    live.close()
+    assert live.progress.env_steps == 400
+    assert live.progress.online_updates > 0
+    again = session(tmp_path / "a", settings, teacher=forward, resume=True)
+    assert again.progress.env_steps == 400
+    np.testing.assert_array_equal(again.ring.rows, live.ring.rows)
+    result = train(again)
+    again.close()
+    assert result.env_steps == 1600
+    assert again.progress.online_updates == int(
+        (1600 - again.progress.online_from) * settings.schedule.updates_per_env_step
+    )
+
+
+@pytest.mark.parametrize("answer", [UNKNOWN, FORWARD])
+def test_whoever_watches_is_told_of_a_teacher_without_opinions(answer: int, tmp_path: Path) -> None:
+    told: list[tuple[str, int]] = []
+    live = session(
+        tmp_path / "a",
+        config(**TAUGHT),
+        teacher=lambda env, observation: np.full(len(observation), answer),
+    )
+    train(live, notify=lambda event, values: told.append((event, values.get("asked", 0))))
+    live.close()
+    notes = [asked for event, asked in told if event == "teacher"]
+    if answer == FORWARD:
+        assert notes == []
+    else:  # once early, and once at the end
+        early, last = notes
+        assert early < last == 1600
 
 
 def test_who_cannot_be_asked_is_refused(tmp_path: Path) -> None:

@@ -157,11 +157,11 @@ class Collector(Stateful):
         # The command in force over the step that begins, as a log has it.
         self._history["command_speed_mps"][envs, self._steps] = self._actions[action, 0]
         self._history["command_yaw_rate_radps"][envs, self._steps] = self._actions[action, 1]
-        self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
         if self._executor is not None:
             self._future = self._executor.submit(self._step, action)
         else:
             self._result = self._step(action)
+        self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
         return self._result
 
     def _step(self, action: NDArray[np.int64]) -> Any:
@@ -183,10 +183,11 @@ class Collector(Stateful):
         """
         if self._sent is None:
             raise RuntimeError("finish() without start()")
-        result = self._future.result() if self._future is not None else self._result
-        self._future = self._result = None
-        observation, reward, terminated, truncated, info = result
+        # Before the result: where the teacher failed, no step was made, and none is under way.
         (action, probability, policy), self._sent = self._sent, None
+        future, self._future = self._future, None
+        result, self._result = future.result() if future is not None else self._result, None
+        observation, reward, terminated, truncated, info = result
         ended = np.asarray(terminated | truncated, np.bool_)
         next_observation = np.array(observation, copy=True)
         for place in np.flatnonzero(ended):  # SAME_STEP: `observation` is the next episode's first

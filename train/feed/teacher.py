@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
+import sysconfig
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+import restock
 from restock.arrays import F32, Ints
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RestockError
+from restock.files import first_line
 from restock.ingest.task.task import Task
 from restock.state import Stateful, restored, saved
 from restock.train.dqn.behaviour import UNKNOWN
@@ -67,6 +74,10 @@ class _Called:
         self.act = function
 
 
+class TeacherFailed(ConfigError):
+    """It raised an error, or its answer was none."""
+
+
 class AskedTeacher(Stateful):
     """A teacher whose answers are checked.
 
@@ -80,14 +91,17 @@ class AskedTeacher(Stateful):
 
     def __init__(self, teacher: Teacher, task: Task, name: str) -> None:
         self._teacher, self._actions, self._name = teacher, task.action_names, name
+        self.asked = self.answered = 0  # states since this process began
 
     def ask(self, env: Any, observation: F32) -> Label:
         """What it would do, (N,); UNKNOWN where it has no opinion.
 
         Raises:
-            ConfigError: it gave no action, other than N of them, or one that the task has not.
+            TeacherFailed: it raised an error, gave no action, other than N of them, or one that
+                the task has not.
         """
-        given = self._teacher.act(env, observation)
+        with _of_the_user(f"the teacher {self._name}", self._teacher.act):
+            given = self._teacher.act(env, observation)
         label = np.asarray(given)
         count = len(observation)
         if label.shape != (count,) or not np.issubdtype(label.dtype, np.integer):
@@ -100,10 +114,12 @@ class AskedTeacher(Stateful):
                 f"returned action {int(label[env_index])} for environment {env_index}: the task's"
                 f" are 0 to {len(self._actions) - 1}"
             )
+        self.asked += count
+        self.answered += int((label != UNKNOWN).sum())
         return label.astype(np.int16)
 
-    def _refused(self, what: str) -> ConfigError:
-        return ConfigError(
+    def _refused(self, what: str) -> TeacherFailed:
+        return TeacherFailed(
             f"the teacher {self._name} {what}",
             where="teacher.source",
             remedy="return an action's index for each environment, (N,), or -1 for no opinion",
@@ -138,7 +154,8 @@ def open_teacher(
         given = _imported(config.source)
     name = config.source if config.source != GIVEN else type(given).__name__
     if isinstance(given, type):
-        given = given()
+        with _of_the_user(f"making the teacher {name}", given):
+            given = given()
     if not hasattr(given, "act"):
         if not callable(given):
             raise ConfigError(
@@ -148,6 +165,52 @@ def open_teacher(
             )
         given = _Called(given)
     return AskedTeacher(given, task, name)
+
+
+@contextmanager
+def _of_the_user(what: str, called: Any) -> Iterator[None]:
+    """An error of the user's code names its file and line, for it is no bug of Restock's.
+
+    So does SystemExit, which would end a run without a word.
+    """
+    try:
+        yield
+    except RestockError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise _raised(what, called, error) from error
+
+
+def _raised(what: str, called: Any, error: BaseException) -> TeacherFailed:
+    said = f": {first_line(error)}" if str(error) else ""
+    return TeacherFailed(
+        f"{what} raised {type(error).__name__}{said}",
+        where=_place(called, error),
+        remedy="correct it: it is asked by act(env, observation), and a class is made without"
+        " arguments",
+    )
+
+
+def _place(called: Any, error: BaseException) -> str:
+    """FILE:LINE of the user's innermost line that the error came through, else of what was called.
+
+    Without frames of libraries and of Restock, which the user's code may call.
+    """
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}:{error.lineno}"
+    libraries = (
+        *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
+        str(Path(restock.__file__).parent),
+        "<",  # the import system's own
+    )
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(libraries)]
+    if own:
+        return f"{own[-1].filename}:{own[-1].lineno}"
+    try:
+        return f"{inspect.getsourcefile(called)}:{inspect.getsourcelines(called)[1]}"
+    except (TypeError, OSError):  # it has no source
+        return "teacher.source"
 
 
 def _imported(source: str) -> Any:
@@ -170,8 +233,10 @@ def _imported(source: str) -> Any:
             remedy="give a module that Python can import, or a file in the working directory, and "
             "the name of the teacher in it",
         ) from error
+    except (Exception, SystemExit) as error:
+        raise _raised(f"importing {source}", None, error) from error
     finally:
         sys.path.remove(here)
 
 
-__all__ = ["AskedTeacher", "Label", "OperatorTeacher", "Teacher", "open_teacher"]
+__all__ = ["AskedTeacher", "Label", "OperatorTeacher", "Teacher", "TeacherFailed", "open_teacher"]

@@ -49,7 +49,7 @@ class TrainCommand:
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
-    """Device of the network."""
+    """Device of the network. cuda has not been run on a GPU yet."""
     flush_fresh: Path | None = None
     """At the end, write the twin's labelled episodes to this store, as a recording of format
     `twin`. Until then they are kept in the run's directory."""
@@ -120,6 +120,8 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     say(_evaluation_line(values, session.wall_s))
                 elif event == "guard":
                     say(_guard_line(values))
+                elif event == "teacher":
+                    say(_silence_line(values))
                 elif event == "progress":
                     advance(values["env_steps"] - seen, _progress_note(values))
                     seen = values["env_steps"]
@@ -166,6 +168,13 @@ def _guard_line(values: dict[str, Any]) -> str:
     )
     done = {"stop": "stopped here", "rollback": "back to the best policy so far"}
     return f"guard: {fallen}; {done[values['action']]}"
+
+
+def _silence_line(values: dict[str, Any]) -> str:
+    return (
+        f"warning: the teacher answered none of the {values['asked']:,} states that it was asked"
+        " (-1: no opinion), so nothing was learnt from it in the twin"
+    )
 
 
 def _evaluation_line(values: dict[str, Any], wall_s: float) -> str:
