@@ -138,15 +138,16 @@ class DeviceSampler(Stateful):
     def update(self, rows: Tensor, td_abs: Tensor) -> None:
         """|TD error| (n,) of rows (n,) just learnt from, on the device; counts from the next block.
 
-        A TD error that is not finite is refused when the next block is drawn: to look at it here
-        would wait for the device.
+        Of a row that is there more than once the largest: which is written last is not defined
+        on a GPU, and a run is to repeat itself. A TD error that is not finite is refused when the
+        next block is drawn: to look at it here would wait for the device.
         """
         if not self._ruled:
             return
         place, errors = self._place[rows], td_abs.detach().float()
         stratum = self._stratum[place]
         priority = self._priority_of(errors, stratum)
-        self._priority[place] = priority
+        self._priority.scatter_reduce_(0, place, priority, "amax", include_self=False)
         self._new[place] = False
         self._largest.scatter_reduce_(0, stratum, priority, "amax")
         self._finite &= torch.isfinite(errors).all()

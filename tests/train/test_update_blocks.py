@@ -122,6 +122,21 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
     assert_same_run(whole, resumed)
 
 
+def test_behaviour_and_critic_learn_online_after_the_critic_alone(
+    device: str, tmp_path: Path
+) -> None:
+    """Another graph than that of the offline updates, in the same run."""
+    changes = {**WAYS["teacher"], "schedule": {"env_steps": 600, "offline_updates": 2 * LONGEST}}
+    one = run_to_end(tmp_path / "one", config(**changes))
+    blocks = trained(in_blocks(tmp_path / "blocks", device, **changes))
+    assert one.learner.behaviour is not None
+    assert blocks.learner.behaviour is not None
+    assert blocks.learner.behaviour.updates == one.learner.behaviour.updates > 100
+    assert blocks.learner.gradient_steps == one.learner.gradient_steps
+    for value in blocks.learner.policy.state_dict().values():
+        assert torch.isfinite(value).all()
+
+
 def test_rows_on_the_device_follow_the_ring(device: str) -> None:
     ring = FreshRing(64, 4, TASK.observation_size, discount=0.9, n_step=2)
     shelf = logs()

@@ -200,6 +200,7 @@ class CapturedUpdates:
         """An update as a graph; the parameters are as before."""
         moved = self.learner.moved
         before = [tensor.clone() for tensor in moved]
+        self._cursor.zero_()
         stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

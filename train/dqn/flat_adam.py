@@ -17,6 +17,7 @@ from restock import native
 from restock.state import Stateful
 
 _ALIGNMENT = 16  # elements: every parameter begins on a cache line, as its own tensor would
+_SLICE = 4096  # elements that a GPU moves at a time: of one tensor, two blocks would move all
 
 
 class FlatParameters:
@@ -105,7 +106,12 @@ class FlatAdam(Stateful):
         self._compiled = compiled
         # Written in place from here on: a CUDA graph keeps hold of them.
         self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
-        self._step = torch.zeros((), device=self.values.device)  # `adam` counts in a tensor
+        # What `adam` moves, and counts in tensors: all as one, and on a GPU in slices.
+        device = self.values.device
+        size = len(self.values) if device.type == "cpu" else _SLICE
+        whole = (self.values, self.gradient, *self._moments)
+        self._moved = [list(tensor.split(size)) for tensor in whole]
+        self._step = torch.zeros(len(self._moved[0]), device=device)
         self._steps = 0
 
     @torch.no_grad()
@@ -126,9 +132,9 @@ class FlatAdam(Stateful):
     def move(self, average: Tensor | None, rate: float | Tensor) -> None:
         """As `step`, by operations on the device alone, which a CUDA graph can repeat."""
         self._clip()
-        moved, squares = self._moments
+        values, gradient, moved, squares = self._moved
         adam(
-            *([self.values], [self.gradient], [moved], [squares], [], [self._step]),
+            *(values, gradient, moved, squares, [], list(self._step.unbind())),
             fused=True,
             amsgrad=False,
             beta1=_BETAS[0],
@@ -176,7 +182,7 @@ class FlatAdam(Stateful):
             return {}
         moments = zip(*(self._flat.views(each) for each in self._moments), strict=True)
         return {
-            str(index): {"step": self._step, **dict(zip(_MOMENTS, pair, strict=True))}
+            str(index): {"step": self._step[0], **dict(zip(_MOMENTS, pair, strict=True))}
             for index, pair in enumerate(moments)
         }
 

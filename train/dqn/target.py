@@ -86,10 +86,11 @@ class TargetUpdate(Stateful):
     @torch.no_grad()
     def pull(self) -> None:
         """What the rule does to the target where it is due."""
-        if isinstance(self.rule, Polyak):
-            torch._foreach_lerp_(self._target, self._online, self.rule.tau)
-        else:
-            torch._foreach_copy_(self._target, self._online)
+        for slow, fast in zip(self._target, self._online, strict=True):
+            if isinstance(self.rule, Polyak):
+                slow.lerp_(fast, self.rule.tau)
+            else:
+                slow.copy_(fast)
 
     @torch.no_grad()
     def distance(self) -> float:
