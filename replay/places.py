@@ -60,7 +60,7 @@ def open_place(
             raise StoreError(
                 "it is not a store, a run or a panel" if path.exists() else "it does not exist",
                 where=str(path),
-                remedy=f"`restock ingest RECORDINGS --store {path}` makes a store",
+                remedy=place.remedy_if_absent(),
             )
         _add_all(connection, beside)
         _list_columns(connection)

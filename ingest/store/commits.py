@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 import pyarrow as pa
@@ -20,7 +21,7 @@ from deltalake.transaction import AddAction, RemoveAction
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.data_files import AddedFile, add_action, rewrite
-from restock.ingest.store.lineage import own_path, stored_files
+from restock.ingest.store.lineage import active_files, own_path, stored_files
 from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
@@ -66,6 +67,17 @@ class TableCommits(StoreReader):
         if self.path.folder is not None and self.path.folder.is_file():
             raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
 
+    def expect_store(self) -> None:
+        """Raises StoreError where there is no store."""
+        self.expect_folder()
+        if not self.path.has_table(TRANSITIONS):
+            there = self.path.folder is not None and self.path.folder.exists()
+            raise StoreError(
+                "not a store" if there else "no such store",
+                where=str(self.path),
+                remedy=self.path.remedy_if_absent(),
+            )
+
     def allow_nulls(self, names: Collection[str]) -> None:
         """Let these signals be null: in a store of an older Restock the clearance of a robot
         without a lidar was a number."""
@@ -89,6 +101,7 @@ class TableCommits(StoreReader):
         """
         recordings = sorted({file.recording_id for file in added})
         replaced: list[str] = []
+        rewritten: list[AddedFile] = []
 
         def attempt() -> int:
             table = self.path.open_table(name)
@@ -101,6 +114,8 @@ class TableCommits(StoreReader):
             turns = []
             if name == TRANSITIONS:
                 replaced.clear()
+                self.discard_uncommitted(name, rewritten)  # of an attempt before
+                rewritten.clear()
                 for file in active:
                     gone = [one for one in file.ingests if one.recording_id in recordings]
                     if not gone:
@@ -109,7 +124,8 @@ class TableCommits(StoreReader):
                     actions.append(RemoveAction(file.path, True, now_ms))
                     kept = [one for one in file.ingests if one.recording_id not in recordings]
                     if kept:
-                        actions.append(add_action(rewrite(self.path, file, kept), now_ms))
+                        rewritten.append(rewrite(self.path, file, kept))
+                        actions.append(add_action(rewritten[-1], now_ms))
                 # Two first ingests of one recording add without removing, which is no conflict by
                 # itself: the transaction id makes it one.
                 turns = [
@@ -120,7 +136,59 @@ class TableCommits(StoreReader):
             table.update_incremental()
             return table.version()
 
-        return self.again_on_conflict(attempt), replaced
+        with self.discarded_on_failure(name, rewritten):
+            return self.again_on_conflict(attempt), replaced
+
+    def replace_files(
+        self, name: str, gone: Collection[str], made: Sequence[AddedFile], operation: str
+    ) -> int | None:
+        """Put files in the place of others of a table, all or nothing.
+
+        Returns the table's version; None, and `made` are deleted, where another writer has taken
+        one of the others out meanwhile.
+        """
+
+        def attempt() -> int | None:
+            table = self.path.open_table(name)
+            active = {path for path, *_ in active_files(table)}
+            if made and {file.path for file in made} <= active:
+                return table.version()  # by the attempt before, whose answer was lost
+            if not set(gone) <= active:
+                return None
+            now_ms = time.time_ns() // 1_000_000
+            actions: list[AddAction | RemoveAction] = [
+                RemoveAction(path, True, now_ms) for path in gone
+            ]
+            actions += [add_action(file, now_ms) for file in made]
+            self.transact(table, actions, [], operation)
+            table.update_incremental()
+            return table.version()
+
+        with self.discarded_on_failure(name, made):
+            version = self.again_on_conflict(attempt)
+        if version is None:
+            self.discard_uncommitted(name, made)
+        return version
+
+    @contextmanager
+    def discarded_on_failure(self, name: str, files: Sequence[AddedFile]) -> Iterator[None]:
+        """Delete files that the block was to commit where it fails or is interrupted."""
+        try:
+            yield
+        except BaseException:
+            self.discard_uncommitted(name, files)
+            raise
+
+    def discard_uncommitted(self, name: str, files: Sequence[AddedFile]) -> None:
+        """Delete those of the files that are not in the table, as far as that is possible.
+
+        An error or an interrupt may come when they are in it already.
+        """
+        with suppress(OSError, StoreError, DeltaError):
+            if files:
+                active = {path for path, *_ in active_files(self.path.open_table(name))}
+                paths = [file.path for file in files if file.path not in active]
+                self.path.delete(f"{name}/{path}" for path in paths)
 
     def remove(self, name: str, paths: Collection[str]) -> None:
         """Take files out of a table, those that are still in it."""

@@ -9,17 +9,15 @@ same files for no conflict, and a replaced recording's rows would be there twice
 
 from __future__ import annotations
 
-import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 import pyarrow as pa
-from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
-from restock.ingest.store.commits import delta_columns, recording_columns
-from restock.ingest.store.data_files import AddedFile, add_action, merge
+from restock.ingest.store.commits import ATTEMPTS, delta_columns, recording_columns
+from restock.ingest.store.data_files import merge, written_whole
 from restock.ingest.store.lineage import Ingest, StoredFile, own_path
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.summary import VERSION, summarised
@@ -29,6 +27,7 @@ from restock.ingest.task.schema import recording_schema
 FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most
 LEAST_FILES = 2
 FOLD_FILES = 200  # manifests of a file each that are worth it, at the end of an ingest
+FULL_MANIFESTS = 2_000  # a file of so many is left alone: else each fold would write all of them
 OPERATION = "restock compact"
 
 
@@ -38,7 +37,7 @@ class Compacted:
 
     rows: int = 0  # of transitions that were written again
     files_before: int = 0  # of transitions
-    files_after: int = 0
+    files_after: int = 0  # of those: what other writers added meanwhile is not counted
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
     summaries: int = 0  # of recordings that had none, or an older Restock's
@@ -52,62 +51,54 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
     Raises:
         StoreError: there is no store, or it cannot be written.
     """
-    if not store.path.has_table(TRANSITIONS):
-        raise StoreError(
-            "no such store", where=str(store.path), remedy="`restock ingest` makes one"
-        )
+    store.expect_store()
     done = Compacted()
-    plan = list(_groups(store))
-    done.files_before = len(store.files(TRANSITIONS))
-    done.files_after = done.files_before - sum(len(group) - 1 for group in plan)
+    groups = list(_groups(store))
+    done.files_before = done.files_after = len(store.files(TRANSITIONS))
     if dry_run:
-        done.rows = sum(file.rows for group in plan for file in group)
-        done.manifests_before = done.manifests_after = len(store.files(RECORDINGS))
+        done.rows = sum(file.rows for group in groups for file in group)
+        done.files_after -= sum(len(group) - 1 for group in groups)
+        if store.path.has_table(RECORDINGS):
+            _Fold.of(store).count(done)
         return done
     fold(store, done)
-    for group in plan:
+    for group in groups:
         _merge_rows(store, group, done)
-    done.files_after = len(store.files(TRANSITIONS))
     return done
 
 
 def fold(store: StoreWriter, done: Compacted | None = None) -> None:
     """Make one file of the manifests of all recordings, with summaries of those that lack them.
 
-    Manifests whose rows are not there yet, and those of replaced rows, stay as they are.
+    Manifests whose rows are not there yet, those of replaced rows, and files that have many already
+    stay as they are.
     """
     done = done or Compacted()
     made: dict[str, pa.Table] = {}  # manifests with new summaries, by ingest
-    written: list[AddedFile] = []
-
-    def commit() -> None:
-        shown = {one.ingest_id: one for one in store.shown()}
-        table = store.path.open_table(RECORDINGS)
-        files = store.files(RECORDINGS)
-        done.manifests_before = done.manifests_after = len(files)
-        chosen = [f for f in files if not f.own or f.ingests[0].ingest_id in shown]
-        live = [one for file in chosen for one in file.ingests if one.ingest_id in shown]
-        _summarise(store, live, made)
-        if not made and len(chosen) < LEAST_FILES:
-            return
-        _keep_replaced(store, chosen, shown.keys())
-        plain = [one for one in live if one.ingest_id not in made]
+    if not store.path.has_table(RECORDINGS):
+        return
+    store.create(RECORDINGS, recording_columns())
+    for _ in range(ATTEMPTS):
+        plan = _Fold.of(store)
+        if not plan.worth_it:
+            break
+        _summarise(store, [one for one in plan.lacking if one.ingest_id not in made], made)
+        _keep_replaced(store, plan)
         schema = delta_columns(recording_columns())
-        one = merge(store.path, RECORDINGS, chosen, plain, schema, extra=list(made.values()))
-        written.append(one)
-        now_ms = time.time_ns() // 1_000_000
-        actions: list[AddAction | RemoveAction] = [
-            RemoveAction(file.path, True, now_ms) for file in chosen
-        ]
-        actions.append(add_action(one, now_ms))
-        store.transact(table, actions, [], OPERATION)
-        done.manifests_after = len(files) - len(chosen) + 1
-        done.summaries = len(made)
-
-    if store.path.has_table(RECORDINGS):
-        store.create(RECORDINGS, recording_columns())
-        store.again_on_conflict(commit)
-        _discard(store, RECORDINGS, written[:-1])
+        plain = [one for one in plan.live if one.ingest_id not in made]
+        live = {one.ingest_id for one in plan.live}
+        extra = [manifest for ingest_id, manifest in made.items() if ingest_id in live]
+        one = merge(store.path, RECORDINGS, plan.chosen, plain, schema, extra=extra)
+        paths = {file.path for file in plan.chosen}
+        if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
+            break
+    else:
+        raise StoreError(
+            f"other writers were faster {ATTEMPTS} times",
+            where=str(store.path),
+            remedy="try again when they are done; the manifests are unchanged",
+        )
+    plan.count(done)
 
 
 def fold_if_many(store: StoreWriter) -> None:
@@ -115,15 +106,52 @@ def fold_if_many(store: StoreWriter) -> None:
     if not store.path.has_table(TRANSITIONS):
         return
     if sum(file.own for file in store.files(RECORDINGS)) >= FOLD_FILES:
-        fold(store)
+        with suppress(StoreError):  # the ingest before it is done; queries say what is damaged
+            fold(store)
 
 
-def _summarise(store: StoreWriter, live: Sequence[Ingest], made: dict[str, pa.Table]) -> None:
-    """The manifests of the ingests that have no summary of this version, with one."""
-    names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
-    told = store.manifests(live, names).to_pylist()
-    current = {one["ingest_id"] for one in told if one["summary_version"] == VERSION}
-    lacking = [one for one in live if one.ingest_id not in current | made.keys()]
+@dataclass
+class _Fold:
+    """What a fold does: the files that it makes one of, and the ingests in that."""
+
+    files: int
+    chosen: list[StoredFile]
+    live: list[Ingest]
+    lacking: list[Ingest]  # of these, those that have no summary of this version
+
+    @classmethod
+    def of(cls, store: StoreWriter) -> _Fold:
+        shown = {one.ingest_id for one in store.shown()}
+        files = store.files(RECORDINGS)
+        live = [one for file in files for one in file.ingests if one.ingest_id in shown]
+        names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
+        told = store.manifests(live, names).to_pylist()
+        current = {one["ingest_id"] for one in told if one["summary_version"] == VERSION}
+
+        chosen = []
+        for file in files:
+            held = shown.intersection(one.ingest_id for one in file.ingests)
+            full = len(held) >= FULL_MANIFESTS and held <= current
+            if not full and (held or not file.own):
+                chosen.append(file)
+        live = [one for file in chosen for one in file.ingests if one.ingest_id in shown]
+        lacking = [one for one in live if one.ingest_id not in current]
+        return cls(len(files), chosen, live, lacking)
+
+    @property
+    def worth_it(self) -> bool:
+        return bool(self.lacking) or len(self.chosen) >= LEAST_FILES
+
+    def count(self, done: Compacted) -> None:
+        """Say what becomes of the files."""
+        done.manifests_before = done.manifests_after = self.files
+        if self.worth_it:
+            done.manifests_after -= len(self.chosen) - 1
+            done.summaries = len(self.lacking)
+
+
+def _summarise(store: StoreWriter, lacking: Sequence[Ingest], made: dict[str, pa.Table]) -> None:
+    """Add the manifests of these ingests with a summary of this version."""
     manifests = store.manifests(lacking, recording_schema())
     for one in lacking:
         with suppress(FileNotFoundError):  # replaced meanwhile
@@ -137,16 +165,17 @@ def _of(manifests: pa.Table, one: Ingest) -> pa.Table:
     return manifests.filter(pc.equal(manifests["ingest_id"], one.ingest_id))
 
 
-def _keep_replaced(store: StoreWriter, files: Sequence[StoredFile], shown: Collection[str]) -> None:
+def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
     """Manifests of replaced rows in compacted files, which older versions need, as files of their
     own: they are found by their names until cleaning removes them."""
-    gone = [
-        one for file in files if not file.own for one in file.ingests if one.ingest_id not in shown
-    ]
+    live = {one.ingest_id for one in plan.live}
+    held = [one for file in plan.chosen for one in file.ingests]
+    gone = [one for one in held if one.ingest_id not in live]
     manifests = store.manifests(gone, recording_columns())
     for one in gone:
-        path = own_path(one.recording_id, one.ingest_id)
-        store.path.write(_of(manifests, one), f"{RECORDINGS}/{path}")
+        path = f"{RECORDINGS}/{own_path(one.recording_id, one.ingest_id)}"
+        with written_whole(store.path, path):
+            store.path.write(_of(manifests, one), path)
 
 
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
@@ -181,31 +210,11 @@ def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted
         held[one.ingest_id] = one._replace(rows=one.rows + (before.rows if before else 0))
     schema = pa.schema(store.path.open_table(TRANSITIONS).schema().to_arrow())
     made = merge(store.path, TRANSITIONS, group, list(held.values()), schema)
-
-    def commit() -> int | None:
-        table = store.path.open_table(TRANSITIONS)
-        active = {file.path for file in store.files(TRANSITIONS)}
-        if made.path in active:
-            return table.version()  # by the attempt before, whose answer was lost
-        if not {file.path for file in group} <= active:
-            return None
-        now_ms = time.time_ns() // 1_000_000
-        actions: list[AddAction | RemoveAction] = [
-            RemoveAction(file.path, True, now_ms) for file in group
-        ]
-        actions.append(add_action(made, now_ms))
-        store.transact(table, actions, [], OPERATION)
-        table.update_incremental()
-        return table.version()
-
-    version = store.again_on_conflict(commit)
+    paths = {file.path for file in group}
+    version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
     if version is None:
         done.changed_meanwhile += len(group)
-        _discard(store, TRANSITIONS, [made])
         return
     done.rows += made.rows
+    done.files_after -= len(group) - 1
     done.version = version
-
-
-def _discard(store: StoreWriter, name: str, files: Sequence[AddedFile]) -> None:
-    store.path.delete(f"{name}/{file.path}" for file in files)

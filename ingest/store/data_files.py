@@ -5,14 +5,24 @@ from __future__ import annotations
 import json
 import uuid
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from deltalake.exceptions import DeltaError
 from deltalake.transaction import AddAction
 
-from restock.ingest.store.lineage import INGESTS, Ingest, StoredFile, packed_ingests
+from restock.errors import StoreError
+from restock.files import first_line
+from restock.ingest.store.lineage import (
+    INGESTS,
+    Ingest,
+    StoredFile,
+    damage_named,
+    packed_ingests,
+)
 from restock.ingest.store.location import TRANSITIONS, Location
 
 GROUP_ROWS = 65_536  # of a compacted file's row groups
@@ -52,7 +62,8 @@ def compacted_name() -> str:
 
 def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
     """A compacted file of transitions without the ingests that are not kept."""
-    with place.reading(f"{TRANSITIONS}/{file.path}") as source:
+    path = f"{TRANSITIONS}/{file.path}"
+    with damage_named(place, path), place.reading(path) as source:
         schema = pq.read_schema(source)
     return merge(place, TRANSITIONS, [file], kept, schema)
 
@@ -69,7 +80,11 @@ def merge(
     """One file of what these files of a table hold of some ingests, in their order, and of `extra`
     manifests.
 
-    A row group at a time is in memory. Columns of `schema` that a file lacks are null.
+    A row group at a time is in memory. Columns of `schema` that a file lacks are null. What is
+    written is deleted where that fails.
+
+    Raises:
+        StoreError: a file is missing or damaged, or it cannot be written.
     """
     wanted = pa.array([one.ingest_id for one in kept], pa.string())
     rows = [(one["recording_id"][0].as_py(), one["ingest_id"][0].as_py()) for one in extra]
@@ -77,6 +92,7 @@ def merge(
     schema = schema.with_metadata({INGESTS: packed_ingests(held)})
     made = AddedFile("", compacted_name(), 0)
     with (
+        written_whole(place, f"{name}/{made.path}"),
         place.writing(f"{name}/{made.path}") as sink,
         pq.ParquetWriter(sink, schema, **parquet_options(schema)) as writer,
     ):
@@ -92,6 +108,24 @@ def merge(
         writer.close()
         made.size = sink.tell()
     return made
+
+
+@contextmanager
+def written_whole(place: Location, path: str) -> Iterator[None]:
+    """Delete a file that the block writes where it fails or is interrupted: on a full disk its
+    part would keep the disk full.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
+    try:
+        yield
+    except BaseException as error:
+        with suppress(OSError, StoreError, DeltaError):
+            place.delete([path])
+        if isinstance(error, OSError):
+            raise StoreError(f"cannot be written: {first_line(error)}", where=str(place)) from error
+        raise
 
 
 def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:
@@ -111,7 +145,8 @@ def _parts(
     import pyarrow.compute as pc  # slow to import
 
     for file in files:
-        with place.reading(f"{name}/{file.path}") as source:
+        path = f"{name}/{file.path}"
+        with damage_named(place, path), place.reading(path) as source:
             for batch in pq.ParquetFile(source).iter_batches(READ_ROWS):
                 rows = pa.table(batch)
                 rows = rows.filter(pc.is_in(rows["ingest_id"], wanted))

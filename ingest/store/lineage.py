@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.location import Location
+from restock.ingest.store.location import TRANSITIONS, Location
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
@@ -60,18 +61,15 @@ def own_path(recording_id: str, ingest_id: str) -> str:
     return f"{recording_id}/{ingest_id}.parquet"
 
 
-def stored_files(place: Location, name: str, table: DeltaTable) -> list[StoredFile]:
-    """The active files of a store's table `name`, with what each holds.
+def stored_files(
+    place: Location, name: str, table: DeltaTable, *, without: Collection[str] = ()
+) -> list[StoredFile]:
+    """The active files of a store's table `name`, with what each holds; `without` those paths.
 
     Raises:
         StoreError: one is of another kind, or it cannot be read.
     """
-    actions = table.get_add_actions(flatten=True)
-    columns = [
-        actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
-        for column in ("path", "num_records", "size_bytes", "modification_time")
-    ]
-    adds = [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
+    adds = [one for one in active_files(table) if one[0] not in without]
     held = {path: one for path, rows, *_ in adds if (one := _named(path, rows))}
     others = [path for path, *_ in adds if path not in held]
     with ThreadPoolExecutor(READERS) as pool:
@@ -80,6 +78,63 @@ def stored_files(place: Location, name: str, table: DeltaTable) -> list[StoredFi
         StoredFile(path, sum(one.rows for one in held[path]), size or 0, added_ms or 0, held[path])
         for path, _, size, added_ms in adds
     ]
+
+
+def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, int | None]]:
+    """What Delta's log says of the active files: path, rows, bytes, when it was added in ms."""
+    actions = table.get_add_actions(flatten=True)
+    columns = [
+        actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
+        for column in ("path", "num_records", "size_bytes", "modification_time")
+    ]
+    return [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
+
+
+def held_by(place: Location, name: str, path: str) -> StoredFile:
+    """A file of a table that need not be active, with what it holds. Raises as `stored_files`."""
+    with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
+        rows = pq.ParquetFile(source).metadata.num_rows
+    return StoredFile(path, rows, 0, 0, _named(path, rows) or _read(place, name, path))
+
+
+@contextmanager
+def damage_named(place: Location, path: str) -> Iterator[None]:
+    """What goes wrong while a file of the store is read, as a StoreError that names the file."""
+    try:
+        yield
+    except MemoryError:  # which one of Arrow's errors is, too
+        raise
+    except (OSError, pa.ArrowException) as error:
+        missing = isinstance(error, FileNotFoundError)
+        raise StoreError(
+            f"its file {path} "
+            + ("is missing" if missing else f"cannot be read: {first_line(error)}"),
+            where=str(place),
+            remedy="make the file readable: it need not be damaged"
+            if by_system(error)
+            else damage_remedy(place, path),
+        ) from error
+
+
+def by_system(error: BaseException) -> bool:
+    """Whether a file could not be read for its permissions or the disk: Parquet's reader sets no
+    errno. What goes wrong on the way to S3 is a StoreError before."""
+    return (
+        isinstance(error, OSError)
+        and error.errno is not None
+        and not isinstance(error, FileNotFoundError)
+    )
+
+
+def damage_remedy(place: Location, path: str) -> str:
+    """What to do where a file of the store is damaged or missing."""
+    name, _, file = path.partition("/")
+    if name == TRANSITIONS and OWN_PATH.fullmatch(file):
+        return "restore the file from a copy, or ingest its recording again with --force"
+    return (
+        f"restore the file from a copy, or let `restock compact {place} --drop-damaged` take it"
+        " out of the store: it names the recordings to ingest again"
+    )
 
 
 def packed_ingests(ingests: Sequence[Ingest]) -> bytes:
@@ -108,23 +163,16 @@ def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
 @lru_cache(maxsize=4096)  # files never change
 def _read(place: Location, name: str, path: str) -> tuple[Ingest, ...]:
     where = f"{name}/{path}"
-    try:
-        with place.translate_errors(), place.files.open_input_file(where) as source:
-            file = pq.ParquetFile(source)
-            if said := (file.schema_arrow.metadata or {}).get(INGESTS):
-                return tuple(Ingest(*one) for one in json.loads(said))
-            counts: Counter[tuple[str | None, str | None]] = Counter()
-            if set(_COLUMNS) <= set(file.schema_arrow.names):
-                for batch in file.iter_batches(columns=list(_COLUMNS)):
-                    rows = pa.table(batch).group_by(list(_COLUMNS)).aggregate([([], "count_all")])
-                    for one in rows.to_pylist():
-                        counts[one["recording_id"], one["ingest_id"]] += one["count_all"]
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(
-            f"its file {where} cannot be read: {first_line(error)}",
-            where=str(place),
-            remedy="restore the file from a copy, or open a version that does not need it",
-        ) from error
+    with damage_named(place, where), place.reading(where) as source:
+        file = pq.ParquetFile(source)
+        if said := (file.schema_arrow.metadata or {}).get(INGESTS):
+            return tuple(Ingest(*one) for one in json.loads(said))
+        counts: Counter[tuple[str | None, str | None]] = Counter()
+        if set(_COLUMNS) <= set(file.schema_arrow.names):
+            for batch in file.iter_batches(columns=list(_COLUMNS)):
+                rows = pa.table(batch).group_by(list(_COLUMNS)).aggregate([([], "count_all")])
+                for one in rows.to_pylist():
+                    counts[one["recording_id"], one["ingest_id"]] += one["count_all"]
     held = [
         Ingest(recording_id, ingest_id, count)
         for (recording_id, ingest_id), count in counts.items()

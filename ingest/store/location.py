@@ -28,7 +28,7 @@ from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.version import Version, version_at
+from restock.ingest.store.version import Version, split_version, version_at
 
 if TYPE_CHECKING:
     import pyarrow.compute as pc
@@ -80,22 +80,23 @@ class Location:
         if isinstance(place, Location):
             return place
         text = str(place)
-        if match := _S3.fullmatch(text):
-            prefix = match["prefix"].strip("/")
-            return cls(f"s3://{match['bucket']}" + (f"/{prefix}" if prefix else ""), None)
-        if scheme := _SCHEME.match(text):
+        on_s3 = _S3.fullmatch(text)
+        if not on_s3 and (scheme := _SCHEME.match(text)):
             raise StoreError(
                 f"a store cannot be on {scheme[1]}:",
                 where=text,
                 remedy="give a folder, or s3://bucket/prefix",
             )
-        if _ENCODED.search(str(Path(text).absolute())):
+        if _ENCODED.search(text if on_s3 else str(Path(text).absolute())):
             # Delta's library takes it for an encoded character, and reads somewhere else.
             raise StoreError(
                 "the path of a store cannot contain a percent sign followed by two hex digits",
                 where=text,
                 remedy="choose another folder, or rename it",
             )
+        if on_s3:
+            prefix = on_s3["prefix"].strip("/")
+            return cls(f"s3://{on_s3['bucket']}" + (f"/{prefix}" if prefix else ""), None)
         return cls(text, Path(text))
 
     def __str__(self) -> str:
@@ -128,6 +129,16 @@ class Location:
         """
         with self.translate_errors():
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
+
+    def remedy_if_absent(self) -> str:
+        """What to do where there is no store. Raises StoreError as `has_table` does."""
+        path, version = split_version(self.text)
+        if version is not None and Location.of(path).has_table(TRANSITIONS):
+            return (
+                f"`{path}` is a store: name its version with --version"
+                f" {self.text.removeprefix(f'{path}@')}, where the command has that option"
+            )
+        return f"`restock ingest RECORDINGS --store {self.text}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
         """One of its tables, at a version (or the newest of a moment) or at its newest.

@@ -13,7 +13,15 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from restock.ingest.store.lineage import READERS, Ingest, StoredFile, own_path, stored_files
+from restock.errors import StoreError
+from restock.ingest.store.lineage import (
+    READERS,
+    Ingest,
+    StoredFile,
+    damage_named,
+    own_path,
+    stored_files,
+)
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.repeated import SKETCH, UNREADABLE, Hashes, Sketch, read_sketch
 from restock.ingest.store.summary import with_ends
@@ -41,10 +49,15 @@ class StoreReader:
         schema = recording_schema()
         if not self.path.has_table(TRANSITIONS):
             return schema.empty_table()
-        shown = self.shown(version)
-        return self.manifests(
-            [one for one in shown if recording_id in (None, one.recording_id)], schema
-        )
+        shown = [one for one in self.shown(version) if recording_id in (None, one.recording_id)]
+        found = self.manifests(shown, schema)
+        if version is not None and len(found) < len(shown):
+            raise StoreError(
+                "this version can no longer be read: manifests of it are gone",
+                where=str(self.path),
+                remedy="name a newer version, or restore them from a copy",
+            )
+        return found
 
     def manifests(
         self,
@@ -55,7 +68,11 @@ class StoreReader:
     ) -> pa.Table:
         """These columns of the manifests of ingests; null where an older store has them not.
 
-        A file at which one of `skip` is raised is left out.
+        An ingest whose manifest the store does not have any more is left out, and so is a file at
+        which one of `skip` is raised.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
         """
         parts = [schema.empty_table()]
         if ingests:
@@ -66,10 +83,13 @@ class StoreReader:
                 at.get(one.ingest_id, own_path(one.recording_id, one.ingest_id)): None
                 for one in ingests
             }
+            listed = set(at.values())
 
             def read(path: str) -> pa.Table:
-                with suppress(*skip):
-                    part = self.path.read(f"{RECORDINGS}/{path}", columns=schema.names)
+                absent = () if path in listed else (FileNotFoundError,)
+                place = f"{RECORDINGS}/{path}"
+                with suppress(*skip), damage_named(self.path, place), suppress(*absent):
+                    part = self.path.read(place, columns=schema.names)
                     return _with_sketch(part) if "sketch" in schema.names else part
                 return schema.empty_table()
 
@@ -84,16 +104,23 @@ class StoreReader:
         return found.filter(pc.is_in(found["ingest_id"], wanted)).combine_chunks()
 
     def rows(self, recording_id: str, ingest_id: str) -> pa.Table:
-        """One recording's transitions, as they were written."""
-        with suppress(FileNotFoundError):
-            return self.path.read(f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}")
+        """One recording's transitions, as they were written.
+
+        Raises:
+            FileNotFoundError: there are none of this ingest.
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        own = f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}"
+        with damage_named(self.path, own), suppress(FileNotFoundError):
+            return self.path.read(own)
         import pyarrow.compute as pc  # slow to import
 
-        parts = [
-            self.path.read(f"{TRANSITIONS}/{file.path}", where=pc.field("ingest_id") == ingest_id)
-            for file in self.files(TRANSITIONS)
-            if ingest_id in {one.ingest_id for one in file.ingests}
-        ]
+        parts = []
+        for file in self.files(TRANSITIONS):
+            if ingest_id in {one.ingest_id for one in file.ingests}:
+                place = f"{TRANSITIONS}/{file.path}"
+                with damage_named(self.path, place):
+                    parts.append(self.path.read(place, where=pc.field("ingest_id") == ingest_id))
         if not parts:
             raise FileNotFoundError(own_path(recording_id, ingest_id))
         rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
@@ -109,9 +136,10 @@ class StoreReader:
         for one in ingests:
             bare = with_ends(pa.table({}), told.get(one.ingest_id))
             if not told.get(one.ingest_id):
-                with suppress(FileNotFoundError):  # of an older store they lie with its rows
-                    path = own_path(one.recording_id, one.ingest_id)
-                    bare = self.path.read_schema(f"{TRANSITIONS}/{path}").empty_table()
+                path = f"{TRANSITIONS}/{own_path(one.recording_id, one.ingest_id)}"
+                # Of an older store they lie with its rows.
+                with damage_named(self.path, path), suppress(FileNotFoundError):
+                    bare = self.path.read_schema(path).empty_table()
             ends = episode_ends(bare)
             if ends is not None:
                 yield one.recording_id, ends

@@ -26,13 +26,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from restock.errors import StoreError
-from restock.files import first_line
 from restock.ingest.store.commits import TableCommits, delta_columns, recording_columns
-from restock.ingest.store.data_files import AddedFile, parquet_options
+from restock.ingest.store.data_files import AddedFile, parquet_options, written_whole
 from restock.ingest.store.lineage import own_path, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import frame_files
-from restock.ingest.store.repeated import Hashes, RepeatedDrive, Sketch, find_repeat
+from restock.ingest.store.repeated import UNREADABLE, Hashes, RepeatedDrive, Sketch, find_repeat
 from restock.ingest.store.summary import summarised
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS
@@ -99,21 +98,14 @@ class StoreWriter(TableCommits):
             StoreError: it cannot be written.
         """
         count = 0
-        try:
-            with (
-                self.path.writing(f"{FRAMES}/{path}") as sink,
-                pq.ParquetWriter(sink, frame_schema(), compression="zstd") as writer,
-            ):
-                for batch in batches:
-                    writer.write_batch(batch)
-                    count += len(batch)
-        except BaseException as error:
-            self.discard_frames(path)
-            if isinstance(error, OSError):
-                raise StoreError(
-                    f"cannot be written: {first_line(error)}", where=str(self.path)
-                ) from error
-            raise
+        with (
+            written_whole(self.path, f"{FRAMES}/{path}"),
+            self.path.writing(f"{FRAMES}/{path}") as sink,
+            pq.ParquetWriter(sink, frame_schema(), compression="zstd") as writer,
+        ):
+            for batch in batches:
+                writer.write_batch(batch)
+                count += len(batch)
         return count
 
     def discard_frames(self, path: str) -> None:
@@ -265,7 +257,10 @@ class StoreWriter(TableCommits):
             return []
         for path in self.path.listing(RECORDINGS):
             if path.endswith(".parquet"):
-                told = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
+                try:
+                    told = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
+                except UNREADABLE:
+                    return []  # which frames it names is not known
                 found -= set(frame_files(told))
         return [f"{FRAMES}/{path}" for path in sorted(found)]
 
@@ -288,10 +283,6 @@ class StoreWriter(TableCommits):
         Lists of fixed size become plain lists, which every engine that knows Delta reads.
         """
         rows = rows.cast(delta_columns(rows.schema).with_metadata(rows.schema.metadata))
-        try:
-            options = parquet_options(rows.schema)
+        options = parquet_options(rows.schema)
+        with written_whole(self.path, path):
             return self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
-        except OSError as error:
-            raise StoreError(
-                f"cannot be written: {first_line(error)}", where=str(self.path)
-            ) from error

@@ -8,6 +8,7 @@ that no file of transitions is looked at before a query needs it; manifests are 
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -36,6 +37,9 @@ from restock.replay.store.stored_tables import StoredTable, manifest_tables, reg
 # Joins are done as they are written, the right side in memory: of files whose columns are told
 # DuckDB takes every scan for one row, and would hold all transitions to look up their recordings.
 AS_WRITTEN = "join_order,build_side_probe_side"
+# DuckDB takes a negative limit, "none" or "null" for none at all, and fails at random with zero.
+_UNLIMITED_OR_ZERO = re.compile(r"\s*(?:-|none\b|null\b|[0.]+\s*[a-z%])", re.IGNORECASE)
+_MEMORY_REMEDY = 'write it like "4GB" or "512MB"'
 T = TypeVar("T")
 
 
@@ -85,18 +89,18 @@ class Store:
         )
         if memory_limit is not None:
             self._set_memory(memory_limit)
-        held = stored_files(self.path, TRANSITIONS, transitions)
-        self._ingests = ingests_table(held)
-        self._recordings, self._summaries = manifest_tables(self.path, recordings, held)
-        self._transitions = StoredTable(
-            self.path,
-            "stored_transitions",
-            TRANSITIONS,
-            pa.schema(transitions.schema().to_arrow()),
-            [file.path for file in held],
-        )
-        self.files = {one.view: one.addresses for one in (self._recordings, self._transitions)}
         try:
+            held = stored_files(self.path, TRANSITIONS, transitions)
+            self._ingests = ingests_table(held)
+            self._recordings, self._summaries = manifest_tables(self.path, recordings, held)
+            self._transitions = StoredTable(
+                self.path,
+                "stored_transitions",
+                TRANSITIONS,
+                pa.schema(transitions.schema().to_arrow()),
+                [file.path for file in held],
+            )
+            self.files = {one.view: one.addresses for one in (self._recordings, self._transitions)}
             self._manifests = self._recordings.read()
             self._present_all(self.bare, "main")
             self._frames().present(self.bare)
@@ -295,7 +299,14 @@ class Store:
         manifests = self._manifests.drop_columns(["summary_version"])
         register(connection, "stored_ingests", self._ingests, schema=schema)
         register(connection, self._recordings.view, manifests, schema=schema)
-        self._transitions.present(connection, schema=schema)
+        try:
+            self._transitions.present(connection, schema=schema)
+        except StoreError as error:
+            raise StoreError(
+                error.what,
+                where=error.where,
+                remedy="restore the file from a copy, or ingest its recording again with --force",
+            ) from error
 
     def _frames(self) -> StoredTable:
         """The frames of cameras that the manifests of its rows name."""
@@ -308,12 +319,14 @@ class Store:
         return StoredTable(self.path, "stored_frames", FRAMES, frame_schema(), files)
 
     def _set_memory(self, limit: str) -> None:
+        if _UNLIMITED_OR_ZERO.match(limit):
+            raise StoreError(
+                f"the memory limit {limit!r} is not a positive size", remedy=_MEMORY_REMEDY
+            )
         try:
             self.bare.execute(f"SET memory_limit = '{limit}'")
         except duckdb.Error as error:
-            raise StoreError(
-                f"no memory limit {limit!r}", remedy='write it like "4GB" or "512MB"'
-            ) from error
+            raise StoreError(f"no memory limit {limit!r}", remedy=_MEMORY_REMEDY) from error
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
@@ -351,5 +364,5 @@ def _expect(place: Location) -> None:
     raise StoreError(
         "not a store" if place.folder is not None and place.folder.exists() else "no such store",
         where=str(place),
-        remedy=f"`restock ingest RECORDINGS --store {place}` makes one",
+        remedy=place.remedy_if_absent(),
     )

@@ -17,7 +17,13 @@ from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.lineage import StoredFile, own_path, stored_files
+from restock.ingest.store.lineage import (
+    StoredFile,
+    damage_named,
+    damage_remedy,
+    own_path,
+    stored_files,
+)
 from restock.ingest.store.location import RECORDINGS, Location
 from restock.ingest.store.summary import SUMMARY_SCHEMA, TABLES
 from restock.replay.store.parquet_views import column_types, read_parquet
@@ -75,7 +81,7 @@ class StoredTable:
             raise StoreError(
                 f"its manifests cannot be read: {first_line(error)}",
                 where=str(self.place),
-                remedy="restore the file from a copy, or ingest its recording again",
+                remedy=damage_remedy(self.place, self.table),
             ) from error
 
     def _dataset(self) -> pa.Table | Dataset:
@@ -99,7 +105,8 @@ class StoredTable:
         bare = []
         for path in self.paths:
             place = f"{self.table}/{path}"
-            part = self.place.read(place, columns=schema.names, repeated=DOCUMENTS)
+            with damage_named(self.place, place):
+                part = self.place.read(place, columns=schema.names, repeated=DOCUMENTS)
             kinds = pa.schema([schema.field(name) for name in part.column_names])
             if part.schema.types != kinds.types:  # other tools write text as views or large strings
                 part = part.cast(kinds)

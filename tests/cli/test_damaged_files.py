@@ -9,6 +9,7 @@ import json
 import shutil
 from pathlib import Path
 
+import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -17,7 +18,7 @@ from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.errors import RunError
+from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table, write_table
 from restock.ingest.profile.profile import load_profile
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -242,6 +243,45 @@ def test_a_target_that_cannot_be_written_is_said(
     for argv in [*writers(root, tmp_path / "file"), ["train", "--out", str(tmp_path / "file/run")]]:
         assert check(argv, tmp_path / "file", capsys) == 2
     assert (tmp_path / "file").read_text().startswith("a file")
+
+
+@pytest.mark.parametrize(
+    ("limit", "remedy"), [("0GB", 'write it like "4GB"'), ("1MB", "raise --memory-limit")]
+)
+def test_a_memory_limit_that_is_too_small_is_said(
+    limit: str, remedy: str, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = str(root / "store")
+    for argv in (
+        ["sql", store, "FROM coverage"],
+        ["mix", store, "--mixture", "coverage", "--out", str(tmp_path / "panel")],
+        ["audit", store],
+        ["audit", store, "--capacity"],
+        ["audit", store, "--reward"],
+    ):
+        assert cli.main([*argv, "--memory-limit", limit]) == 2
+        said = capsys.readouterr().err
+        assert "memory limit" in said, argv
+        assert remedy in said.splitlines()[-1], argv
+        assert "damaged" not in said, argv
+
+
+def test_too_little_memory_is_said_by_a_verb_without_a_limit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(args: list[str]) -> int:
+        try:
+            raise duckdb.OutOfMemoryException("Out of Memory Error: 9 GiB used\n\nPossible: …")
+        except duckdb.Error as error:
+            raise StoreError("is damaged or cannot be read") from error
+
+    monkeypatch.setattr(cli, "_dispatch", full)
+    assert cli.main(["coverage", "store/"]) == 2
+    said = capsys.readouterr().err
+    assert "restock coverage store/: DuckDB's memory limit" in said
+    assert "9 GiB used" in said
+    assert "free some memory" in said
+    assert not {"damaged", "Possible", "--memory-limit"} & set(said.split())
 
 
 def test_what_nobody_foresaw_exits_2_and_developers_see_where(

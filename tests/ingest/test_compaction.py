@@ -7,6 +7,7 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable, write_deltalake
 from hypothesis import given, settings
@@ -14,7 +15,9 @@ from hypothesis import strategies as st
 from support.long import one_in
 from support.stores import manifest, one, shown, views_over
 
+from restock.cli import main
 from restock.errors import StoreError
+from restock.ingest.store import compaction
 from restock.ingest.store.compaction import OPERATION, compact, fold
 from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
@@ -287,3 +290,170 @@ def test_the_ends_of_episodes_outlive_compaction(tmp_path):
     with Store(tmp_path / "s") as store:
         assert list(store.episode_ends()) == [(f"{1:016x}", ends)]
         assert list(store.episode_ends([f"{2:016x}"])) == []
+
+
+@pytest.mark.parametrize("way", ["deltalake", "polars", "files"])
+def test_without_restock_each_row_is_read_once(tmp_path, way):
+    """As docs/libraries.md says."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    writer.write(*one(2, "b"))
+    compact(writer)
+    place = str(tmp_path / "s" / TRANSITIONS)
+    count = sum(shown(tmp_path / "s").values())
+    if way == "deltalake":
+        pytest.importorskip("pandas")
+        rows = len(DeltaTable(place).to_pandas())
+    elif way == "polars":
+        rows = len(pytest.importorskip("polars").scan_delta(place).collect())
+    else:
+        rows = len(duckdb.read_parquet(DeltaTable(place).file_uris()))
+        assert len(duckdb.read_parquet(f"{place}/**/*.parquet")) > 2 * count
+    assert rows == count
+
+
+def parquet(path: Path) -> list[Path]:
+    return sorted(path.rglob("*.parquet"))
+
+
+@pytest.mark.parametrize("name", [RECORDINGS, TRANSITIONS])
+@pytest.mark.parametrize("committed", [False, True])
+def test_an_interrupted_compaction_leaves_no_file_that_is_in_no_version(
+    tmp_path, monkeypatch, name, committed
+):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    before, whole, transact = parquet(tmp_path / "s"), shown(tmp_path / "s"), StoreWriter.transact
+
+    def interrupted(self, table, actions, turns, operation=OPERATION):
+        at_it = table.table_uri.rstrip("/").endswith(name)
+        if committed or not at_it:
+            transact(self, table, actions, turns, operation)
+        if at_it:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(StoreWriter, "transact", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        compact(writer)
+    held = {
+        tmp_path / "s" / table / file.path
+        for table in (RECORDINGS, TRANSITIONS)
+        for file in writer.files(table)
+    }
+    assert set(parquet(tmp_path / "s")) == set(before) | held
+    assert shown(tmp_path / "s") == whole
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize("name", [RECORDINGS, TRANSITIONS])
+def test_a_write_that_fails_leaves_no_part_of_a_file(tmp_path, monkeypatch, name, error):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    if name == TRANSITIONS:
+        fold(writer)
+    before, write = parquet(tmp_path / "s"), pq.ParquetWriter.write_table
+
+    def full(self, table, **given):
+        write(self, table, **given)
+        raise error
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+    with pytest.raises(StoreError if isinstance(error, OSError) else KeyboardInterrupt):
+        compact(writer)
+    assert parquet(tmp_path / "s") == before
+
+
+def test_an_ingest_into_a_joined_file_that_fails_leaves_no_file(tmp_path, monkeypatch):
+    """Of those that it would write again."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    compact(writer)
+
+    def fails(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(StoreWriter, "transact", fails)
+    added = StoreWriter(tmp_path / "s").stage(*one(1, "b"))
+    before = parquet(tmp_path / "s")
+    with pytest.raises(KeyboardInterrupt):
+        writer.commit(TRANSITIONS, [added.rows], {})
+    assert parquet(tmp_path / "s") == before
+
+
+def test_manifests_are_written_again_a_bounded_number_of_times(tmp_path, monkeypatch):
+    """However many there are: files of enough of them are left alone."""
+    monkeypatch.setattr(compaction, "FULL_MANIFESTS", 4)
+    written: list[int] = []
+    merge = compaction.merge
+
+    def counted(*args, **given):
+        made = merge(*args, **given)
+        written.append(made.rows)
+        return made
+
+    monkeypatch.setattr(compaction, "merge", counted)
+    writer = StoreWriter(tmp_path / "s")
+    for recording in range(1, 13, 2):
+        writer.write_all([one(recording), one(recording + 1)])
+        fold(writer)
+    assert written == [2, 4, 2, 4, 2, 4]
+    assert sorted(len(file.ingests) for file in writer.files(RECORDINGS)) == [4, 4, 4]
+    writer.write_all([one(n, "b") for n in (1, 2)])  # leaves a file of two dead manifests
+    fold(writer)
+    assert sorted(len(file.ingests) for file in writer.files(RECORDINGS)) == [4, 4, 4]
+    same_as_scanned(tmp_path / "s")
+
+
+def test_files_that_others_add_meanwhile_are_not_counted(tmp_path, monkeypatch):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    monkeypatch.setattr(compaction, "fold", lambda *_: writer.write_all([one(3), one(4)]))
+    done = compact(writer)
+    assert (done.files_before, done.files_after) == (2, 1)
+
+
+def test_what_the_command_says(tmp_path, capsys):
+    place = str(tmp_path / "s")
+    StoreWriter(place).write_all([one(1), one(2)])
+    assert main(["compact", place, "--dry-run"]) == 0
+    planned = capsys.readouterr().err
+    assert "2 -> 1 files" in planned
+    assert "manifests: 2 -> 1 files" in planned
+    assert main(["compact", place]) == 0
+    assert capsys.readouterr().err == planned.replace("would write", "wrote")
+    assert main(["compact", place]) == 0
+    said = capsys.readouterr().err
+    assert "nothing to join: 1 file of transitions, 1 of manifests" in said
+    assert "wrote" not in said
+
+
+def test_a_dry_run_tells_of_summaries_what_the_run_does(tmp_path):
+    for name, tables in zip(
+        (RECORDINGS, TRANSITIONS), zip(one(1), one(2), strict=True), strict=True
+    ):
+        for table in tables:
+            write_deltalake(str(tmp_path / "s" / name), table, mode="append")
+    planned = compact(StoreWriter(tmp_path / "s"), dry_run=True)
+    done = compact(StoreWriter(tmp_path / "s"))
+    done.version = None
+    assert planned == done
+    assert (planned.manifests_before, planned.manifests_after, planned.summaries) == (2, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("panel.json", "is a panel, not a store"),
+        ("config.json", "is the folder of a run, not a store"),
+        ("other", "not a store"),
+        (None, "is a file, not a store"),
+    ],
+)
+def test_what_is_no_store_is_said_to_be_what_it_is(tmp_path, capsys, file, said):
+    if file is None:
+        (tmp_path / "x").write_text("")
+    else:
+        (tmp_path / "x").mkdir()
+        (tmp_path / "x" / file).write_text("{}")
+    assert main(["compact", str(tmp_path / "x")]) == 2
+    assert said in capsys.readouterr().err

@@ -296,6 +296,7 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
     [
         ("gs://bucket/store", "cannot be on gs:"),
         ("some%20where/store", "percent sign"),
+        ("s3://bucket/some%20where", "percent sign"),
     ],
 )
 def test_places_that_cannot_hold_a_store_are_refused(place, said, tmp_path, monkeypatch):

@@ -12,11 +12,12 @@ import pyarrow as pa
 import pytest
 from deltalake import write_deltalake
 from support.paths import ROOT
-from support.stores import TASK, manifest, recording_transitions, write_store
+from support.stores import TASK, manifest, one, recording_transitions, write_store
 
 import restock
 from restock.errors import QueryError, StoreError
 from restock.ingest.store.transitions import replaced
+from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
 from restock.replay.store.column_docs import column_docs, rewrite, view_docs
@@ -321,8 +322,37 @@ def test_what_is_no_store_is_said_to_be_none(tmp_path: Path) -> None:
         Store(tmp_path)
     with pytest.raises(StoreError, match="no such store"):
         Store(tmp_path / "x")
-    with pytest.raises(StoreError, match="memory limit"):
-        Store(write_store(tmp_path / "s", [recording_transitions(1)]), memory_limit="lots")
+    write_store(tmp_path / "s", [recording_transitions(1)])
+    assert is_store(tmp_path / "s")
+    with pytest.raises(StoreError, match="--version 3"):
+        Store(f"{tmp_path / 's'}@3")
+
+
+def test_a_file_of_rows_that_is_missing_is_said_with_what_to_do(tmp_path: Path) -> None:
+    StoreWriter(tmp_path / "s").write(*one(1))
+    next((tmp_path / "s" / "transitions").glob("*/*.parquet")).unlink()
+    with pytest.raises(StoreError, match="--force"):
+        Store(tmp_path / "s").sql("FROM transitions")
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [("lots", "no memory limit 'lots'"), ("5", "no memory limit '5'")]
+    + [
+        (limit, f"memory limit '{limit}' is not a positive size")
+        for limit in ("0GB", "0.0 kib", "0%", "-1", " -5GB", "none", "None", "null")
+    ],
+)
+def test_a_memory_limit_that_is_none_is_refused(store_path: Path, limit: str, said: str) -> None:
+    with pytest.raises(StoreError, match=said) as error:
+        Store(store_path, memory_limit=limit)
+    assert "4GB" in str(error.value)
+
+
+@pytest.mark.parametrize("limit", ["2GB", "0.5 GB", ".5gb", "50%", "2 GiB"])
+def test_other_ways_to_write_a_memory_limit_are_taken(store_path: Path, limit: str) -> None:
+    with Store(store_path, memory_limit=limit) as store:
+        assert len(store.sql("SELECT 1"))
 
 
 def test_a_memory_limit_is_kept(store_path: Path) -> None:

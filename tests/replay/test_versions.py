@@ -12,7 +12,10 @@ from support.stores import one
 import restock
 from restock.cli import main
 from restock.errors import StoreError
+from restock.ingest.store.compaction import compact
+from restock.ingest.store.lineage import _read
 from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
 
 VERBS = ("sql", "audit", "gaps", "drift", "mix", "export", "trace", "label")
 
@@ -85,6 +88,21 @@ def test_what_has_no_versions_says_so(
         restock.open(str(path), version="yesterday")
 
 
+@pytest.mark.parametrize(
+    "verb", ["sql", "audit", "gaps", "drift", "coverage", "compact", "check", "label"]
+)
+def test_a_version_after_an_at_is_said_to_be_an_option(
+    verb: str, versions: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, first = versions
+    assert main([verb, f"{path}@{first}"]) == 2
+    said = capsys.readouterr().err
+    assert f"`{path}` is a store: name its version with --version {first}" in said
+    assert "restock ingest" not in said
+    assert main([verb, f"{path}x@{first}"]) == 2  # and that is no store
+    assert "restock ingest" in capsys.readouterr().err
+
+
 def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path: Path) -> None:
     writer = StoreWriter(tmp_path / "store")
     first = writer.write(*one(1))
@@ -93,3 +111,18 @@ def test_a_version_whose_files_are_gone_says_for_how_long_they_are_kept(tmp_path
     with pytest.raises(StoreError, match="can no longer be read") as error:
         restock.open(str(tmp_path / "store"), version=first)
     assert "7 days" in str(error.value)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_version_of_one_file_or_of_joined_ones_is_said_to_be_gone_alike(
+    tmp_path: Path, version: int
+) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    writer.write_all([one(1), one(2)])
+    compact(writer)
+    writer.write(*one(1, "b"))
+    writer.clean(retention_hours=0)
+    _read.cache_clear()  # as in another process
+    with pytest.raises(StoreError, match=f"its version {version} can no longer be read") as said:
+        Store(tmp_path / "store", version=version)
+    assert "7 days" in str(said.value)

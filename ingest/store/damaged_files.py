@@ -1,0 +1,208 @@
+"""Damaged files: a store goes on without those that cannot be read, and says what it lost.
+
+A file that others were joined into is joined again from them, while they are kept. Where they are
+gone it is taken out of its table, and the recordings whose rows or manifests were in it are named:
+no view shows them until they are ingested again. A file that can be read is never taken out. Other
+writers may go on meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+from urllib.parse import unquote
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from restock.ingest.store.data_files import READ_ROWS, merge
+from restock.ingest.store.lineage import (
+    OWN_PATH,
+    StoredFile,
+    active_files,
+    by_system,
+    damage_named,
+    held_by,
+    stored_files,
+)
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.writer import StoreWriter
+
+OPERATION = "restock compact --drop-damaged"
+READ_AT_ONCE = 4  # files, of each of which a row group may be in memory
+Files = Mapping[str, list[StoredFile]]  # by table
+_TOLD = (
+    *("recording_id", "ingest_id", "ingested_at"),
+    *("source_file", "transitions", "corrections"),
+)
+
+
+@dataclass(frozen=True)
+class LostRecording:
+    """A recording that no view shows without the damaged files."""
+
+    recording_id: str
+    source_file: str
+    transitions: int
+    corrections: int | None  # of its labels, by people; None where its manifest was damaged
+
+
+@dataclass
+class Dropped:
+    """What became of the damaged files, or would. Files are named by their paths in the store."""
+
+    joined_again: list[str] = field(default_factory=list)
+    dropped: list[str] = field(default_factory=list)
+    lost: list[LostRecording] = field(default_factory=list)
+    unnamed_transitions: int = 0  # lost ones, of recordings whose manifests are lost as well
+
+
+def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
+    """Take the files that cannot be read out of a store's tables. Every file is read whole.
+
+    Raises:
+        StoreError: there is no store, it cannot be reached or written, or a file cannot be read
+            for another reason than damage.
+    """
+    store.expect_store()
+    done = Dropped()
+    lost_rows = 0  # by Delta's log
+    readable: dict[str, list[StoredFile]] = {}
+    for name in (TRANSITIONS, RECORDINGS):  # of manifests, those of the rows that stay are needed
+        table = store.path.open_table(name)
+        rows = {path: count or 0 for path, count, *_ in active_files(table)}
+        with ThreadPoolExecutor(READ_AT_ONCE) as pool:
+            broken = pool.map(lambda path: is_damaged(store.path, path), _below(name, rows))
+            damaged = [path for path, one in zip(rows, broken, strict=True) if one]
+        readable[name] = stored_files(store.path, name, table, without=damaged)
+        for path in damaged:
+            sources = _sources(store.path, name, path, rows[path], readable)
+            if not dry_run and not _replace(store, name, path, sources):
+                continue  # another process was faster
+            if sources:
+                done.joined_again.append(f"{name}/{path}")
+                readable[name] += sources
+            else:
+                done.dropped.append(f"{name}/{path}")
+                lost_rows += rows[path] if name == TRANSITIONS else 0
+    done.lost = _lost(store.path, readable, done.dropped)
+    if any(path.startswith(f"{RECORDINGS}/") for path in done.dropped):
+        named = sum(one.transitions for one in done.lost if one.corrections is not None)
+        done.unnamed_transitions = max(0, lost_rows - named)
+    return done
+
+
+def is_damaged(place: Location, path: str) -> bool:
+    """Whether a file of the store is missing, or is no whole Parquet file.
+
+    Raises:
+        StoreError: it cannot be read for another reason: permissions, the disk, the network.
+    """
+    with damage_named(place, path):
+        try:
+            with place.reading(path) as source:
+                for _ in pq.ParquetFile(source).iter_batches(READ_ROWS):
+                    pass
+        except (FileNotFoundError, pa.ArrowInvalid):
+            return True
+        except OSError as error:
+            if by_system(error):
+                raise
+            return True
+    return False
+
+
+def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:
+    """The files that a damaged one was joined from, with those ingests that are missing now.
+
+    An empty list where they are gone, or do not have all that is missing.
+    """
+    paths = _joined_from(place, name, path)
+    if any(is_damaged(place, one) for one in _below(name, paths)):
+        return []
+    there = [one for file in readable[TRANSITIONS] for one in file.ingests]
+    known = {one.recording_id for one in there}  # also those that were ingested again since
+    told = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
+    untold = {one.ingest_id for one in there} - told
+    found = []
+    for file in (held_by(place, name, one) for one in paths):
+        kept = [
+            one
+            for one in file.ingests
+            if (one.recording_id not in known if name == TRANSITIONS else one.ingest_id in untold)
+        ]
+        if kept:
+            found.append(replace(file, rows=sum(one.rows for one in kept), ingests=tuple(kept)))
+    complete = name == RECORDINGS or sum(file.rows for file in found) == rows
+    return found if complete else []
+
+
+def _joined_from(place: Location, name: str, path: str) -> list[str]:
+    """The files that the commit which added a file took out, by Delta's log; none where the log
+    does not go back to it."""
+    log = f"{name}/_delta_log"
+    commits = [one for one in place.listing(log) if one.endswith(".json")]
+    for commit in sorted(commits, reverse=True):
+        with place.reading(f"{log}/{commit}") as source:
+            actions = [json.loads(line) for line in source.read().splitlines()]
+        if any(unquote(one["add"]["path"]) == path for one in actions if "add" in one):
+            return [unquote(one["remove"]["path"]) for one in actions if "remove" in one]
+    return []
+
+
+def _replace(store: StoreWriter, name: str, path: str, sources: Sequence[StoredFile]) -> bool:
+    """Put what its sources have in the place of a damaged file; False where it is gone by then."""
+    made = []
+    if sources:
+        schema = pa.schema(store.path.open_table(name).schema().to_arrow())
+        kept = [one for file in sources for one in file.ingests]
+        made.append(merge(store.path, name, sources, kept, schema))
+    replaced = store.replace_files(name, {path}, made, OPERATION) is not None
+    if replaced and name == RECORDINGS and OWN_PATH.fullmatch(path):
+        store.path.delete([f"{name}/{path}"])  # a reader would find it by its name
+    return replaced
+
+
+def _lost(place: Location, readable: Files, dropped: Sequence[str]) -> list[LostRecording]:
+    """The recordings that have rows and no manifest, or a manifest and no rows.
+
+    Of the latter, some may be those of a writer between its two commits: it does no harm to ingest
+    them again.
+    """
+    manifests: dict[str, dict[str, Any]] = {}
+    for file in readable[RECORDINGS] if dropped else ():
+        rows = place.read(f"{RECORDINGS}/{file.path}", columns=_TOLD).to_pylist()
+        held = {one.ingest_id for one in file.ingests}
+        manifests |= {row["ingest_id"]: row for row in rows if row["ingest_id"] in held}
+    lost: dict[str, LostRecording] = {}
+    if any(path.startswith(f"{RECORDINGS}/") for path in dropped):
+        for file in readable[TRANSITIONS]:
+            if untold := [one for one in file.ingests if one.ingest_id not in manifests]:
+                sources = _source_files(place, file)
+                for one in untold:
+                    lost[one.recording_id] = LostRecording(
+                        one.recording_id, sources[one.ingest_id], one.rows, None
+                    )
+    if any(path.startswith(f"{TRANSITIONS}/") for path in dropped):
+        there = {one.recording_id for file in readable[TRANSITIONS] for one in file.ingests}
+        for row in sorted(manifests.values(), key=lambda row: row["ingested_at"]):
+            if (recording := row["recording_id"]) not in there:
+                corrections = len(row.get("corrections") or ())
+                lost[recording] = LostRecording(
+                    recording, row["source_file"], row["transitions"], corrections
+                )
+    return sorted(lost.values(), key=lambda one: (one.source_file, one.recording_id))
+
+
+def _source_files(place: Location, file: StoredFile) -> dict[str, str]:
+    """The recordings that rows are of, as the rows name them, by ingest."""
+    names = ["ingest_id", "source_file"]
+    rows = place.read(f"{TRANSITIONS}/{file.path}", columns=names)
+    return dict(zip(*(rows[name].to_pylist() for name in names), strict=True))
+
+
+def _below(name: str, paths: Sequence[str] | Mapping[str, object]) -> list[str]:
+    return [f"{name}/{path}" for path in paths]

@@ -1,0 +1,238 @@
+"""A store whose files are damaged: what is lost is said, and Restock's commands lead out of it."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from support.long import one_in
+from support.s3_server import files_of
+from support.stores import one, shown
+
+from restock.cli import main
+from restock.errors import StoreError
+from restock.ingest.store import compaction, lineage
+from restock.ingest.store.compaction import compact
+from restock.ingest.store.damaged_files import drop_damaged
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+
+DAMAGES = ("cut", "missing", "a page")
+
+
+def damage(place: Path | str, file: str, how: str) -> None:
+    lineage._read.cache_clear()  # as in another process
+    store = Location.of(place)
+    with store.reading(file) as source:
+        content = source.read()
+    if how == "missing":
+        store.delete([file])
+        return
+    if how == "cut":
+        content = content[:1000]
+    else:  # the footer is whole
+        content = content[:8] + bytes(byte ^ 0x55 for byte in content[8:40]) + content[40:]
+    with store.writing(file) as sink:
+        sink.write(content)
+
+
+def active(place: Path | str, name: str) -> list[str]:
+    return [f"{name}/{file.path}" for file in StoreWriter(place).files(name)]
+
+
+def expected(*ingests: tuple[int, str, int]) -> dict[str, int]:
+    return {f"{n:016x}-{name}": len(one(n, name, seed)[1]) for n, name, seed in ingests}
+
+
+def joined(place: Path | str) -> StoreWriter:
+    """Three recordings in one file, the second ingested again since."""
+    writer = StoreWriter(place)
+    writer.write_all([one(1), one(2), one(3)])
+    compact(writer)
+    writer.write(*one(2, "b", seed=7))
+    return writer
+
+
+WHOLE = expected((1, "a", 0), (2, "b", 7), (3, "a", 0))
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize("names", [[TRANSITIONS], [RECORDINGS], [TRANSITIONS, RECORDINGS]])
+def test_a_damaged_file_is_joined_again_from_those_it_was_made_of(tmp_path, names, how):
+    writer = joined(tmp_path / "s")
+    before = writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist()
+    damaged = [one for name in names for one in active(tmp_path / "s", name) if "compacted" in one]
+    for file in damaged:
+        damage(tmp_path / "s", file, how)
+    planned = drop_damaged(writer, dry_run=True)
+    done = drop_damaged(writer)
+    assert planned == done
+    assert (done.joined_again, done.dropped, done.lost) == (damaged, [], [])
+    assert shown(tmp_path / "s") == WHOLE
+    assert writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist() == before
+    assert len(writer.live()) == 3
+    assert drop_damaged(writer).joined_again == []
+
+
+@pytest.mark.parametrize("place", one_in(2, ["folder", "s3"]), indirect=True)
+@pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
+@pytest.mark.parametrize("how", one_in(2, DAMAGES[:2]))
+def test_what_is_lost_with_a_damaged_file_is_named_and_comes_back_by_ingest(place, name, how):
+    writer = joined(place)
+    writer.clean(retention_hours=0)  # the files that it was made of
+    damage(place, next(one for one in active(place, name) if "compacted" in one), how)
+    with pytest.raises(StoreError, match=r"restock compact .* --drop-damaged"):
+        writer.write(*one(1, "c"))
+    done = drop_damaged(writer)
+    assert len(done.dropped) == 1
+    assert [one.recording_id[-1] for one in done.lost] == ["1", "3"]
+    assert {one.source_file for one in done.lost} == {"logs/1.mcap", "logs/3.mcap"}
+    assert {one.transitions for one in done.lost} == {WHOLE[f"{n:016x}-a"] for n in (1, 3)}
+    assert done.unnamed_transitions == 0
+    assert shown(place) == expected((2, "b", 7))
+    compact(writer)  # rows without a manifest are in no one's way
+    writer.write_all([one(1, "c"), one(3, "c"), one(4)])
+    assert shown(place) == expected((1, "c", 0), (2, "b", 7), (3, "c", 0), (4, "a", 0))
+
+
+@pytest.mark.parametrize("how", ["cut", "missing"])
+def test_a_manifest_of_its_own_that_is_damaged_is_named_and_dropped(tmp_path, how):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    file = f"{RECORDINGS}/{1:016x}/{1:016x}-a.parquet"
+    damage(tmp_path / "s", file, how)
+    with pytest.raises(StoreError, match=file) as said:
+        writer.live(f"{1:016x}")
+    assert "--drop-damaged" in str(said.value)
+    with pytest.raises(StoreError, match=file) as said:
+        Store(tmp_path / "s")
+    assert "--drop-damaged" in str(said.value)
+    assert drop_damaged(writer).dropped == [file]
+    assert shown(tmp_path / "s") == expected((2, "a", 0))
+    assert len(writer.live(f"{1:016x}")) == 0  # so an ingest takes it for new
+    writer.write(*one(1, "b"))
+    assert shown(tmp_path / "s") == expected((1, "b", 0), (2, "a", 0))
+
+
+def test_of_damaged_rows_of_its_own_the_remedy_is_to_ingest_with_force(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write(*one(1))
+    file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
+    damage(tmp_path / "s", file, "cut")
+    with pytest.raises(StoreError, match=f"{file} cannot be read") as said:
+        writer.rows(f"{1:016x}", f"{1:016x}-a")
+    assert "--force" in str(said.value)
+    writer.write(*one(1, "b"))
+    assert shown(tmp_path / "s") == expected((1, "b", 0))
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "denied"), OSError(5, "disk")])
+def test_a_file_that_only_now_cannot_be_read_is_not_dropped(tmp_path, monkeypatch, error):
+    writer = joined(tmp_path / "s")
+    reading = Location.reading
+
+    @contextmanager
+    def refused(self, path):
+        if "compacted" in path:
+            raise error
+        with reading(self, path) as source:
+            yield source
+
+    monkeypatch.setattr(Location, "reading", refused)
+    with pytest.raises(StoreError, match=r"compacted/.* cannot be read") as said:
+        drop_damaged(writer)
+    assert "make the file readable" in str(said.value)
+    monkeypatch.undo()
+    assert shown(tmp_path / "s") == WHOLE
+
+
+def test_memory_that_does_not_suffice_is_no_damage(tmp_path, monkeypatch):
+    writer = joined(tmp_path / "s")
+
+    def full(*_: object) -> None:
+        raise pa.ArrowMemoryError("malloc of size 1 failed")
+
+    monkeypatch.setattr("restock.ingest.store.damaged_files.pq.ParquetFile", full)
+    with pytest.raises(MemoryError):
+        drop_damaged(writer)
+
+
+def test_two_that_drop_the_same_file_drop_it_once(tmp_path, monkeypatch):
+    writer = joined(tmp_path / "s")
+    file = next(one for one in active(tmp_path / "s", TRANSITIONS) if "compacted" in one)
+    damage(tmp_path / "s", file, "cut")
+    transact = StoreWriter.transact
+
+    def overtaken(self, *args, **given):
+        monkeypatch.setattr(StoreWriter, "transact", transact)
+        assert drop_damaged(StoreWriter(tmp_path / "s")).joined_again == [file]
+        transact(self, *args, **given)
+
+    monkeypatch.setattr(StoreWriter, "transact", overtaken)
+    done = drop_damaged(writer)
+    assert (done.joined_again, done.dropped, done.lost) == ([], [], [])
+    assert shown(tmp_path / "s") == WHOLE
+    assert len([one for one in files_of(tmp_path / "s") if "transitions/compacted" in one]) == 3
+
+
+def test_of_a_version_whose_manifests_are_gone_no_recording_is_left_out(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    version = writer.write_all([one(1), one(2)])
+    writer.write(*one(1, "b"))
+    assert len(writer.live(version=version)) == 2
+    writer.clean(retention_hours=0)
+    with pytest.raises(StoreError, match="can no longer be read"):
+        writer.live(version=version)
+
+
+def test_an_ingest_is_not_failed_by_a_damaged_manifest_of_another_recording(tmp_path, monkeypatch):
+    """In what it does at its end; frames that the manifest may name are kept."""
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    damage(tmp_path / "s", f"{RECORDINGS}/{1:016x}/{1:016x}-a.parquet", "cut")
+    frames = tmp_path / "s/frames" / f"{1:016x}" / f"{1:016x}-a.parquet"
+    frames.parent.mkdir(parents=True)
+    frames.write_text("frames")
+    os.utime(frames, (0, 0))
+    monkeypatch.setattr(compaction, "FOLD_FILES", 2)
+    assert writer.clean() == []
+    compaction.fold_if_many(writer)
+    assert frames.is_file()
+
+
+def test_rows_that_are_lost_with_their_manifests_are_counted(tmp_path):
+    writer = joined(tmp_path / "s")
+    writer.clean(retention_hours=0)
+    for name in (TRANSITIONS, RECORDINGS):
+        damage(tmp_path / "s", next(f for f in active(tmp_path / "s", name) if "comp" in f), "cut")
+    done = drop_damaged(writer)
+    assert len(done.dropped) == 2
+    assert (done.lost, done.unnamed_transitions) == (
+        [],
+        sum(WHOLE[f"{n:016x}-a"] for n in (1, 3)),
+    )
+    assert shown(tmp_path / "s") == expected((2, "b", 7))
+
+
+def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
+    place = tmp_path / "s"
+    writer = joined(place)
+    assert main(["compact", str(place), "--drop-damaged"]) == 0
+    assert "no file is damaged" in capsys.readouterr().err
+    writer.clean(retention_hours=0)
+    file = next(one for one in active(place, TRANSITIONS) if "compacted" in one)
+    damage(place, file, "cut")
+    for options in (["--dry-run"], ["--json"]):
+        assert main(["compact", str(place), "--drop-damaged", *options]) == 3
+        out, said = capsys.readouterr()
+        assert file in said
+        assert "logs/1.mcap (recording 0000000000000001" in said
+        assert "logs/3.mcap" in said
+        assert "logs/2.mcap" not in said
+    assert json.loads(out)["dropped"] == [file]
+    assert shown(place) == expected((2, "b", 7))
