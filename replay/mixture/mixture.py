@@ -122,6 +122,10 @@ class SourceShares(Checked, frozen=True):
 
 
 def _check_rates(represents: Represents | None) -> None:
+    _require(
+        represents != {},
+        "`represents` is an empty table: give the rate of a stratum, or leave it out",
+    )
     total = sum(represents.values()) if isinstance(represents, dict) else 0.0
     _require(total <= 1 + 1e-6, f"the rates of `represents` sum to {total:g}, above 1")
 

@@ -8,7 +8,8 @@ and corrections weigh the rows back to them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,11 +17,13 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, StratumRule
+from restock.replay.mixture.mixture import Mixture, Represents, StratumRule
 
-# How many times the others' rate of a condition, by episode, speaks of an archive; and how many
-# episodes of it there must be.
-ARCHIVE_RATIO, ARCHIVE_EPISODES = 5.0, 5
+# How many times the others' odds of a condition, by episode, are reason to warn, and to refuse an
+# archive that does not say that it is one; and of how many such episodes. Odds, because what a
+# fifth of all episodes meet can never be five times as frequent.
+WARNING_ODDS, ARCHIVE_ODDS, ARCHIVE_EPISODES = 2.0, 5.0, 5
+Z_99 = 2.576  # standard errors of a normal distribution's two-sided 99 % interval
 
 
 class Source(Protocol):
@@ -30,8 +33,6 @@ class Source(Protocol):
     def name(self) -> str: ...
     @property
     def code(self) -> NDArray[np.int16]: ...
-    @property
-    def episode(self) -> Ints: ...
 
 
 class Resolved(Protocol):
@@ -44,17 +45,13 @@ class Resolved(Protocol):
 
 
 def represented_shares(
-    mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source], nominal: str
+    mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source]
 ) -> list[F64 | None]:
     """The natural share of each stratum (S,) that each source stands for; None: of its own rows.
 
-    `nominal` is the stratum of what met no condition, which is no rare one.
-
     Raises:
-        MixtureError: a source that looks like an archive and does not say what it represents, or
-            rates that are of no stratum or leave no room for the others.
+        MixtureError: rates that are of no stratum or leave no room for the others.
     """
-    refuse_archives(mixture, strata, sources, nominal)
     names = [stratum.rule.name for stratum in strata]
     rows = [np.bincount(source.code, minlength=len(names)) for source in sources]
     first = mixture.sources.represents
@@ -109,43 +106,68 @@ def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: 
         )
 
 
-def refuse_archives(
-    mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source], nominal: str
-) -> None:
-    """That no source that does not say what it represents looks like an archive.
+def look_for_archives(
+    said: Mapping[str, Represents | None],
+    met: Mapping[str, Sequence[tuple[int, int]]],
+    strata: Collection[str],
+) -> tuple[str, ...]:
+    """What to warn of: a source in which a condition is far more frequent than in the others.
+
+    Of several such conditions, the clearest. Only a source that does not say what it represents is
+    looked at, and compared with those that do not stand for other rates than their own.
+
+    Args:
+        said: what each source says of itself.
+        met: condition or exposure -> of each source, the episodes that met it, and of how many.
+        strata: names of strata: the rates of others change nothing.
 
     Raises:
-        MixtureError: a condition is far more frequent among the episodes of one than of the others.
+        MixtureError: the same, of a stratum, by ARCHIVE_ODDS.
     """
-    said = list(mixture.sources.said.values())
-    if len(sources) < 2:
-        return
-    met, of_all = zip(*(_episodes(source, len(strata)) for source in sources), strict=True)
-    for number, source in enumerate(sources):
-        others = [k for k, what in enumerate(said) if k != number and what in (None, "natural")]
-        if said[number] is not None or not others:
+    found = []
+    for number, (source, represents) in enumerate(said.items()):
+        others = [
+            k for k, what in enumerate(said.values()) if k != number and what in (None, "natural")
+        ]
+        if represents is not None or not others:
             continue
-        for place, stratum in enumerate(strata):
-            if stratum.rule.where is not None or stratum.rule.name == nominal:
-                continue
-            mine, all_mine = met[number][place], of_all[number]
-            theirs = sum(met[k][place] for k in others), sum(of_all[k] for k in others)
-            usual = (theirs[0] + 1) / (theirs[1] + 1)  # one more, as it may be chance
-            if mine < ARCHIVE_EPISODES or mine / all_mine < ARCHIVE_RATIO * usual:
-                continue
-            place_of = "[sources]" if number == 0 else f"the store {source.name!r}"
-            name = stratum.rule.name
-            natural = f"{name} = {max(theirs[0], 1) / max(theirs[1], 1):.2g}"
-            raise MixtureError(
-                f"the source {source.name!r} looks like an archive: {mine} of its {all_mine}"
-                f" episodes are of {name}, {theirs[0]} of {theirs[1]} of the other sources",
-                remedy=f"set in {place_of} what its rows represent: "
-                + ('represents = "archive" (the rates of the main store), ' if number else "")
-                + f'represents = {{ {natural} }} (rates), or "natural" (it is as it occurs)',
-            )
+        for name, of_sources in met.items():
+            mine = of_sources[number]
+            theirs = (sum(of_sources[k][0] for k in others), sum(of_sources[k][1] for k in others))
+            odds, low, high = odds_ratio(mine, theirs)
+            if mine[1] and theirs[1] and odds >= WARNING_ODDS and low > 1:
+                refused = odds >= ARCHIVE_ODDS and mine[0] >= ARCHIVE_EPISODES and name in strata
+                found.append((refused, low, high, odds, number, source, name, mine, theirs))
+    if not found:
+        return ()
+    refused, low, high, odds, number, source, name, mine, theirs = max(found)
+    what = (
+        f"{mine[0]} of its {mine[1]} episodes are of {name}, {theirs[0]} of {theirs[1]} of the"
+        f" other sources (odds {odds:.2g} times theirs, {low:.2g} to {high:.2g})"
+    )
+    place = f"the store {source!r}" if number else "[sources]"
+    choices = [
+        *(['"archive" (the rates of the main store)'] if number else []),
+        *(
+            [f"{{ {name} = {max(theirs[0], 1) / theirs[1]:.2g} }} (rates)"]
+            if name in strata
+            else []
+        ),
+        '"natural" (it is as it occurs)',
+    ]
+    remedy = f"set in {place} what its rows represent: represents = {' or '.join(choices)}"
+    if refused:
+        raise MixtureError(f"the source {source!r} looks like an archive: {what}", remedy=remedy)
+    return (f"the source {source!r} may be an archive: {what}; {remedy}",)
 
 
-def _episodes(source: Source, size: int) -> tuple[Ints, int]:
-    """Episodes with a row in each stratum (S,), and in all."""
-    pairs = np.unique(np.stack([source.code.astype(np.int64), source.episode]), axis=1)
-    return np.bincount(pairs[0], minlength=size), len(np.unique(source.episode))
+def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, float, float]:
+    """How many times the others' odds, and its 99 % interval: several conditions are compared.
+
+    `mine` and `theirs` are (episodes that met it, episodes). Half an episode is added to each count
+    (Haldane 1956, Anscombe 1956), so that none is 0.
+    """
+    counts = np.array([mine[0], mine[1] - mine[0], theirs[0], theirs[1] - theirs[0]]) + 0.5
+    log_odds = float(np.log(counts) @ [1, -1, -1, 1])
+    margin = Z_99 * float(np.sqrt((1 / counts).sum()))
+    return math.exp(log_odds), math.exp(log_odds - margin), math.exp(log_odds + margin)

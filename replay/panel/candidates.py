@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
+from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.strata import ResolvedStratum
 
@@ -220,6 +221,49 @@ def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
         " HAVING count(DISTINCT recording_id) = (SELECT count(*) FROM recordings)"
     ).fetchall()
     return dict(rows)
+
+
+def episodes_met(
+    connection: duckdb.DuckDBPyConnection, mixture: Mixture, conditions: Sequence[Condition]
+) -> dict[str, list[tuple[int, int]]]:
+    """Of each condition and exposure, by store: episodes that met it, of those that could tell.
+
+    Over a view of several stores, and the rows that the mixture's `where` admits.
+    """
+    held = "conditions" if mixture.uncertain == "keep" else _CERTAIN
+    rows = (
+        f"(SELECT {STORE_COLUMN}, recording_id, episode_id, {held} AS conditions, exposures"
+        f" FROM transitions WHERE coalesce(({mixture.where or 'true'}\n)::BOOLEAN, false))"
+    )
+    met: dict[tuple[str, str], int] = {
+        (recording, name): episodes
+        for recording, name, episodes in connection.sql(
+            "SELECT recording_id, held, count(DISTINCT episode_id) FROM (SELECT recording_id,"
+            f" episode_id, unnest(list_concat(conditions, exposures)) AS held FROM {rows})"
+            " GROUP BY ALL"
+        ).fetchall()
+    }
+    recordings = connection.sql(
+        f"SELECT {STORE_COLUMN}, recording_id, episodes, exposed,"
+        " coalesce(list_transform(unknown_conditions, lambda one: one.condition), [])"
+        f" FROM (SELECT {STORE_COLUMN}, recording_id, count(DISTINCT episode_id) AS episodes,"
+        f" count(exposures) > 0 AS exposed FROM {rows} GROUP BY ALL)"
+        " JOIN (SELECT recording_id, any_value(unknown_conditions) AS unknown_conditions"
+        " FROM recordings GROUP BY recording_id) USING (recording_id)"
+    ).fetchall()
+    stores = 1 + len(mixture.sources.stores)
+    counts = {condition.name: np.zeros((stores, 2), np.int64) for condition in conditions}
+    for store, recording, episodes, exposed, unknown in recordings:
+        for condition in conditions:
+            if condition.name not in unknown and (exposed or condition.kind == "outcome"):
+                counts[condition.name][store] += (
+                    met.get((recording, condition.name), 0),
+                    episodes,
+                )
+    return {
+        name: [(met_it, could_tell) for met_it, could_tell in of_stores.tolist()]
+        for name, of_stores in counts.items()
+    }
 
 
 def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:

@@ -21,12 +21,13 @@ from restock.arrays import F32, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
-from restock.replay.mixture.represented import represented_shares
+from restock.replay.mixture.represented import look_for_archives, represented_shares
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.candidates import (
     META_COLUMNS,
     bools,
     codes,
+    episodes_met,
     one_task,
     read_candidates,
     unknown_conditions,
@@ -80,6 +81,7 @@ class PanelPlan:
     others: tuple[PinnedStore, ...] = ()  # besides the first store
     uncertain_rows: int = 0  # with a condition too near to call, whatever the mixture does of it
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
+    warnings: tuple[str, ...] = ()  # of a source that may be an archive
 
     @property
     def panel_rows(self) -> Ints:
@@ -150,7 +152,12 @@ def plan_panel(
     leave_out_of_strata(table, mixture, strata, stratum, out)
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
-    occurs = represented_shares(mixture, strata, given, NOMINAL)
+    warnings: tuple[str, ...] = ()
+    if others:
+        met = episodes_met(connection, mixture, conditions)
+        names = [named.name for named in strata]
+        warnings = look_for_archives(mixture.sources.said, met, names)
+    occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)
     worked_out = [
         plan_source(connection, mixture, strata, source, natural, unknown)
@@ -167,6 +174,7 @@ def plan_panel(
         worked_out,
         others,
         as_of_ns,
+        warnings,
     )
 
 
@@ -253,6 +261,7 @@ def _joined(
     worked_out: Sequence[SourcePlan],
     others: Sequence[PinnedStore],
     as_of_ns: int,
+    warnings: tuple[str, ...],
 ) -> PanelPlan:
     """All sources as one plan: the strata of source k are k * S and on."""
     size = len(strata)
@@ -313,6 +322,7 @@ def _joined(
         others=tuple(others),
         uncertain_rows=int(bools(table, "uncertain").sum()),
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
+        warnings=warnings,
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import duckdb
 import msgspec
 
-from restock.errors import StoreError
+from restock.errors import MixtureError, StoreError
 from restock.replay.mixture.mixture import Mixture, OtherStore
 from restock.replay.panel.candidates import STORE_COLUMN
 from restock.replay.store.definitions import definitions
@@ -44,6 +44,7 @@ def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> It
 
     Raises:
         StoreError: one of them cannot be opened, has no such version, or no rows.
+        MixtureError: the stores before one of them have all of its rows too.
     """
     if not mixture.sources.stores:
         yield AllStores(first.connection, ())
@@ -54,7 +55,7 @@ def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> It
             for wanted in mixture.sources.stores
         ]
         connection = opened.enter_context(duckdb.connect())
-        repeated_rows = _attach(connection, [first, *(store for _, store in others)])
+        repeated_rows = _attach(connection, first, others)
         pinned = tuple(
             PinnedStore(wanted.name, str(store.path), store.version, repeated)
             for (wanted, store), repeated in zip(others, repeated_rows, strict=True)
@@ -78,11 +79,13 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
         ) from error
 
 
-def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> list[int]:
+def _attach(
+    connection: duckdb.DuckDBPyConnection, first: Store, others: Sequence[tuple[OtherStore, Store]]
+) -> list[int]:
     """Make the view; returns how many rows of each other store are in one before it."""
     tables: dict[str, list[str]] = {"stored_transitions": [], "stored_recordings": []}
     repeated = []
-    for number, store in enumerate(stores):
+    for number, store in enumerate([first, *(store for _, store in others)]):
         schema = f'"store_{number}"'
         connection.execute(f"CREATE SCHEMA {schema}")
         for table in tables:
@@ -96,8 +99,11 @@ def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> l
         before = " UNION ALL ".join(f'FROM "store_{i}".mine' for i in range(number))
         known = f"recording_id IN ({before})" if before else "false"
         if number:
-            count = f"SELECT count(*) FROM {schema}.stored_transitions WHERE {known}"
-            repeated.append(int(connection.sql(count).fetchall()[0][0]))
+            count = f"SELECT countif({known}), count(*) FROM {schema}.stored_transitions"
+            [(repeats, rows)] = connection.sql(count).fetchall()
+            if repeats == rows:
+                raise _all_repeated(others[number - 1][0].name, rows, number)
+            repeated.append(int(repeats))
         for table in tables:
             tables[table].append(
                 f"SELECT *, {number} AS {STORE_COLUMN} FROM {schema}.{table} WHERE NOT ({known})"
@@ -106,3 +112,12 @@ def _attach(connection: duckdb.DuckDBPyConnection, stores: Sequence[Store]) -> l
         connection.execute(f"CREATE VIEW {table} AS " + " UNION ALL BY NAME ".join(parts))
     connection.execute(definitions(names=["rows.sql"]))
     return repeated
+
+
+def _all_repeated(name: str, rows: int, number: int) -> MixtureError:
+    where = "the main store" if number == 1 else "the stores before it"
+    return MixtureError(
+        f"all {rows:,} rows of {name!r} are also in {where}, and are drawn from there",
+        remedy="leave this store out of the mixture: a stratum with a larger `share` draws them"
+        " more often, and its `where` may name their recordings (recording_id IN (…))",
+    )

@@ -188,6 +188,19 @@ def two_stores(tmp_path: Path, store_path: Path) -> Path:
     return tmp_path
 
 
+def test_a_store_whose_rows_are_all_in_the_first_one_is_named(
+    tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = recording_transitions(3)
+    write_store(tmp_path / "other", [rows])
+    mixture = tmp_path / "m.toml"
+    mixture.write_text(OTHERS.replace("version = 1\n", "") + EVERY)
+    assert cli.main(["mix", str(store_path), "--mixture", str(mixture), "--dry-run"]) == 2
+    said = capsys.readouterr().err
+    assert f"all {len(rows)} rows of 'twin' are also in the main store" in said
+    assert "leave this store out of the mixture" in said
+
+
 def test_another_store_is_drawn_from_at_its_pinned_version(
     two_stores: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

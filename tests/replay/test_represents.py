@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.stores import recording_transitions, write_store
 
+from restock import cli
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
+from restock.replay.mixture.represented import look_for_archives, odds_ratio
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.logged_sampler import sampler_for
 from restock.replay.panel.panel import Panel
@@ -104,6 +107,59 @@ def test_the_main_store_may_be_the_archive(folder):
     plan = planned(folder, main="represents = { near_collision = 0.03 }", first="incidents")
     assert natural(plan)["near_collision"] == pytest.approx(0.03)
     assert natural(plan)["nominal"] == pytest.approx(0.97)
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "refused", "warned"),
+    [
+        ((25, 65), (21, 182), False, True),  # 3.3 times as frequent, odds 4.7 times
+        ((36, 40), (80, 200), True, True),  # what two fifths meet is at most 2.5 times as frequent
+        ((3, 6), (21, 182), False, False),  # a small one, by chance
+        ((30, 100), (50, 182), False, False),
+        ((180, 1000), (100, 1000), False, False),  # surely more, and less than twice
+        ((0, 0), (21, 182), False, False),  # no episode tells
+    ],
+)
+def test_archives_are_told_by_their_odds(mine, theirs, refused, warned):
+    said = {"logs": None, "incidents": None}
+    met = {"near_collision": [theirs, mine]}
+    if refused:
+        with pytest.raises(MixtureError, match="looks like an archive"):
+            look_for_archives(said, met, ["near_collision"])
+    # What is no stratum has no rate to be given; the rows are a selection all the same.
+    warnings = look_for_archives(said, met, ["all"] if refused else ["near_collision"])
+    assert bool(warnings) == warned
+    assert all("'incidents' may be an archive" in text for text in warnings)
+    assert look_for_archives(said | {"incidents": "archive"}, met, ["all"]) == ()
+
+
+def test_odds_are_those_of_a_two_by_two_table():
+    odds, low, high = odds_ratio((10, 20), (5, 30))
+    assert odds == pytest.approx(10.5 / 10.5 / (5.5 / 25.5))
+    spread = 2.576 * np.sqrt(2 / 10.5 + 1 / 5.5 + 1 / 25.5)
+    assert (low, high) == pytest.approx((odds * np.exp(-spread), odds * np.exp(spread)))
+
+
+def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, capsys):
+    """By its conditions or its exposures, whatever the strata are."""
+    write_store(tmp_path / "main", [recording(1, 100, 20)])
+    write_store(tmp_path / "incidents", [recording(2, 30, 14)])
+    plan = planned(tmp_path)
+    assert "14 of its 30 episodes are of near_collision, 20 of 100" in plan.warnings[0]
+    assert planned(tmp_path, 'represents = "natural"').warnings == ()
+
+    exposed = recording(3, 30, 6)
+    there = exposed["episode_index"].to_numpy() < 26  # a third of those of the main store
+    names = [["closing_traffic"] if one else [] for one in there]
+    write_store(tmp_path / "bags", [replaced(exposed, {"exposures": names})])
+    (tmp_path / "m.toml").write_text(
+        TWO.format(archive="", main="", rule="none").replace('path = "incidents"', 'path = "bags"')
+    )
+    asked = ["mix", str(tmp_path / "main"), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
+    assert cli.main([*asked, "--json"]) == 0
+    said = capsys.readouterr()
+    assert "warning: the source 'incidents' may be an archive: 26 of its 30" in said.err
+    assert len(json.loads(said.out)["warnings"]) == 1
 
 
 def test_an_archive_stands_for_the_main_stores_rates_or_for_given_ones(folder):
@@ -224,6 +280,8 @@ def test_rates_that_cannot_be_meant_are_refused(folder, archive, main, message):
         ("represents = { near_collision = 0.7, nominal = 0.6 }", "", "sum to 1.3"),
         ("represents = { near_collision = 1.5 }", "", "near_collision|<= 1"),
         ("", 'represents = "archive"', "this is it"),
+        ("represents = {}", "", "an empty table"),
+        ("", "represents = {}", "an empty table"),
     ],
 )
 def test_a_file_that_says_it_wrongly_is_refused(archive, main, message):

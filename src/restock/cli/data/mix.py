@@ -98,6 +98,8 @@ class MixCommand:
                         source, plan, self.out, force=self.force, advance=lambda n: advance(n)
                     )
                 document |= {"panel": str(self.out), "id": panel.id}
+        for warning in document["warnings"]:
+            output.say(f"warning: {warning}")
         if self.json:
             output.print_json(document)
             return
@@ -148,6 +150,7 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
             for name, rates in plan.mixture.sources.said.items()
             if plan.mixture.sources.chosen(name)
         },
+        "warnings": list(plan.warnings),
         "planned_draws": plan.mixture.planned.updates * plan.mixture.planned.batch_size,
         "max_replays_per_row": plan.mixture.max_replays_per_row,
         "schedules": {
