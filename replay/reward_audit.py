@@ -7,6 +7,7 @@ training, in the returns of the drivers that are there: of a store, or of a run'
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,8 @@ class RewardAudit:
 
     discount: float
     returns: list[dict[str, Any]]  # a row a condition, driver and outcome
-    order: list[dict[str, Any]]  # a row a condition and pair of drivers
+    # A row a condition and pair of drivers; ends of `more_return` are NaN below three episodes.
+    order: list[dict[str, Any]]
     findings: list[Finding]
 
 
@@ -45,6 +47,7 @@ def audit_reward(
     *,
     discount: float | None = None,
     version: Version | None = None,
+    memory_limit: str | None = None,
 ) -> RewardAudit:
     """Whether more success earns more, in a store's logs or a run's evaluations.
 
@@ -53,6 +56,7 @@ def audit_reward(
         audits, thresholds: all that are known; those of the reward are run.
         discount: of one step; for a run its own, for a store DISCOUNT.
         version: of the store; the newest.
+        memory_limit: of DuckDB, for a store.
 
     Raises:
         ConfigError: another discount than a run's evaluations were made with.
@@ -69,7 +73,9 @@ def audit_reward(
         discount = _discount_of(folder, discount)
     discount = DISCOUNT if discount is None else discount
     beside = {"run": place} if of_run else {}
-    with open_place(place, beside=beside, only_store=not of_run, version=version) as connection:
+    with open_place(
+        place, beside=beside, memory_limit=memory_limit, only_store=not of_run, version=version
+    ) as connection:
         if of_run:
             _check_evaluated(connection, Path(place))
         else:
@@ -82,12 +88,11 @@ def audit_reward(
         source = "run.driven_episodes" if of_run else "driven_episodes"
         least = max(float(table["min_episodes"]) for table in limits.values())
         same = float(limits[names[1]]["same_success"])
-        return RewardAudit(
-            discount,
-            _rows(connection, f"FROM returns_of('{source}')"),
-            _rows(connection, f"FROM return_order('{source}', {least!r}, {same!r})"),
-            findings,
-        )
+        order = _rows(connection, f"FROM return_order('{source}', {least!r}, {same!r})")
+        for row in order:
+            row["more_return"] = [math.nan if end is None else end for end in row["more_return"]]
+        returns = _rows(connection, f"FROM returns_of('{source}')")
+        return RewardAudit(discount, returns, order, findings)
 
 
 def _discount_of(run: Path, asked: float | None) -> float:

@@ -6,6 +6,16 @@
 --
 -- Not translated for Spark: `query_table` is DuckDB's.
 
+-- Student's t at .975, by its expansion in the normal quantile (Abramowitz and Stegun 26.7.5), within
+-- 1 %; null below 2 degrees of freedom: the spread of one or two episodes says nothing.
+CREATE OR REPLACE MACRO student_t_975(freedom) AS CASE
+    WHEN freedom >= 2 THEN 1.96
+        + 2.3723 / freedom
+        + 2.8225 / pow(freedom, 2)
+        + 2.5558 / pow(freedom, 3)
+        + 1.5895 / pow(freedom, 4)
+END;
+
 -- One row a condition and driver, and one an outcome of those (`all` is every outcome).
 CREATE OR REPLACE MACRO returns_of(source) AS TABLE
 SELECT
@@ -16,16 +26,18 @@ SELECT
     avg(success::INTEGER) AS success_share,
     avg(return) AS return_mean,
     avg(discounted_return) AS discounted_mean,
-    discounted_mean - 1.96 * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_low,
-    discounted_mean + 1.96 * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_high
+    discounted_mean
+        - student_t_975(count(*) - 1) * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_low,
+    discounted_mean
+        + student_t_975(count(*) - 1) * stddev_samp(discounted_return) / sqrt(count(*)) AS discounted_high
 FROM query_table(source)
 GROUP BY GROUPING SETS ((condition, driver), (condition, driver, outcome))
 ORDER BY condition, driver, outcome <> 'all', outcome;
 
 -- One row a condition and pair of drivers: by how much the one with more success has more of it, and
--- how much more it earns, each with its 95 % interval. Episodes of the same missions are compared
--- mission by mission. Episodes in which control was handed over count for no driver: the operator is
--- called to the harder ones.
+-- how much more it earns, each with its 95 % interval (of earnings null below three episodes of
+-- either). Episodes of the same missions are compared mission by mission. Episodes in which control
+-- was handed over count for no driver: the operator is called to the harder ones.
 CREATE OR REPLACE MACRO return_order(source, min_episodes, same_success) AS TABLE
 WITH driven AS (
     SELECT condition, driver, mission, success::INTEGER AS success, discounted_return AS earned
@@ -38,7 +50,7 @@ WITH driven AS (
         count(*) AS n,
         avg(success) AS success,
         avg(earned) AS earned,
-        coalesce(var_samp(earned), 0) AS earned_variance,
+        var_samp(earned) / count(*) AS earned_error, -- its mean's variance
         -- Wilson's interval: its centre and half width, z = 1.96.
         (avg(success) + 1.9208 / count(*)) / (1 + 3.8416 / count(*)) AS centre,
         1.96 / (1 + 3.8416 / count(*))
@@ -57,7 +69,7 @@ WITH driven AS (
         avg(b.success) AS success_less,
         avg(a.earned) AS earned,
         avg(b.earned) AS earned_less,
-        coalesce(var_samp(a.earned - b.earned), 0) AS earned_variance
+        var_samp(a.earned - b.earned) / count(*) AS earned_error
     FROM driven AS a
     JOIN driven AS b ON a.condition = b.condition AND a.mission = b.mission AND a.driver <> b.driver
     GROUP BY a.condition, a.driver, b.driver
@@ -69,7 +81,7 @@ WITH driven AS (
         (only_more - only_less) / (n + 2) AS success_middle,
         1.96 * sqrt(only_more + only_less + 1 - pow(only_more - only_less, 2) / (n + 2)) / (n + 2) AS success_below,
         success_below AS success_above,
-        1.96 * sqrt(earned_variance / n) AS earned_half
+        student_t_975(n - 1) * sqrt(earned_error) AS earned_half
     FROM paired
     UNION ALL
     SELECT
@@ -79,15 +91,23 @@ WITH driven AS (
         a.success - b.success,
         sqrt(pow(a.success - (a.centre - a.half), 2) + pow(b.centre + b.half - b.success, 2)),
         sqrt(pow(a.centre + a.half - a.success, 2) + pow(b.success - (b.centre - b.half), 2)),
-        1.96 * sqrt(a.earned_variance / a.n + b.earned_variance / b.n)
+        -- Welch's; where neither varies it has no degrees of freedom.
+        CASE
+            WHEN least(a.n, b.n) < 3 THEN NULL
+            WHEN a.earned_error + b.earned_error = 0 THEN 0
+            ELSE sqrt(a.earned_error + b.earned_error) * student_t_975(
+                pow(a.earned_error + b.earned_error, 2)
+                / (pow(a.earned_error, 2) / (a.n - 1) + pow(b.earned_error, 2) / (b.n - 1))
+            )
+        END
     FROM by_driver AS a
     JOIN by_driver AS b ON a.condition = b.condition AND a.driver <> b.driver
     WHERE NOT EXISTS (FROM paired WHERE paired.condition = a.condition AND more = a.driver AND less = b.driver)
 ), intervals AS (
     SELECT
         *,
-        success_middle - success_below AS success_low,
-        success_middle + success_above AS success_high,
+        greatest(success_middle - success_below, -1) AS success_low,
+        least(success_middle + success_above, 1) AS success_high,
         earned - earned_less - earned_half AS earned_low,
         earned - earned_less + earned_half AS earned_high
     FROM differences

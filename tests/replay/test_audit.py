@@ -643,7 +643,10 @@ def test_the_verb_fails_on_an_error_and_passes_without(
     out = capsys.readouterr().out
     assert "stale_data" in out
     assert "skipped" in out
-    strict = ["--thresholds", str(easy), "--strict", "--junit", str(junit)]
+    assert cli.main(["audit", str(store_path), "--memory-limit", "lots"]) == 2
+    assert "no memory limit 'lots'" in capsys.readouterr().err
+    assert cli.main(["audit", str(store_path), "--capacity", "--memory-limit", "1GB"]) == 0
+    strict = ["--thresholds", str(easy), "--strict", "--junit", str(junit), "--memory-limit", "1GB"]
     assert cli.main(["audit", str(store_path), *strict]) == 1
     assert int(ElementTree.fromstring(junit.read_text()).get("failures", "")) > 0
 

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import ttest_ind, ttest_rel
 from support.finished_runs import document, make_run
 from support.stores import recording_transitions, write_store
 
@@ -121,7 +122,8 @@ def test_a_reward_that_pays_for_haste_fails_and_one_that_stops_at_a_bump_passes(
 def test_the_command_fails_with_the_numbers_and_the_remedy(tmp_path, capsys) -> None:
     place = str(store_of(tmp_path / "store", hasty_and_careful(earlier, 120)))
     assert cli.main(["audit", place, "--reward", "--discount", "0.97"]) == 1
-    shown = capsys.readouterr().out
+    shown = " ".join(capsys.readouterr().out.split())  # a cell may be wrapped
+    assert "return at discount 0.97" in shown
     assert all(text in shown for text in ("goal after a bump 30", "bump_terminates", "1 reversed"))
     assert cli.main(["audit", place, "--reward", "--discount", "0.97", "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
@@ -163,7 +165,7 @@ def test_what_cannot_be_told_is_undetermined_and_no_pass(tmp_path, capsys, drive
     assert "undetermined" in capsys.readouterr().out
 
 
-def test_an_evaluation_is_compared_mission_by_mission(tmp_path) -> None:
+def test_an_evaluation_is_compared_mission_by_mission(tmp_path, capsys) -> None:
     """Missions differ far more than drivers do: only their pairs tell."""
     run = make_run(tmp_path / "run", document())
     with pytest.raises(RunError, match="no evaluation with discounted returns"):
@@ -193,6 +195,88 @@ def test_an_evaluation_is_compared_mission_by_mission(tmp_path) -> None:
     assert found["reward_order"] == "fail"
     assert found["near_collision: operator 1 > agent 1"] == "reversed"
     assert cli.main(["audit", str(run), "--reward", "--discount", "0.5"]) == 2  # it has its own
+    assert cli.main(["audit", str(run), "--reward", "--memory-limit", "4GB"]) == 2
+    assert "--memory-limit: cannot be combined" in capsys.readouterr().err
+
+
+def ordered(
+    first: Sequence[float],
+    second: Sequence[float],
+    *,
+    success: tuple[float, float] = (1.0, 0.0),
+    paired: bool = False,
+    min_episodes: int = 20,
+) -> dict[str, Any]:
+    """`return_order` of two drivers, a and b, with these returns and shares of success."""
+    rows = [
+        {
+            "condition": "c",
+            "driver": driver,
+            "mission": str(number) if paired else None,
+            "success": number < share * len(returns),
+            "discounted_return": float(value),
+            "handed_over": False,
+        }
+        for driver, returns, share in zip("ab", (first, second), success, strict=True)
+        for number, value in enumerate(returns)
+    ]
+    schema = pa.schema([
+        *(("condition", pa.string()), ("driver", pa.string()), ("mission", pa.string())),
+        *(("success", pa.bool_()), ("discounted_return", pa.float64())),
+        ("handed_over", pa.bool_()),
+    ])  # fmt: skip
+    with duckdb.connect() as connection:
+        connection.register("driven", pa.Table.from_pylist(rows, schema))
+        connection.execute(definitions(names=("return_order.sql",)))
+        found = connection.sql(f"FROM return_order('driven', {min_episodes}, 0.1)")
+        (row,) = found.fetchall()
+        return dict(zip(found.columns, row, strict=True))
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_returns_of_fewer_than_three_episodes_have_no_interval(paired: bool) -> None:
+    for few in (1, 2):
+        many = few if paired else 40
+        row = ordered([5.0] * few, list(range(many)), paired=paired, min_episodes=1)
+        assert row["more_return"] == [None, None]
+        assert row["verdict"] in ("undetermined", "same success")
+        assert ordered([5.0] * few, list(range(many)), paired=paired)["verdict"] == "undetermined"
+
+
+def test_the_command_shows_a_pair_without_an_interval(tmp_path, capsys) -> None:
+    episodes: list[Episode] = [("planner", [1.0], "goal"), ("agent", [2.0], "goal")]
+    place = str(store_of(tmp_path / "store", [*episodes, ("agent", [3.0], "bump")]))
+    assert cli.main(["audit", place, "--reward"]) == 0
+    assert "undetermined" in capsys.readouterr().out
+    assert cli.main(["audit", place, "--reward", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["order"][0]["more_return"] == [None, None]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(3, 60), st.integers(3, 60), st.floats(0.1, 10), st.integers(0, 99))
+def test_returns_have_students_interval(n: int, m: int, spread: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.normal(0, 1, n), rng.normal(3, spread, m), rng.normal(0, 1, m)
+    for row, test in (
+        (ordered(a, b), ttest_ind(a, b, equal_var=False)),
+        (ordered(c, b, paired=True), ttest_rel(c, b)),
+    ):
+        low, high = test.confidence_interval()
+        found = row["more_return"]
+        assert found[1] - found[0] == pytest.approx(high - low, rel=0.01)
+        assert found[0] + found[1] == pytest.approx(low + high)
+
+
+def test_returns_that_do_not_vary_are_told_apart() -> None:
+    row = ordered([2.0] * 30, [1.0] * 30)
+    assert (row["verdict"], row["more_return"]) == ("agrees", [1.0, 1.0])
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_differences_of_success_end_at_one(paired: bool) -> None:
+    for count in (1, 3, 30):
+        low, high = ordered(range(count), range(count), paired=paired)["more_success"]
+        assert -1 <= low < high <= 1
 
 
 @settings(max_examples=30, deadline=None)

@@ -51,6 +51,8 @@ class AuditCommand:
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """Audit an earlier version of the store: its number, or a time (2026-11-01T08:00Z). Default:
     the newest."""
+    memory_limit: Annotated[str | None, tyro.conf.arg(metavar="SIZE")] = None
+    """Memory limit of DuckDB, e.g. 4GB; beyond it, DuckDB spills to a temporary folder."""
     rows: int = 5
     """How many offending rows to show per audit, at most 10; `restock sql` shows all."""
     json: bool = False
@@ -89,6 +91,8 @@ class AuditCommand:
             )
         if self.reward:
             _refuse_with(self, "--reward", "panel", "run_dir", "rows")
+            if (Path(self.store) / RUN_CONFIG).is_file():
+                _refuse_with(self, "the --reward of a run", "memory_limit")
         refuse_folder(self.junit, "--junit")
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
@@ -97,11 +101,22 @@ class AuditCommand:
         reward: RewardAudit | None = None
         if self.reward:
             reward = audit_reward(
-                self.store, audits, thresholds, discount=self.discount, version=version
+                self.store,
+                audits,
+                thresholds,
+                discount=self.discount,
+                version=version,
+                memory_limit=self.memory_limit,
             )
             findings = reward.findings
         else:
-            place = open_place(self.store, beside=given, only_store=True, version=version)
+            place = open_place(
+                self.store,
+                beside=given,
+                memory_limit=self.memory_limit,
+                only_store=True,
+                version=version,
+            )
             with place as connection, output.progress("audits", len(audits)) as advance:
                 findings = run_audits(
                     connection, audits, thresholds, beside=given, done=lambda name: advance(1, name)
@@ -144,7 +159,9 @@ class AuditCommand:
         from restock.replay.store.capacity import recommend_capacity
 
         version = given_version(self.version)
-        with open_place(self.store, only_store=True, version=version) as connection:
+        with open_place(
+            self.store, memory_limit=self.memory_limit, only_store=True, version=version
+        ) as connection:
             capacity = recommend_capacity(connection)
         applied = None
         if self.apply is not None:
@@ -255,7 +272,7 @@ def _print_reward(reward: RewardAudit) -> None:
             "driver": row["driver"],
             "episodes": row["episodes"],
             "success": row["success_share"],
-            f"return by {reward.discount:g}": row["discounted_mean"],
+            f"return at discount {reward.discount:g}": row["discounted_mean"],
             "undiscounted": row["return_mean"],
             "by outcome (return)": ", ".join(outcomes[row["condition"], row["driver"]]),
         }
