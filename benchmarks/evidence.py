@@ -37,9 +37,8 @@ from restock.errors import RestockError
 from restock.files import write_text
 from restock.stats import paired_t
 from restock.train.study.contrasts import RunCurve
-from restock.train.study.findings import findings, power_of
+from restock.train.study.findings import findings, power_of, too_small
 from restock.train.study.page import as_markdown
-from restock.train.study.power import warning
 from restock.train.study.study import DONE, Study, StudyPlan, load_study
 from restock.train.study.study_run import run_study
 
@@ -97,16 +96,15 @@ def _answer(options: argparse.Namespace) -> int:
     _make_store(store, LOGS[str(study.store)], hours, options.workers, options.quick)
     study = msgspec.structs.replace(study, store=str(store.resolve()))
     plan = StudyPlan(study, HERE, out / options.question)
-    power = power_of(plan)
-    if power is not None and power.too_small:
-        _say(warning(power))
+    if small := too_small(plan, power_of(plan)):
+        _say(small)
     comparisons = run_study(plan, workers=options.workers, say=_say)
     found = findings(plan, comparisons)
     page = f"{as_markdown(found)}\n{curves(plan)}"
     write_text(plan.out / "study.md", page)
     write_text(plan.out / "study.json", json.dumps(plain(found), indent=1) + "\n")
     sys.stdout.write(page)
-    return int(any(comparison.verdict != "comparable" for comparison in comparisons))
+    return int(any(one["verdict"] != "comparable" for one in found["comparisons"]))
 
 
 def primary_arms(study: Study) -> Study:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from support.finished_runs import document, make_run
 
 from restock.cli import main
+from restock.errors import ConfigError
 from restock.report import write_study_page
 from restock.train.comparison.compare import compare
 from restock.train.run.kept_evaluations import add_evaluation
@@ -186,6 +187,28 @@ def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
     assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "with 2 seeds; below 3 seeds there is no interval; " in said
+
+
+def test_a_study_of_two_seeds_is_too_small_whatever_pilots_say(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--dry-run"]
+    (tmp_path / "s.toml").write_text(STUDY.replace("[0, 1, 2, 3]", "[0, 1]"))
+    assert main(line) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the study is too small for its contrast: auc_wheel_slip of quotas" in said
+    assert "has 2 seeds; below 3 seeds there is no interval" in said
+    (tmp_path / "s.toml").write_text(STUDY)
+    assert main(line) == 0
+    assert "too small" not in capsys.readouterr().err
+
+
+def test_an_effect_beyond_the_range_of_a_share_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(
+        STUDY.replace("rare =", "power = { sd = 0.06, effect = 5 }\nrare =")
+    )
+    with pytest.raises(ConfigError, match=r"power\.effect must be in \(0, 1\]"):
+        load_study(tmp_path / "s.toml")
 
 
 def test_power_needs_a_contrast_and_a_spread(

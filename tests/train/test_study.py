@@ -8,10 +8,13 @@ from pathlib import Path
 import pytest
 
 from restock.cli import main
-from restock.errors import ConfigError
-from restock.train.comparison.arms import Difference
+from restock.errors import ConfigError, RunError
+from restock.train.comparison.arms import Difference, Treatment
+from restock.train.comparison.comparability import Check
 from restock.train.comparison.compare import Comparison
 from restock.train.study import study_run
+from restock.train.study.findings import findings
+from restock.train.study.page import as_markdown
 from restock.train.study.study import StudyPlan, load_study
 
 SMALL = """
@@ -146,6 +149,82 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     assert 'they differ in config.network.dueling, which treatment = "algorithm"' in page
     assert "## again against dueling" in page
     assert "Not held: the algorithm (config.network.dueling, library.arguments)." in page
+
+
+def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:
+    arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
+    (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
+    out = tmp_path / "out"
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, out)
+    for job in plan.jobs:  # all were trained and evaluated before
+        job.path.mkdir(parents=True)
+        job.done.write_text(plan.fingerprint(job))
+
+    def compared(first, second, *, treatment):
+        if treatment == "algorithm":
+            raise RunError("has no record of the episodes it sampled", where=str(second[0]))
+        return Comparison(treatment, "comparable", [], [], [], [], "evaluation", [])
+
+    monkeypatch.setattr(study_run, "compare", compared)
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
+    first, second = json.loads(capsys.readouterr().out)["comparisons"]
+    assert (first["verdict"], second["verdict"]) == ("inconclusive", "comparable")
+    why = "runs/dueling-0: has no record of the episodes it sampled"
+    assert why in first["why"]
+    assert f"{why}." in (out / "study.md").read_text()
+    assert why in (out / "study.html").read_text()
+
+
+def test_updates_that_differ_are_the_one_cause_that_is_named(tmp_path: Path) -> None:
+    """A feed that follows from them is not listed, nor is one that the treatment allows."""
+    (tmp_path / "s.toml").write_text(SMALL.replace('"algorithm"', '"mixture"'))
+    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, tmp_path / "out")
+    updates = Check.exact("updates", 51_500, 49_500, 51_500 / 49_500, 1.02)
+    fed = [Check.exact(f"share of fresh/{n}", 0.1, 0.9, 9.0, 1.25) for n in range(9)]
+
+    def page(totals: list[Check], treatment: Treatment = "mixture") -> str:
+        made = Comparison(treatment, "incomparable", [], [], totals, fed, None, [])
+        return as_markdown(findings(plan, [made]))
+
+    said = page([updates])
+    assert "Not compared: dueling made 49,500 updates and plain 51,500" in said
+    assert "share of fresh" not in said
+    many = page([], "algorithm")
+    assert "incomparable in share of fresh/0, " in many
+    assert "share of fresh/3 and 5 more." in many
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("schedule.env_steps = 1_500", "'a' would make no update: its schedule.env_steps (1,500)"),
+        ("schedule.env_steps = 2_000", "and it has no logs"),
+    ],
+)
+def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -> None:
+    study = f"store = 's'\n[settings]\n{settings}\n"
+    (tmp_path / "s.toml").write_text(study + TWO)
+    with pytest.raises(ConfigError) as refused:
+        load_study(tmp_path / "s.toml")
+    assert said in str(refused.value)
+    with_logs = TWO.replace("'\n", "'\nmixture = 'uniform'\n")
+    (tmp_path / "s.toml").write_text(study + with_logs)
+    assert load_study(tmp_path / "s.toml")
+    (tmp_path / "s.toml").write_text(f"{study}schedule.offline_updates = 0\n{with_logs}")
+    with pytest.raises(ConfigError, match=r"schedule\.offline_updates is 0"):
+        load_study(tmp_path / "s.toml")
+
+
+def test_an_interrupted_study_says_how_to_continue(tmp_path: Path, capsys, monkeypatch) -> None:
+    def stopped(plan, job, say):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_run, "run_job", stopped)
+    (tmp_path / "s.toml").write_text(SMALL)
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")]) == 130
+    said = " ".join(capsys.readouterr().err.split())
+    assert "interrupted; finished runs are kept" in said
+    assert "continue with the same command" in said
 
 
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:

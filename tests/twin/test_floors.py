@@ -278,6 +278,13 @@ def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
     assert describe_floor(read_floor(hall))["unreachable_goals"] == 60
 
 
+def test_a_kind_of_episode_that_does_not_exist_is_named_with_the_choices(tmp_path: Path) -> None:
+    shares = "env.conditions={nominal=0.5, ice=0.2}"
+    with pytest.raises(ConfigError, match="there is no kind of episode 'ice'") as refused:
+        prepare_new(tmp_path / "run", None, None, [shares])
+    assert "nominal, wheel_slip, blocked_aisle, near_collision" in str(refused.value.remedy)
+
+
 def test_one_way_rules_turn_the_plan_and_a_shut_in_robot_leaves_against_them() -> None:
     floor = default_warehouse()
     lane = floor.segments[2].area  # aisle 2, west

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from restock.errors import RunError
 from restock.stats import LEAST_PAIRS, paired_t, paired_t_power
 from restock.train.comparison.compare import Comparison
 from restock.train.comparison.curves import learning_curves, training_cost
@@ -17,20 +18,25 @@ from restock.train.run.measures import cell_name
 from restock.train.study import power as study_power
 from restock.train.study.contrasts import Contrast, RunCurve, contrast, with_holm
 from restock.train.study.power import Power
-from restock.train.study.study import DONE, ArmConfig, StudyPlan
+from restock.train.study.study import DONE, ArmConfig, Pair, StudyPlan
+from restock.words import counted
 
 # Columns of the table of arms, besides success by cell.
 SAFETY = ("bumps_per_km", "closest_person_m", "time_lost_s", "discounted_return")
 NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
+MOST_NAMED = 4  # checks that refuse a comparison
 
 
-def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """The study and all that it found, as JSON values."""
-    refused = {
-        (pair.arm.name, pair.baseline.name)
+def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
+    """The study and all that it found, as JSON values.
+
+    `comparisons` are those of `run_study`; an error is why there is none.
+    """
+    compared = [
+        _compared(pair, comparison)
         for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
-        if comparison.verdict != "comparable"
-    }
+    ]
+    refused = {(one["arm"], one["baseline"]) for one in compared if one["verdict"] != "comparable"}
     power = power_of(plan)
     return {
         "doc": plan.study.doc,
@@ -42,11 +48,46 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison]) -> dict[str, An
         "arms": arms(plan),
         "curves": learning_curves(_finished(plan)),
         "cost": training_cost(_finished(plan)),
-        "comparisons": [
-            {"arm": pair.arm.name, "baseline": pair.baseline.name, **comparison.as_json()}
-            for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
-        ],
+        "comparisons": compared,
     }
+
+
+def _compared(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
+    """A comparison as JSON values, with why it has no outcomes, or ""."""
+    if isinstance(comparison, RunError):
+        why = f"{comparison.where}: {comparison.what}" if comparison.where else comparison.what
+        comparison = Comparison(pair.treatment, "inconclusive", [], [], [], [], None, [])
+    else:
+        why = _why_refused(pair, comparison)
+    return {
+        "arm": pair.arm.name,
+        "baseline": pair.baseline.name,
+        **comparison.as_json(),
+        "why": why,
+    }
+
+
+def _why_refused(pair: Pair, comparison: Comparison) -> str:
+    if comparison.verdict == "comparable":
+        return ""
+    if comparison.refused:
+        return (
+            f"they differ in {', '.join(one.setting for one in comparison.refused)}, which"
+            f' treatment = "{pair.treatment}" does not allow'
+        )
+    failed = [one for one in comparison.deciding_checks if one.verdict == comparison.verdict]
+    # A feed that differs follows from numbers of updates that do: one cause is named.
+    for check in failed:
+        if check.name == "updates" and check.first is not None and check.second is not None:
+            return (
+                f"{pair.arm.name} made {check.second:,.0f} updates and {pair.baseline.name}"
+                f" {check.first:,.0f}, with those on the logs alone;"
+                f' treatment = "{pair.treatment}" needs the same number'
+                ' (schedule.updates_per_env_step), treatment = "method" does not'
+            )
+    names = list(dict.fromkeys(check.name for check in failed))
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{comparison.verdict} in {', '.join(names[:MOST_NAMED])}{more}"
 
 
 def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
@@ -112,6 +153,20 @@ def power_of(plan: StudyPlan) -> Power | None:
         None if effect is None else paired_t_power(effect, sd, seeds),
         study_power.least_effect(sd, seeds),
         None if effect is None else study_power.seeds_needed(effect, sd),
+    )
+
+
+def too_small(plan: StudyPlan, power: Power | None) -> str | None:
+    """That a study is too small for its primary contrast, by name; `power` is its `power_of`."""
+    if power is not None:
+        return study_power.warning(power) if power.too_small else None
+    first, seeds = plan.study.primary, len(plan.study.seeds)
+    if first is None or seeds >= LEAST_PAIRS:
+        return None
+    return (
+        f"the study is too small for its contrast: {first.measure} of {first.arm} against"
+        f" {first.baseline} has {counted(seeds, 'seed')}; below {LEAST_PAIRS} seeds there is no"
+        " interval, so no difference is found"
     )
 
 
@@ -220,4 +275,4 @@ def _mean(values: Sequence[float | None]) -> float:
     return float(np.mean(known)) if known else float("nan")
 
 
-__all__ = ["SAFETY", "arms", "contrasts", "findings", "power_of"]
+__all__ = ["SAFETY", "arms", "contrasts", "findings", "power_of", "too_small"]

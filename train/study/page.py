@@ -121,7 +121,7 @@ def _comparison(comparison: dict[str, Any]) -> list[str]:
     if treatment == "method":
         lines += [_held(comparison), ""]
     if comparison["verdict"] != "comparable":
-        return [*lines, _refusal(comparison)]
+        return [*lines, f"Not compared: {comparison['why']}."]
     lines += [
         "Intervals are 95 %, over seeds and episodes; bold where they exclude 0. From fewer than"
         f" {LEAST_RUNS} seeds or {LEAST_EPISODES} episodes, and where nothing varies, there are"
@@ -162,18 +162,6 @@ def _improvement(row: dict[str, Any]) -> str:
 
 def _cell(value: float | None, form: str) -> str:
     return "no goal" if value is None else format(value, form)
-
-
-def _refusal(comparison: dict[str, Any]) -> str:
-    """Why there are no outcomes."""
-    if comparison["refused"]:
-        return (
-            f"Not compared: they differ in {', '.join(comparison['refused'])}, which"
-            f' treatment = "{comparison["treatment"]}" does not allow.'
-        )
-    verdict = comparison["verdict"]
-    names = [check["name"] for check in comparison["checks"] if check["verdict"] == verdict]
-    return f"Not compared: {verdict} in {', '.join(dict.fromkeys(names))}."
 
 
 def _held(comparison: dict[str, Any]) -> str:

@@ -26,7 +26,8 @@ class PowerConfig(Checked, frozen=True):
 
     # Between seeds, of the primary measure of one arm.
     sd: Annotated[float, msgspec.Meta(gt=0)]
-    effect: Annotated[float, msgspec.Meta(gt=0)]  # difference that the study should detect
+    # Difference that the study should detect; every measure is a share.
+    effect: Annotated[float, msgspec.Meta(gt=0, le=1)]
     # Of the two arms' values at the same seed: pairing helps by it.
     correlation: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
     # Of a kind, that the pilots were judged on; None: as many as the study's.

@@ -15,6 +15,7 @@ from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
 from restock.train.dqn.config import (
     EvaluationConfig,
+    ScheduleConfig,
     apply_overrides,
     as_overrides,
     parse_config,
@@ -189,15 +190,30 @@ def load_study(path: Path) -> Study:
     """
     remedy = "docs/study.md lists every key with its meaning"
     study = typed(read_toml(path), Study, where=str(path), remedy=remedy)
-    _refuse_judging_by_the_choice(study, str(path))
+    for arm in study.arms:
+        sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
+        config = parse_config(apply_overrides({}, sets), where=str(path))
+        refuse_judging_by_the_choice(
+            f"arm {arm.name!r}", config.evaluation, study.evaluation, str(path)
+        )
+        _refuse_without_updates(arm, config.schedule, str(path))
     return study
 
 
-def _refuse_judging_by_the_choice(study: Study, where: str) -> None:
-    for arm in study.arms:
-        sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
-        chosen = parse_config(apply_overrides({}, sets), where=where).evaluation
-        refuse_judging_by_the_choice(f"arm {arm.name!r}", chosen, study.evaluation, where)
+def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str) -> None:
+    """An arm that makes no update cannot be compared, which would be found after all its runs."""
+    if arm.library == "sb3-ppo":  # it has no warm-up
+        return
+    has_logs = arm.mixture is not None or arm.panel is not None
+    if (has_logs and schedule.offline_updates) or schedule.env_steps > schedule.warmup_env_steps:
+        return
+    raise ConfigError(
+        f"arm {arm.name!r} would make no update: its schedule.env_steps ({schedule.env_steps:,})"
+        f" end within schedule.warmup_env_steps ({schedule.warmup_env_steps:,})"
+        + (", and schedule.offline_updates is 0" if has_logs else ", and it has no logs"),
+        where=where,
+        remedy="set schedule.env_steps above schedule.warmup_env_steps",
+    )
 
 
 def refuse_judging_by_the_choice(

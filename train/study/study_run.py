@@ -23,7 +23,7 @@ from restock.files import write_text
 from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
-from restock.train.study.study import ArmConfig, StudyEvaluation, StudyJob, StudyPlan
+from restock.train.study.study import ArmConfig, Pair, StudyEvaluation, StudyJob, StudyPlan
 
 Say = Callable[[str], None]
 Engine = Literal["processes", "ray"]
@@ -35,10 +35,11 @@ def run_study(
     workers: int = 1,
     engine: Engine = "processes",
     say: Say = lambda line: None,
-) -> list[Comparison]:
+) -> list[Comparison | RunError]:
     """Do what is not done yet, then compare every arm with its baseline, in the order of the arms.
 
-    `engine` "ray" gives each run to a Ray cluster.
+    `engine` "ray" gives each run to a Ray cluster. A comparison that cannot be made is its error:
+    the others of a study that has run count all the same.
 
     Raises:
         RunError: a run failed (its log says why), or was made by another version of the study.
@@ -64,10 +65,14 @@ def run_study(
     else:
         _run_here(plan, todo, workers, say)
     _drive_references(plan, say)
-    return [
-        compare(plan.runs(pair.baseline), plan.runs(pair.arm), treatment=pair.treatment)
-        for pair in plan.study.pairs
-    ]
+    return [_compare(plan, pair) for pair in plan.study.pairs]
+
+
+def _compare(plan: StudyPlan, pair: Pair) -> Comparison | RunError:
+    try:
+        return compare(plan.runs(pair.baseline), plan.runs(pair.arm), treatment=pair.treatment)
+    except RunError as error:
+        return error
 
 
 def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:

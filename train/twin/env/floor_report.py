@@ -43,8 +43,14 @@ def describe_floor(floor: Warehouse) -> dict[str, Any]:
 
 
 def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
-    """Raises ConfigError where a floor has no room for one of these kinds of episodes."""
+    """Raises ConfigError for a kind of episode that is none, or that a floor has no room for."""
     kinds = tuple(kinds)
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        raise ConfigError(
+            f"there is no kind of episode {', '.join(map(repr, unknown))}",
+            where="conditions",
+            remedy=f"choose from {', '.join(KINDS)}",
+        )
     for floor in floors:
         unfit = [kind for kind in kinds if kind not in fitting_kinds(floor)]
         if unfit:

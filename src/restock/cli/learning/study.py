@@ -3,11 +3,34 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+
+from restock.errors import ExitCode, RestockError
+
+
+class StudyInterrupted(RestockError):
+    """Ctrl-C; what has finished is kept."""
+
+    exit_code = ExitCode.INTERRUPTED
+
+
+@contextmanager
+def _continued_by_the_same_command(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise StudyInterrupted(
+            "interrupted; finished runs are kept, and those under way continue from their"
+            " checkpoints",
+            where=str(out),
+            remedy="continue with the same command",
+        ) from stop
 
 
 @dataclass
@@ -47,13 +70,12 @@ class StudyCommand:
         from json import dumps
 
         from restock.cli.output import plain, print_json, print_table, say
-        from restock.errors import ConfigError, ExitCode
+        from restock.errors import ConfigError
         from restock.files import write_text
         from restock.report import write_study_page
         from restock.toml import read_toml
-        from restock.train.study.findings import findings, power_of
+        from restock.train.study.findings import findings, power_of, too_small
         from restock.train.study.page import as_markdown, power_sentence
-        from restock.train.study.power import warning
         from restock.train.study.study import StudyPlan, load_study
         from restock.train.study.study_run import run_study
 
@@ -82,8 +104,8 @@ class StudyCommand:
             document = power.as_json()
             print_json(document) if self.json else sys.stdout.write(power_sentence(document) + "\n")
             return 0
-        if power is not None and power.too_small:
-            say(warning(power))
+        if small := too_small(plan, power):
+            say(small)
         if self.dry_run:
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
@@ -104,7 +126,8 @@ class StudyCommand:
             else:
                 print_table(rows, title="what would be run")
             return 0
-        comparisons = run_study(plan, workers=self.workers, engine=self.engine, say=say)
+        with _continued_by_the_same_command(out):
+            comparisons = run_study(plan, workers=self.workers, engine=self.engine, say=say)
         document = findings(plan, comparisons)
         page = as_markdown(document)
         write_text(out / "study.md", page)
@@ -114,7 +137,7 @@ class StudyCommand:
             print_json(document)
         else:
             sys.stdout.write(page)
-        refused = any(comparison.verdict != "comparable" for comparison in comparisons)
+        refused = any(one["verdict"] != "comparable" for one in document["comparisons"])
         return int(ExitCode.FAILED if refused else ExitCode.OK)
 
     def _search(self) -> int:
@@ -148,7 +171,8 @@ class StudyCommand:
                 )
             return 0
         require_optuna()
-        found = run_search(SearchPlan(search, self.study.parent, self.out), say=say)
+        with _continued_by_the_same_command(self.out):
+            found = run_search(SearchPlan(search, self.study.parent, self.out), say=say)
         page = search_page(found)
         write_text(self.out / "study.md", page)
         write_text(self.out / "study.json", dumps(plain(found), indent=1) + "\n")

@@ -79,7 +79,9 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
 
 
 def why_refused(found: dict[str, Any]) -> str:
-    """What the gate found."""
+    """What the gate found; a study has said it already."""
+    if found.get("why"):
+        return str(found["why"])
     if found["refused"]:
         return f"they differ in {', '.join(found['refused'])}, which is not the treatment"
     names = [words(c["name"]) for c in found["checks"] if c["verdict"] == found["verdict"]]
