@@ -1,8 +1,12 @@
-"""The contestants of `ingest.py`: a log to columns, by Restock and by its peers."""
+"""The contestants of `ingest.py`: a log to columns, by Restock and by its peers.
+
+rerun-sdk and mcap-ros2-support are left out where they are not installed.
+"""
 
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +15,6 @@ import numpy as np
 import pyarrow as pa
 import zstandard
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
 from restock.ingest.containers.formats.mcap_records import crc32
@@ -21,6 +23,16 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, equal, join, ta
 from restock.ingest.decoding.definitions import message_type
 from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.decoding.row_by_row import RowDecoder
+
+NOT_INSTALLED: set[str] = set()
+try:
+    from rerun.chunk import McapReader
+except ImportError:
+    NOT_INSTALLED.add("rerun-sdk")
+try:
+    from mcap_ros2.decoder import DecoderFactory
+except ImportError:
+    NOT_INSTALLED.add("mcap-ros2-support")
 
 PROFILE = {
     "/odom": ["header.stamp", "twist.twist.linear.x", "twist.twist.angular.z"],
@@ -127,27 +139,29 @@ def mcap_alone(path: Path) -> None:
 def check_values(path: Path, bag: Path) -> dict[str, int]:
     """How many columns equal Restock's of the MCAP, by whom; ends where one does not."""
     of_mcap = restock_columns(path)
-    compared = {"restock, of the sqlite3 bag": 0, "rosbags": 0, "rerun-sdk": 0}
+    compared: Counter[str] = Counter()
     of_bag = restock_columns(bag)
     rosbags = rosbags_columns(path)
-    rerun = rerun_columns(path)
+    rerun = {} if "rerun-sdk" in NOT_INSTALLED else rerun_columns(path)
     with open_recording(path) as recording:
         leaves = {
             topic: message_type(recording._streams[topic][0].channel, "humble").leaves()
             for topic in recording.topics
         }
     for topic, columns in of_mcap.items():
-        parts = pa.Table.from_batches(rerun[topic])
-        order = np.argsort(parts["message_log_time"].cast(pa.int64()).to_numpy(), kind="stable")
-        (name,) = (name for name in parts.column_names if name.endswith(":message"))
-        messages = parts[name].combine_chunks().values  # one struct a message
+        if rerun:
+            parts = pa.Table.from_batches(rerun[topic])
+            order = np.argsort(parts["message_log_time"].cast(pa.int64()).to_numpy(), kind="stable")
+            (name,) = (name for name in parts.column_names if name.endswith(":message"))
+            messages = parts[name].combine_chunks().values  # one struct a message
         for leaf in leaves[topic]:
             ours = columns.fields[leaf.path]
             others = {
                 "restock, of the sqlite3 bag": of_bag[topic].fields[leaf.path],
                 "rosbags": rosbags[topic][leaf.path],
-                "rerun-sdk": take(arrow_column(messages, leaf), order),
             }
+            if rerun:
+                others["rerun-sdk"] = take(arrow_column(messages, leaf), order)
             for who, column in others.items():
                 if not equal(ours, column):
                     raise SystemExit(f"{topic} {leaf.path}: not what {who} reads")

@@ -222,6 +222,6 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
         raise StoreError(
             "there is no store, or it is empty",
             where=str(path),
-            remedy=f"`restock ingest RECORDINGS --store {path}` makes one",
+            remedy=store.path.remedy_if_absent(),
         )
     return store

@@ -2,7 +2,8 @@
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
 network, the gather of a batch, draws by priority and the twin's lidar. Without it PyTorch, NumPy
-and MuJoCo do the same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0 asks for that.
+and MuJoCo do the same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0 (or no, false,
+off) asks for that.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ else:
 
 def is_used() -> bool:
     """Whether compiled code updates plain networks on the CPU, draws batches and ranges there."""
-    return IS_THERE and os.environ.get(SWITCH, "1") != "0"
+    return IS_THERE and os.environ.get(SWITCH, "").lower() not in ("0", "no", "false", "off")
 
 
 def state() -> str:

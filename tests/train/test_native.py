@@ -215,7 +215,20 @@ def test_the_compiled_way_is_that_of_one_thread() -> None:
     plain = parse_config({}, where="test").network
     assert update_path(plain, "cpu") == "native"
     assert update_path(plain, "cpu", threads=2) == "manual"
-    assert update_path(plain, "cuda") == "autograd"
+    assert update_path(plain, "cuda") == "manual"
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("value", "used"),
+    [("0", False), ("no", False), ("False", False), ("OFF", False), ("1", True), ("", True)],
+)
+def test_the_usual_words_switch_it_off(
+    value: str, used: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(native.SWITCH, value)
+    assert native.is_used() == used
+    assert native.state().startswith("in use") == used
 
 
 @pytest.mark.parametrize("way", ["asked for", "not compiled"])

@@ -11,6 +11,7 @@ import os
 import traceback
 from collections.abc import Sequence
 
+from restock.cli import command_of
 from restock.errors import RestockError, StoreError
 from restock.files import first_line
 
@@ -33,6 +34,14 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
     where = f"restock {' '.join(args)}"
+    if full := _out_of_memory(error):
+        return RestockError(
+            f"DuckDB's memory limit is too small: {full}",
+            where=where,
+            remedy="raise --memory-limit (default: 80 % of the machine's memory)"
+            if hasattr(command_of(args[0]), "memory_limit")
+            else "free some memory, or use a machine with more: DuckDB may take 80 % of it",
+        )
     if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known
         return StoreError(error.what, where=where, remedy=error.remedy)
     if isinstance(error, RestockError):
@@ -63,6 +72,15 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             " a bug: please report it",
         )
     return RestockError(first_line(error), where=where, remedy=remedy)
+
+
+def _out_of_memory(error: BaseException | None) -> str:
+    """What DuckDB says where it may take no more memory, or ""; other errors may quote it."""
+    while error is not None:
+        if type(error).__name__ == "OutOfMemoryException":  # its package need not be imported
+            return first_line(error)
+        error = error.__cause__
+    return ""
 
 
 def _at(error: Exception) -> str:

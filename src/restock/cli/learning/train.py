@@ -49,7 +49,7 @@ class TrainCommand:
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
-    """Device of the network. cuda has not been run on a GPU yet."""
+    """Device of the network."""
     flush_fresh: Path | None = None
     """At the end, write the twin's labelled episodes to this store, as a recording of format
     `twin`. Until then they are kept in the run's directory."""
