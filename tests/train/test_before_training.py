@@ -7,22 +7,30 @@ import re
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from support.panels import EVERY, NO_SPLIT, panel_of
 from support.paths import ROOT
 from support.stores import TASK, recording_transitions, write_store
 
+from restock.arrays import Ints
 from restock.cli import main
+from restock.errors import PanelError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
+from restock.replay.panel.panel import HEADER, META, Panel
+from restock.replay.panel.seal import FileRecord, seal
 from restock.stats import ConfidenceInterval
-from restock.train.comparison.diagnose import Cause, Diagnosis
+from restock.train.comparison.diagnose import Diagnosis
 from restock.train.comparison.rows_verdict import with_rows
+from restock.train.comparison.windows import Cause
 from restock.train.diagnosis.answers import GAIN, Answer
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
 from restock.train.diagnosis.causes import findings
@@ -63,21 +71,22 @@ def _swapped(rows: FedRows) -> FedRows:
     """Left and right exchanged wherever an action stands, in the observations too."""
     table = [tuple(action) for action in rows.task.actions]
     other = np.array([table.index((speed, -turn if turn else turn)) for speed, turn in table])
-    first = rows.task.observation_names.index("previous_action_0")
-    observations = []
-    for held in (rows.observation, rows.next_observation):
-        changed = held.copy()
-        changed[:, first : first + len(table)] = held[:, first + other]
-        observations.append(changed)
-    return replace(
-        rows, action=other[rows.action], observation=observations[0],
-        next_observation=observations[1],
-    )  # fmt: skip
+    return _acted(rows, other[rows.action])
+
+
+def _acted(rows: FedRows, action: Ints) -> FedRows:
+    """Other actions (N,) in the logs: observations hold them too."""
+    first, count = rows.task.observation_names.index("previous_action_0"), len(rows.task.actions)
+    held, before = np.eye(count, dtype=np.float32)[action], rows.joined.nonzero()[0]
+    observation, after = rows.observation.copy(), rows.next_observation.copy()
+    observation[before, first : first + count] = held[before - 1]
+    after[:, first : first + count] = held
+    return replace(rows, action=action, observation=observation, next_observation=after)
 
 
 def _late(rows: FedRows) -> FedRows:
     place, known = rows.before(2)
-    return replace(rows, action=np.where(known, rows.action[place], 0))
+    return _acted(rows, np.where(known, rows.action[place], 0))
 
 
 def _degrees(rows: FedRows) -> FedRows:
@@ -114,6 +123,10 @@ def _twice(rows: FedRows) -> FedRows:
 PLANTED: dict[str, tuple[Plant, str]] = {
     "left and right": (_swapped, "ACTIONS_MIRRORED"),
     "actions .4 s late": (_late, "ACTIONS_SHIFTED"),
+    "actions changed after ingest": (
+        lambda rows: replace(rows, action=_swapped(rows).action),
+        "ACTIONS_CHANGED",
+    ),
     "rewards twice": (lambda rows: replace(rows, reward=2 * rows.reward), "REWARD_SCALED"),
     "rewards of other rows": (
         lambda rows: replace(rows, reward=np.random.default_rng(0).permutation(rows.reward)),
@@ -176,10 +189,18 @@ def test_only_what_surely_has_the_opposite_sign_is_called_mirrored(high: float, 
     assert not re.search(r"[2-9]\d\d%|1[1-9]\d%", found.text)  # no share above 1
 
 
+def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
+    logs: FedRows, twin: FedRows
+) -> None:
+    found = diagnose_rows(replace(logs, action=_swapped(logs).action), twin).findings
+    assert [one.cause for one in found] == ["ACTIONS_CHANGED"]
+    assert "profile" not in found[0].remedy
+
+
 def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:
     half = np.random.default_rng(0).random(len(logs)) < 0.5
     swapped = _swapped(logs)
-    mixed = replace(logs, action=np.where(half, swapped.action, logs.action))
+    mixed = _acted(logs, np.where(half, swapped.action, logs.action))
     found = diagnose_rows(mixed, twin)
     assert found.findings[0].cause == "ACTIONS_MIXED"
 
@@ -292,6 +313,39 @@ def test_labels_and_ends_are_computed_again_from_the_stored_signals(tmp_path: Pa
     assert off == ["labels: blocked_aisle", "terminations"]
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
     assert {"LABELS_WRONG", "TERMINATIONS_LOST"} <= {one.cause for one in found}
+
+
+def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> None:
+    """What was changed after mixing is what the critic is fed, and the store does not show it."""
+    profile = load_profile("warehouse_amr")
+    ingest(ROOT / "sample_logs/amr_tuesday", profile, store=StoreWriter(tmp_path / "store"))
+    panel = panel_of(tmp_path / "store", EVERY + NO_SPLIT, tmp_path / "panel")
+    compared = [row for row in open_rows(panel.path).comparisons if row.check.startswith("fed ")]
+    assert len(compared) > 1
+    assert {(row.status, row.logs) for row in compared} == {("ok", 0.0)}
+
+    meta = panel.meta
+    _rewrite(panel, condition=["blocked_aisle"] * len(meta))
+    opened = open_rows(panel.path)
+    found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
+    (finding,) = [one for one in found if one.cause.startswith("LABELS_")]
+    assert finding.cause == "LABELS_CHANGED"
+    assert "nominal 100%" in finding.text
+
+    _rewrite(panel, action=[99, *meta["action"].to_pylist()[1:]])
+    with pytest.raises(PanelError, match=r"has action 99, and the task has actions 0 to \d"):
+        open_rows(panel.path)
+
+
+def _rewrite(panel: Panel, **columns: list[Any]) -> None:
+    """Other software's doing: columns of `meta`, and a seal that agrees with them."""
+    path, header = panel.path / META, panel.path / HEADER
+    meta = replaced(panel.meta, columns)
+    path.unlink()
+    pq.write_table(meta, path)
+    files = panel.header.files | {META: FileRecord.of(path)}
+    header.unlink()
+    header.write_bytes(seal(msgspec.structs.replace(panel.header, files=files)))
 
 
 @pytest.mark.parametrize(

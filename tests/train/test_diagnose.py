@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from restock.train.comparison.action_coverage import action_symptoms
 from restock.train.comparison.confirm import confirm, swapped
 from restock.train.comparison.diagnose import diagnose
 from restock.train.dqn.config import TrainConfig, apply_overrides, parse_config
+from restock.train.dqn.target import Hard, Polyak, TargetRule
 from restock.train.run.run import Run
 
 CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
@@ -43,12 +44,17 @@ def make_run(
     logged: int = 400,  # different rows of each condition in the logs
     supplied: float = 0.0,  # of the fresh rows of these conditions, those with `turn`
     held_out: Mapping[str, int] | None = None,  # rows of a condition in each evaluation
+    lags: Sequence[float] | None = None,  # L of each window, in place of `lag`
+    every: int = 500,  # updates of a window
+    target: TargetRule = Polyak(),  # noqa: B008  (frozen)
 ) -> Run:
     """A run whose evaluations show these figures, as training writes them."""
-    run = Run.create(path, {"config": msgspec.to_builtins(TrainConfig()), "panel": None})
+    config = msgspec.to_builtins(TrainConfig(target=target))
+    run = Run.create(path, {"config": config, "panel": None})
     for window in range(1, windows + 1):
-        clocks = {"env_steps": 1000 * window, "gradient_steps": 500 * window}
+        clocks = {"env_steps": 1000 * window, "gradient_steps": every * window}
         ill = until is None or window <= until
+        lag = lags[window - 1] if lags else lag
         for name in CONDITIONS:
             share = (shares or SHARES).get(name, 0.0) if ill else SHARES[name]
             here = gap.get(name, 1.2) if isinstance(gap, Mapping) else gap
@@ -193,6 +199,18 @@ def action_rows(
         ({"windows": 2, "lag": 0.9}, "UNDETERMINED"),  # too few to agree
         ({"until": 3, "lag": 0.9}, "UNDETERMINED"),  # gone in the last one
         ({"until": 1, "lag": 0.9}, "HEALTHY"),  # a young critic's lag
+        # So does that of a young run's last windows: any target lags while values grow from 0.
+        ({"every": 325, "lag": 0.4}, "UNDETERMINED"),
+        ({"every": 400, "lags": (0.9, 0.6, 0.4, 0.3)}, "UNDETERMINED"),
+        ({"every": 400, "lags": (0.9, 0.4, 0.4, 0.4)}, "TARGET"),
+        ({"every": 600, "lags": (0.9, 0.6, 0.4, 0.3)}, "TARGET"),
+        ({"every": 325, "lag": 0.4, "target": Polyak(tau=0.02)}, "TARGET"),
+        ({"every": 325, "gap": 7.0}, "TARGET"),  # age excuses a lag alone
+        ({"every": 1000, "lags": (0.9, 0.6, 0.4, 0.3), "target": Hard(1000)}, "UNDETERMINED"),
+        ({"every": 1300, "lags": (0.9, 0.6, 0.4, 0.3), "target": Hard(1000)}, "TARGET"),
+        # No run is old enough for a target that hardly moves, and L does not fall.
+        ({"every": 450, "lag": 1.1, "target": Hard(1_000_000)}, "TARGET"),
+        ({"every": 450, "lags": (1.2, 1.15, 1.1, 1.0), "target": Polyak(tau=3e-5)}, "TARGET"),
         ({"actions": {"recovery": (0.3, 0.0)}}, "ACTION_COVERAGE"),
         ({"actions": {"recovery": (0.3, 0.01)}}, "ACTION_COVERAGE"),
         ({"actions": {"recovery": (0.3, 0.05)}}, "HEALTHY"),  # rare, and there
@@ -291,11 +309,150 @@ def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "c").exists()
 
 
+@pytest.mark.parametrize(
+    ("symptoms", "advice"),
+    [
+        (
+            {"windows": 1},
+            "train longer, or evaluate more often (evaluation.every_env_steps): 1 evaluation, and "
+            "the verdict needs 3",
+        ),
+        (
+            {"until": 3, "lag": 0.9},
+            "train longer: the last 3 evaluations do not agree on whether the target is at fault",
+        ),
+        (
+            {"every": 325, "lag": 0.4},
+            "train longer: after 1,300 updates any target lags; L is judged from 1,500 on",
+        ),
+        (
+            {"every": 50, "lag": 0.4, "target": Polyak(tau=0.02)},
+            "train longer: after 200 updates any target lags; L is judged from 500 on",
+        ),
+        (
+            {"every": 400, "lags": (0.9, 0.6, 0.4, 0.3)},
+            "train longer: L is still falling (0.60, 0.40, 0.30), as the values of a young run are"
+            " learnt",
+        ),
+        (
+            {"gap": {"nominal": 9.0}, "agreement": dict.fromkeys(CONDITIONS, 0.01)},
+            "correct what the evidence names, and train again: more than half of the conditions "
+            "are in doubt, which may be their rows or the critic",
+        ),
+    ],
+)
+def test_why_nothing_is_named_is_said(
+    tmp_path: Path, symptoms: dict[str, Any], advice: str
+) -> None:
+    found = diagnose([make_run(tmp_path / "r", **symptoms)])
+    assert found.cause == "UNDETERMINED"
+    assert found.experiment == advice
+
+
+def test_runs_that_disagree_are_listed(tmp_path: Path) -> None:
+    found = diagnose([make_run(tmp_path / "w"), make_run(tmp_path / "s", lag=0.9)])
+    assert found.experiment == (
+        "train longer, or with more seeds: the runs do not agree (HEALTHY, TARGET)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("symptoms", "line"),
+    [
+        ({"lag": 0.333}, "target: L is 0.333 (limit 0.25): the target is far behind"),
+        (
+            {"lag": 0.0},
+            "target: L is 0 (at least 0.002 is expected): there is no target network to speak of",
+        ),
+        ({"clock": 8.0}, "target: S is 8 (limit 2): the networks disagree"),
+        ({"gap": 7.0}, "target: the median G is 7 (limit 6): everything is worse held out"),
+    ],
+)
+def test_the_evidence_names_the_figure_and_its_limit(
+    tmp_path: Path, symptoms: dict[str, Any], line: str
+) -> None:
+    found = diagnose([make_run(tmp_path / "r", **symptoms)])
+    assert found.cause == "TARGET"
+    assert line in found.evidence
+
+
+@pytest.mark.parametrize(
+    ("rule", "tau"),
+    [
+        (Polyak(), 0.02),
+        (Polyak(tau=0.01), 0.04),
+        (Polyak(tau=0.002), 0.008),
+        (Hard(400), 0.02),
+        (Polyak(tau=0.00003), 0.005),
+        (Hard(1_000_000), 0.005),
+        (Polyak(tau=1.0), 0.005),
+        (Hard(1), 0.005),
+    ],
+)
+@pytest.mark.parametrize("cause", ["TARGET", "BOTH"])
+def test_the_experiment_on_a_target_changes_its_rule(
+    tmp_path: Path, rule: TargetRule, tau: float, cause: Any
+) -> None:
+    run = make_run(tmp_path / "r", lag=0.9, every=5000, target=rule)
+    changed = parse_config(
+        apply_overrides(run.document["config"], swapped(run, cause)), where="test"
+    )
+    assert changed.target == Polyak(tau=tau) != rule
+    assert f"{changed.target} in place of {rule}" in diagnose([run]).experiment
+
+
 @pytest.mark.parametrize("cause", ["BUFFER", "TARGET", "DIVERGENCE"])
-def test_the_experiment_swaps_one_clock(tmp_path: Path, cause: Any) -> None:
+def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None:
     run = make_run(tmp_path / "r")
     config = run.document["config"]
     changed = parse_config(apply_overrides(config, swapped(run, cause)), where="test")
     sections = {"BUFFER": {"replay", "env"}, "TARGET": {"target"}, "DIVERGENCE": {"optimizer"}}
     before, after = config, msgspec.to_builtins(changed)
-    assert {key for key in before if before[key] != after[key]} <= sections[cause]
+    changes = {key for key in before if before[key] != after[key]}
+    assert changes
+    assert changes <= sections[cause]
+
+
+def test_an_experiment_that_changes_nothing_is_refused(tmp_path: Path) -> None:
+    sick = make_run(tmp_path / "sick", gap={"blocked_aisle": 6.0})
+    found = diagnose([sick])
+    assert found.cause == "BUFFER"
+    fed = apply_overrides(sick.document["config"], swapped(sick, "BUFFER"))
+    sick.document["config"] = fed  # fresh rows alone already
+    with pytest.raises(RunError, match="has the settings of the experiment already"):
+        confirm(sick, found, tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    ("after", "cause", "confirmed"),
+    [
+        ({"lag": 0.9}, "TARGET", False),  # another target rule, and the target is at fault again
+        ({"gap": {"blocked_aisle": 6.0}}, "BUFFER", True),  # what else is at fault is left
+        ({"windows": 2}, "UNDETERMINED", None),
+    ],
+)
+def test_of_two_faults_the_experiment_answers_for_the_target(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    after: dict[str, Any],
+    cause: str,
+    confirmed: bool | None,
+) -> None:
+    run = make_run(tmp_path / "r", lag=0.9, gap={"blocked_aisle": 6.0})
+    found = diagnose([run])
+    assert found.cause == "BOTH"
+
+    class Trained:
+        def __init__(self, out: Path, *_: Any) -> None:
+            make_run(out, **after)
+
+        def open(self) -> Trained:
+            return self
+
+        def close(self) -> None: ...
+
+    monkeypatch.setattr("restock.train.comparison.confirm.prepare_new", Trained)
+    monkeypatch.setattr("restock.train.comparison.confirm.train", lambda session: None)
+    answer = confirm(run, found, tmp_path / "c")
+    assert (answer["cause"], answer["confirmed"]) == (cause, confirmed)

@@ -1,4 +1,4 @@
-"""The experiment that confirms a diagnosis: the same run with one clock swapped.
+"""The experiment that confirms a diagnosis: the same run with one suspect replaced.
 
 If the target was at fault, another target rule on the same feed mends it; if the feed was, the same
 target rule on another feed does. What is left unchanged says as much as what changes.
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import RunError
-from restock.train.comparison.diagnose import Cause, Diagnosis, diagnose
-from restock.train.dqn.config import as_overrides
+from restock.train.comparison.diagnose import Diagnosis, diagnose, other_target, target_rule
+from restock.train.comparison.windows import Cause
+from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
 from restock.train.run.run import Run
@@ -26,7 +27,7 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
     gone, False where it stayed, None where the new run does not say.
 
     Raises:
-        RunError: there is nothing to confirm, or it takes other logs.
+        RunError: there is nothing to confirm, or no setting changes what is suspected.
     """
     if diagnosis.cause in _NOTHING:
         raise RunError(
@@ -40,9 +41,19 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
             where=str(run.path),
             remedy=diagnosis.experiment,
         )
-    changed = swapped(run, diagnosis.cause)
+    config, changed = run.document["config"], swapped(run, diagnosis.cause)
+    where = str(run.path)
+    if parse_config(apply_overrides(config, changed), where=where) == parse_config(
+        config, where=where
+    ):
+        raise RunError(
+            f"is {diagnosis.cause}, and has the settings of the experiment already: "
+            + ", ".join(changed),
+            where=where,
+            remedy=diagnosis.experiment,
+        )
     panel = run.document["panel"]
-    settings = as_overrides(run.document["config"]) + changed
+    settings = as_overrides(config) + changed
     prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
     session = prepared.open()
     try:
@@ -50,7 +61,8 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
     finally:
         session.close()
     after = diagnose([Run.open(out)])
-    still = after.cause in (diagnosis.cause, "BOTH")
+    suspected = "TARGET" if diagnosis.cause == "BOTH" else diagnosis.cause  # what was swapped
+    still = after.cause in (suspected, "BOTH")
     return {
         "changed": changed,
         "run": str(out),
@@ -61,12 +73,13 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
 
 
 def swapped(run: Run, cause: Cause) -> list[str]:
-    """The settings that swap the suspected clock for one that is known to work."""
+    """The settings that replace what is suspected."""
     config = run.document["config"]
     if cause == "DIVERGENCE":
         return [f"optimizer.learning_rate={min(config['optimizer']['learning_rate'] / 10, 3e-4)}"]
     if cause in ("TARGET", "BOTH"):
-        return ["target={rule='polyak', tau=0.005}"]
+        tau = other_target(target_rule(run)).tau
+        return [f"target={{rule='polyak', tau={tau:g}}}"]
     # The feed: all conditions that were evaluated, equally often, and fresh rows alone.
     share = 1 / len(config["env"]["conditions"])
     names = list(config["env"]["conditions"])

@@ -3,201 +3,36 @@
 A critic fails in two ways that a falling loss cannot tell apart. Its *replay* may lack, outnumber
 or misstate a condition: then it is wrong on fresh steps of that condition and right elsewhere. Or
 its *target* may follow too slowly, not at all, or too fast: then it is wrong everywhere, or its two
-networks disagree. Steps of the evaluations (`evaluation_buffer`), in no replay, tell which:
-
-    G_k  |TD| held out / |TD| in replay, in condition k
-    O_k  |TD| held out in k / the median condition's
-    L    mean |Q - Q_target| / mean |Q|
-    S    |TD| with the online network bootstrapping / |TD| with the target network
-
-A network that generalises, or memorises few rows, hides what is wrong with its replay from
-all of these. So three figures look at the rows, not at the critic
-(`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
-how many of its logged rows look like it; and whether their next observations follow from them.
-And a condition may be well supplied, and an action of it not (`action_coverage`): neither logs nor
-fresh rows say what it leads to, and the policy wants it.
-
-Each figure is its median over the last evaluations. The limits are from faults planted in the twin
-(benchmarks/planted_faults.py; the table is in docs/diagnose.md).
+networks disagree. Steps of the evaluations, in no replay, tell which: `windows` has the figures and
+their limits. Each figure is its median over the last evaluations.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from importlib.resources import files
-from statistics import median
-from typing import Any, Literal
+from dataclasses import dataclass, replace
 
-import numpy as np
+import msgspec
 
-from restock.errors import RunError
-from restock.train.comparison.action_coverage import ActionSymptom, action_symptoms
+from restock.train.comparison.action_coverage import action_symptoms
+from restock.train.comparison.windows import (
+    Cause,
+    DiagnosisLimits,
+    Window,
+    median_window,
+    windows_of,
+)
+from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.run.run import Run
+from restock.words import counted
 
-Cause = Literal[
-    "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
-]
 WINDOWS = 3  # the last, that figures are the median of
-_LEAST_ROWS = 20  # held out, for a condition to be diagnosed
-_LEAST_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
-_LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
+_SETTLED_LAGS = 10  # updates, in mean ages of the target: then even a young critic's L is low
+_LEAST_UPDATES = 1500  # of a slower rule: no excuse, unless L is falling
+_FALLING = 0.75  # the last L over the first of the last windows
+_WORKING_LAGS = 50, 800  # updates: the mean age of a target that most critics can learn from
 ALONE = "a policy from these logs alone never learns what it leads to"
-
-
-@dataclass(frozen=True)
-class DiagnosisLimits:
-    """From where on a figure is a symptom."""
-
-    gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
-    relative: float = 3.0  # and G_k over the median G
-    gap_everywhere: float = 6.0  # the median G: everything is worse held out
-    lag: float = 0.25  # L: the target is far behind
-    no_lag: float = 0.002  # L below this: there is no target network to speak of
-    clock: float = 2.0  # S
-    explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
-    supply: float = 0.1  # a condition's share of replay over its share of what driving meets
-    agreement: float = 0.1  # of a condition's logged rows that look like it
-    unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
-    unexplained_relative: float = 1.6  # and over that of the condition with the least
-    quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
-    wanted: float = 0.18  # of a condition's fresh rows, those where the policy takes an action …
-    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it …
-    fresh: float = 0.02  # … and of its fresh rows drawn: nor does driving supply it
-
-
-@dataclass(frozen=True)
-class Symptom:
-    """One condition in one window, or over several."""
-
-    condition: str
-    gap: float | None  # G_k; None: not in replay, or too few rows
-    outlier: float | None  # O_k; None: too few rows
-    replay_share: float
-    met_share: float | None  # of the evaluations' steps
-    agreement: float | None  # of its logged rows with fresh ones
-    unexplained: float | None  # of the variance of its logged rows' next observations
-    quota_met: float | None
-
-    @property
-    def supply(self) -> float | None:
-        """Its share of replay over its share of what driving meets."""
-        return self.replay_share / self.met_share if self.met_share else None
-
-
-@dataclass(frozen=True)
-class Window:
-    """What one evaluation shows, or several."""
-
-    gradient_steps: int
-    symptoms: list[Symptom]
-    gap_median: float
-    lag: float  # L
-    clock: float  # S
-    explained: float | None  # of the targets' variance, the median condition's
-    q_abs_max: float
-    q_bound: float  # the largest value that rewards seen could add up to
-    actions: list[ActionSymptom] = field(default_factory=list)  # over several windows only
-
-    def relative(self, symptom: Symptom) -> float | None:
-        """G_k over the median G: how much worse held out this condition is than the others."""
-        return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
-
-    def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
-        """The conditions whose replay is in doubt, with what is wrong, for people."""
-        follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
-        least = min(follows, default=0.0)
-        doubts = {}
-        for symptom in self.symptoms:
-            reasons = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
-            relative = self.relative(symptom)
-            if relative is not None and symptom.gap is not None:
-                if symptom.gap >= limits.gap and relative >= limits.relative:
-                    reasons.append(
-                        f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
-                        f" {relative:.1f} times the median condition's gap"
-                    )
-            elif not symptom.replay_share and (symptom.outlier or 0.0) >= limits.gap:
-                reasons.append(
-                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and "
-                    "the condition is not in replay"
-                )
-            if reasons and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
-                reasons.append(f"got {symptom.quota_met:.0%} of its quota")
-            if reasons:
-                doubts[symptom.condition] = reasons
-        return doubts
-
-    def _supply(self, symptom: Symptom, limits: DiagnosisLimits) -> list[str]:
-        if symptom.supply is None:  # a run from before it was kept
-            return [] if symptom.replay_share else ["is not in replay"]
-        if symptom.supply >= limits.supply:
-            return []
-        share, met = symptom.replay_share, symptom.met_share
-        return [f"is {share:.2%} of replay and {met:.1%} of the steps when driving"]
-
-    def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
-        reasons = []
-        if symptom.agreement is not None and symptom.agreement < limits.agreement:
-            reasons.append(
-                f"{symptom.agreement:.0%} of its logged rows look like it: check the label"
-            )
-        rest = symptom.unexplained
-        if (
-            rest is not None
-            and rest >= limits.unexplained
-            and rest >= limits.unexplained_relative * least
-        ):
-            reasons.append(
-                f"its logged rows leave {rest:.0%} of the variance of their next observations "
-                f"unexplained (another condition: {least:.0%}): check that observations, actions "
-                "and next observations match"
-            )
-        return reasons
-
-    def unlogged(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
-        """Actions that the policy wants in a condition, and whose logged rows hardly have them."""
-        return [
-            symptom
-            for symptom in self.actions
-            if symptom.condition_rows >= _LEAST_LOGGED
-            and symptom.wanted_low >= limits.wanted
-            and symptom.logs_share <= limits.logged
-        ]
-
-    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
-        """Of these, the ones that fresh rows do not supply either."""
-        unlogged = self.unlogged(limits)
-        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= limits.fresh]
-
-    def target(self, limits: DiagnosisLimits) -> bool:
-        """Whether the target is in doubt."""
-        clocks = not limits.no_lag <= self.lag < limits.lag or self.clock >= limits.clock
-        return clocks or self.gap_median >= limits.gap_everywhere
-
-    def diverged(self, limits: DiagnosisLimits) -> bool:
-        """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
-        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
-            return True
-        # A frozen target can be far from what it is learnt from; then the target is at fault.
-        if self.explained is None or self.target(limits):
-            return False
-        return self.explained < limits.explained
-
-    def cause(self, limits: DiagnosisLimits) -> Cause:
-        """The rule."""
-        if self.diverged(limits):
-            return "DIVERGENCE"
-        bad = self.bad(limits)
-        buffer = 0 < len(bad) <= len(self.symptoms) / 2
-        if self.target(limits):
-            return "BOTH" if buffer else "TARGET"
-        if buffer:
-            return "BUFFER"
-        if bad:
-            return "UNDETERMINED"
-        return "ACTION_COVERAGE" if self.lacking(limits) else "HEALTHY"
 
 
 @dataclass(frozen=True)
@@ -212,7 +47,10 @@ class Diagnosis:
     experiment: str  # what would confirm it
 
 
-def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -> Diagnosis:
+def diagnose(
+    runs: Sequence[Run],
+    limits: DiagnosisLimits = DiagnosisLimits(),  # noqa: B008  (frozen)
+) -> Diagnosis:
     """Diagnose runs of one method, which differ in their seed.
 
     Raises:
@@ -220,10 +58,13 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
     """
     windows = [windows_of(run) for run in runs]
     figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
-    causes = [_cause_of_run(*pair, limits) for pair in zip(windows, figures, strict=True)]
+    verdicts = [_verdict(*its, limits) for its in zip(runs, windows, figures, strict=True)]
+    causes = [cause for cause, _ in verdicts]
     ((cause, votes), *_) = Counter(causes).most_common()
+    advice = "; ".join(dict.fromkeys(advice for _, advice in verdicts if advice))
     if votes <= len(causes) / 2:
         cause = "UNDETERMINED"
+        advice = f"train longer, or with more seeds: the runs do not agree ({', '.join(causes)})"
     shown = [one for one, its in zip(figures, causes, strict=True) if its == cause] or figures
     return Diagnosis(
         cause,
@@ -231,8 +72,22 @@ def diagnose(runs: Sequence[Run], limits: DiagnosisLimits = DiagnosisLimits()) -
         figures,
         windows,
         _evidence(shown[0], limits),
-        _experiment(cause, shown, limits),
+        _experiment(cause, shown, limits, target_rule(runs[0]), advice),
     )
+
+
+def target_rule(run: Run) -> TargetRule:
+    """The rule that its target followed."""
+    rule: TargetRule = msgspec.convert(run.document["config"]["target"], TargetRule)
+    return rule
+
+
+def other_target(rule: TargetRule) -> Polyak:
+    """A target rule that tells whether `rule` is at fault: the default one where `rule` is far too
+    slow or too fast, else one with a quarter of its lag."""
+    least, below = _WORKING_LAGS
+    lag = rule.effective_lag
+    return Polyak(tau=4 / lag) if least <= lag < below else Polyak()
 
 
 def _figures(run: Run, windows: Sequence[Window]) -> Window:
@@ -242,110 +97,52 @@ def _figures(run: Run, windows: Sequence[Window]) -> Window:
     return replace(median_window(windows[-WINDOWS:]), actions=actions)
 
 
-def _cause_of_run(windows: Sequence[Window], figures: Window, limits: DiagnosisLimits) -> Cause:
-    """What the last windows come to; those that do not agree on the target are not forced."""
+def _verdict(
+    run: Run, windows: Sequence[Window], figures: Window, limits: DiagnosisLimits
+) -> tuple[Cause, str]:
+    """What the last windows come to, and what to do where that is UNDETERMINED."""
     if windows[-1].diverged(limits) and figures.diverged(limits):
-        return "DIVERGENCE"
+        return "DIVERGENCE", ""
     last = windows[-WINDOWS:]
-    if len(last) < WINDOWS or len({window.target(limits) for window in last}) > 1:
-        return "UNDETERMINED"
-    return figures.cause(limits)
-
-
-def median_window(windows: Sequence[Window]) -> Window:
-    """The median of each figure over windows, of each condition over those in which it was met."""
-
-    def middle(name: str, of: Sequence[Any] = windows) -> Any:
-        known = [value for item in of if (value := getattr(item, name)) is not None]
-        return median(known) if known else None
-
-    conditions = dict.fromkeys(s.condition for window in windows for s in window.symptoms)
-    symptoms = []
-    for condition in conditions:
-        same = [s for window in windows for s in window.symptoms if s.condition == condition]
-        names = [name for name in Symptom.__dataclass_fields__ if name != "condition"]
-        symptoms.append(Symptom(condition, **{name: middle(name, same) for name in names}))
-    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
-    return Window(
-        gradient_steps=windows[-1].gradient_steps,
-        symptoms=symptoms,
-        gap_median=median(gaps) if gaps else 1.0,
-        lag=middle("lag"),
-        clock=middle("clock"),
-        explained=middle("explained"),
-        q_abs_max=windows[-1].q_abs_max,
-        q_bound=windows[-1].q_bound,
-    )
-
-
-def windows_of(run: Run) -> list[Window]:
-    """The windows of a run, one an evaluation that had updates before it."""
-    import duckdb
-
-    query = files("restock.train.comparison").joinpath("diagnose.sql").read_text(encoding="utf-8")
-    with duckdb.connect() as connection:
-        names = ("evaluation_buffer", "conditions", "strata", "progress")
-        for name in names:  # one that an older run has not is empty
-            connection.register(f"run_{name}", run.table(name))
-        rows = connection.sql(query).to_arrow_table().to_pylist()
-    if not rows:
-        remedy = "continue the run past its first evaluation (evaluation.every_env_steps)"
-        if not run.document["config"]["env"].get("twin", True):
-            remedy = (
-                "it learned from the logs alone, without evaluations: use `restock eval "
-                f"{run.path} --on-logs own`"
-            )
-        raise RunError("has no evaluation to diagnose", where=str(run.path), remedy=remedy)
-    bound = _value_bound(run)
-    steps = sorted({row["gradient_steps"] for row in rows})
-    return [_window([row for row in rows if row["gradient_steps"] == at], bound) for at in steps]
-
-
-def _window(rows: list[dict[str, Any]], bound: float) -> Window:
-    known_well = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
-    judged = [row for row in known_well if row["evaluation_rows"] >= _LEAST_TD_ROWS]
-    middle = median(row["evaluation_td"] for row in judged or known_well)
-    symptoms = [
-        Symptom(
-            row["condition"],
-            row["evaluation_td"] / row["replay_td"] if row in judged and row["replay_td"] else None,
-            row["evaluation_td"] / max(middle, 1e-12) if row in judged else None,
-            row["replay_share"] or 0.0,
-            row["met_share"],
-            row["agreement"],
-            row["unexplained"],
-            row["quota_met"],
+    if len(last) < WINDOWS:
+        return "UNDETERMINED", (
+            "train longer, or evaluate more often (evaluation.every_env_steps): "
+            f"{counted(len(last), 'evaluation')}, and the verdict needs {WINDOWS}"
         )
-        for row in known_well
-    ]
-    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
-    weight = sum(row["evaluation_rows"] for row in known_well)
-    # Less than nothing counts as nothing: where robots stand, targets hardly vary, and a share of
-    # that is of any size.
-    told = [row["explained"] for row in judged or known_well if row["explained"] is not None]
-    known = [max(share, 0.0) for share in told]
-
-    def mean(name: str) -> float:
-        return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)
-
-    return Window(
-        gradient_steps=rows[0]["gradient_steps"],
-        symptoms=symptoms,
-        gap_median=median(gaps) if gaps else 1.0,
-        lag=max(rows[0]["lag"] or 0.0, mean("evaluation_lag")),
-        clock=mean("evaluation_td_online") / max(mean("evaluation_td"), 1e-12),
-        explained=median(known) if known else None,
-        q_abs_max=rows[0]["q_abs_max"],
-        q_bound=bound,
+    lagging = any(not window.lag < limits.lag for window in last)
+    if lagging and (young := _too_young(last, target_rule(run))):
+        return "UNDETERMINED", f"train longer: {young}"
+    if len({bool(window.target(limits)) for window in last}) > 1:
+        return "UNDETERMINED", (
+            f"train longer: the last {WINDOWS} evaluations do not agree on whether the target is "
+            "at fault"
+        )
+    cause = figures.cause(limits)
+    many = (
+        "correct what the evidence names, and train again: more than half of the conditions are in "
+        "doubt, which may be their rows or the critic"
     )
+    return cause, many if cause == "UNDETERMINED" else ""
 
 
-def _value_bound(run: Run) -> float:
-    """r_max / (1 - gamma), with the largest reward in the audited batches."""
-    rewards = run.table("audit")["reward"].to_numpy()
-    largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
-    discount = run.document["config"]["loss"]["discount"]
-    return largest / (1 - discount) if largest > 0 else float("inf")
+def _too_young(last: Sequence[Window], rule: TargetRule) -> str:
+    """Why an L past its limit may be the run's age, or nothing.
+
+    While values grow from 0, every target lags. A rule that is so slow that no run would be old
+    enough is at fault itself, which shows by an L that does not fall.
+    """
+    updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
+    if updates >= settled:
+        return ""
+    if updates < _LEAST_UPDATES:
+        return (
+            f"after {updates:,} updates any target lags; L is judged from "
+            f"{min(settled, _LEAST_UPDATES):,.0f} on"
+        )
+    if last[-1].lag < _FALLING * last[0].lag:
+        lags = ", ".join(f"{window.lag:.2f}" for window in last)
+        return f"L is still falling ({lags}), as the values of a young run are learnt"
+    return ""
 
 
 def _explained(explained: float | None) -> str:
@@ -359,6 +156,7 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
         f" L {window.lag:.3f}, S {window.clock:.2f},{_explained(window.explained)}"
         f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
     ]
+    lines += [f"target: {reason}" for reason in window.target(limits)]
     for condition, reasons in window.bad(limits).items():
         lines += [f"{condition}: {reason}" for reason in reasons]
     lacking = window.lacking(limits)
@@ -368,7 +166,13 @@ def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     return lines
 
 
-def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits) -> str:
+def _experiment(
+    cause: Cause,
+    windows: Sequence[Window],
+    limits: DiagnosisLimits,
+    rule: TargetRule,
+    advice: str,  # where it is UNDETERMINED
+) -> str:
     named = dict.fromkeys(name for window in windows for name in window.bad(limits))
     which = ", ".join(named) or "the condition with the largest gap"
     lacking = {
@@ -384,14 +188,14 @@ def _experiment(cause: Cause, windows: Sequence[Window], limits: DiagnosisLimits
         + ", ".join(lacking)
         + " (record some, or use rows from the twin: `restock train --flush-fresh`): this symptom "
         "must disappear, and the offline policy must not get worse there",
-        "TARGET": "train again with another target rule (target.tau 0.005) on the same panel:"
-        " L and S must fall, or the median G",
-        "BOTH": f"first change the target rule alone, then the rows of {which} alone",
+        "TARGET": f"train again with the target rule {other_target(rule)} in place of {rule} on "
+        "the same panel: the figures of the target must be back within their limits",
+        "BOTH": f"first change the target rule alone, from {rule} to {other_target(rule)}, then "
+        f"the rows of {which} alone",
         "DIVERGENCE": "train again with a lower optimizer.learning_rate, then with a slower"
         " target: no rows explain values above the sum of rewards, or without information",
-        "UNDETERMINED": "train longer, or with more seeds: the last windows or the runs do not "
-        "agree",
+        "UNDETERMINED": advice,
     }[cause]
 
 
-__all__ = ["Diagnosis", "DiagnosisLimits", "Symptom", "Window", "diagnose", "windows_of"]
+__all__ = ["Diagnosis", "diagnose", "other_target", "target_rule"]

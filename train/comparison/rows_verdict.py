@@ -12,7 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from restock.errors import RestockError
-from restock.train.comparison.diagnose import Cause, Diagnosis
+from restock.train.comparison.diagnose import Diagnosis
+from restock.train.comparison.windows import Cause
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_before_training
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run

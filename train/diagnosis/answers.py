@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -153,13 +153,15 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comp
         share = float((away.argmin(axis=1) == nearest).mean())
         is_other = nearest != action and middle[action] > _AWAY and share >= _MOST_ROWS
         speed, turn = np.median(motion, axis=0)
+        distance = float(middle[action])
         row = judged(
-            f"action: {name}", what, "distance", ConfidenceInterval(*[float(middle[action])] * 3),
-            logs=float(middle[action]), twin=float(middle[nearest]),
+            f"action: {name}", what, "distance", ConfidenceInterval(distance, distance, distance),
+            logs=distance, twin=float(middle[nearest]),
             most=_AWAY if is_other else math.inf, logs_rows=len(motion),
             note=f"{speed:+.2f} m/s, {turn:+.2f} rad/s: {share:.0%} nearest to {names[nearest]!r}",
         )  # fmt: skip
-        yield row, nearest if is_other else action
+        # A median decided by a share: there is no interval to show.
+        yield replace(row, low=None, high=None), nearest if is_other else action
 
 
 __all__ = ["Answer", "answers", "held_motion", "permuted_actions"]

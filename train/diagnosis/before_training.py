@@ -26,7 +26,7 @@ from restock.train.diagnosis.fed_rows import FedRows, of_panel, of_store
 from restock.train.diagnosis.gap_evidence import gap_evidence, untrusted
 from restock.train.diagnosis.outcomes import outcomes
 from restock.train.diagnosis.row_order import row_order
-from restock.train.diagnosis.stored import stored
+from restock.train.diagnosis.stored import fed_labels, stored
 from restock.train.diagnosis.twin_rows import drive_twin
 from restock.train.diagnosis.values import values
 from restock.train.feed.collector import conditions_in_twin
@@ -166,10 +166,14 @@ def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedR
         store_path, version = Path(panel.header.store), panel.store_version
         if version < 0 or not is_store(store_path):
             reason = f"the panel's store is no longer at {store_path}"
-            missing = [not_run("labels", "labels by stored signals", reason)]
+            missing = [
+                not_run("fed labels", "labels against the store's", reason),
+                not_run("labels", "labels by stored signals", reason),
+            ]
             return OpenedRows(rows, own, missing, [path])
         with Store(store_path, version=version) as store:
-            return OpenedRows(rows, own, _of_store(store, rows, own), [store_path, path])
+            compared = [*fed_labels(store, rows), *_of_store(store, rows, own)]
+            return OpenedRows(rows, own, compared, [store_path, path])
     if is_store(path):
         with Store(path) as store:
             chosen = task_hash or store.task().hash

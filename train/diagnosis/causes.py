@@ -59,7 +59,20 @@ FOLLOW_FROM = {  # checks that are off because an end is
 _FIRST = (  # nothing can be told of rows before these
     *("ROWS_APART", "ROWS_UNCHANGED", "FUTURE_IN_OBSERVATION"),
 )
+CHANGED = "ACTIONS_CHANGED"  # then nothing that actions show is the profile's fault
 COARSE = "ACTIONS_COARSE"  # then actions explain less of the motion, whatever else is right
+_LABELS = {  # by how the name of their checks, one a condition, begins
+    "fed labels: ": (
+        "LABELS_CHANGED",
+        "labels in the panel differ from the store's, of which it was made: wrong in",
+        "something changed labels after mixing: make the panel again with `restock mix`",
+    ),
+    "labels: ": (
+        "LABELS_WRONG",
+        "labels differ from what their conditions give on the stored signals: wrong in",
+        "`restock label STORE` computes them again; corrections by people are kept",
+    ),
+}
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")
 _UNITS = (
     ((50.0, 65.0), "degrees in place of radians"),
@@ -91,17 +104,18 @@ def findings(
     if first:  # what rows are made of, and all that is compared with their next, follows from it
         return first + [one for one in of_rows if one.cause in _ON_THEIR_OWN]
     ends = odd_ends(answers)
-    found = []
     moved = [(row, place, other) for place, (row, other) in enumerate(permuted) if other != place]
     one_to_one = len({other for _, _, other in moved}) == len(moved)
     actions = [end for end in ends if end in (ACTION_SPEED, ACTION_TURN, "actions")]
     # Actions that are late or early are found in place of others, too.
     shifted = any(_is_shift(*_distortion(end, ends[end])) for end in actions)
-    if len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
-        found.append(_permuted(moved, task))
+    found = [one for one in of_rows if one.cause == CHANGED]
+    if not found and len(moved) > 1 and one_to_one and not shifted and (actions or not ends):
+        found = [_permuted(moved, task)]
+    if found:
         ends = {end: off for end, off in ends.items() if end not in actions}
     follow = {check for end in ends for check in FOLLOW_FROM.get(end, ())}
-    of_rows = [one for one in of_rows if not set(one.evidence) <= follow]
+    of_rows = [one for one in of_rows if one not in found and not set(one.evidence) <= follow]
     found += [_of_end(end, off, task) for end, off in ends.items()]
     if any(one.cause == COARSE for one in of_rows):
         found = [one for one in found if one.cause not in ("ACTIONS_MIXED", "COMMAND_SCALED")]
@@ -165,9 +179,9 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         share = (1 - (gain if surely else max(gain, 0))) / 2
         return Finding(
             "ACTIONS_MIXED",
-            f"the logs' {end} explains only {max(gain, 0):.0%} of the expected motion, as if it "
-            f"had the opposite sign in {share:.0%} of the rows, or belonged to other rows in "
-            f"{min(1 - gain, 1):.0%}",
+            f"only {max(gain, 0):.0%} of the expected motion follows from the logs' {end}, as if "
+            f"{share:.0%} of the rows had the opposite sign, or {min(1 - gain, 1):.0%} belonged to "
+            "other rows",
             f"check some recordings one by one: {key} may be right in some and wrong in others "
             "(robots, firmware), or actions may belong to other rows",
             evidence,
@@ -175,7 +189,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
     if scale < 0 and _surely_reversed(off):
         return Finding(
             "SENSOR_MIRRORED",
-            f"the logs' {end} has the opposite sign ({scale:+.2f} of the other signals)",
+            f"the sign of the logs' {end} is opposite ({scale:+.2f} of the other signals)",
             f"change the sign of {key} in the profile (or its frame of reference)",
             evidence,
         )
@@ -187,7 +201,7 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         )
         return Finding(
             "SENSOR_SCALED" if not is_action else "COMMAND_SCALED",
-            f"the logs' {end} is {scale:.3g} times the other signals"
+            f"the scale of the logs' {end} is {scale:.3g} times that of the other signals"
             + (f": {unit}?" if unit else ""),
             f"scale {key} in the profile by {1 / scale:.3g}, or calibrate the sensor",
             evidence,
@@ -202,15 +216,15 @@ def _of_end(end: str, off: Sequence[Answer], task: Task) -> Finding:
         )
         return Finding(
             "ACTIONS_SHIFTED" if is_action else "SENSOR_SHIFTED",
-            f"the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps) "
-            f"{'late' if late else 'early'} compared with the other signal{slower}",
+            f"the time of the logs' {end} is {seconds:.2g} s ({abs(delay):.1f} steps) "
+            f"{'late' if late else 'early'} compared with the other signals{slower}",
             f"check the stamps of {key}: `restock info --clocks` shows each topic's clock; use "
             "the time of measurement, or correct the offset",
             evidence,
         )
     return Finding(
         "UNLIKE_TWIN",
-        f"the logs' {end} does not match the other signals as it does in the twin",
+        f"the relation of the logs' {end} to the other signals is not that of the twin",
         f"check {key} for values of other rows, outliers or heavy noise",
         evidence,
     )
@@ -268,16 +282,13 @@ def _of_rows(off: Sequence[Comparison]) -> list[Finding]:
             found.append(Finding(kind.cause, text, kind.remedy, used))
             for check in used:
                 del left[check]
-    if labels := [row for name, row in left.items() if name.startswith("labels: ")]:
-        shares = ", ".join(f"{row.check.removeprefix('labels: ')} {row.logs:.0%}" for row in labels)
-        text = (
-            f"labels differ from what their conditions give on the stored signals: wrong in "
-            f"{shares}"
-        )
-        remedy = "`restock label STORE` computes them again; corrections by people are kept"
-        used = tuple(row.check for row in labels)
-        found.append(Finding("LABELS_WRONG", text, remedy, used))
-        left = {name: row for name, row in left.items() if name not in used}
+    for prefix, (cause, text, remedy) in _LABELS.items():
+        if used := tuple(name for name in left if name.startswith(prefix)):
+            shares = ", ".join(
+                f"{name.removeprefix(prefix)} {left[name].logs:.0%}" for name in used
+            )
+            found.append(Finding(cause, f"{text} {shares}", remedy, used))
+            left = {name: row for name, row in left.items() if name not in used}
     found += [
         Finding(
             VALUES,
@@ -359,11 +370,11 @@ KINDS = (
         "terminations belong to other rows, or episodes were joined: ingest the logs again",
     ),
     Kind(
-        "ACTIONS_CHANGED",
+        CHANGED,
         ("own action", "previous action", "foresight"),
         "in {own_action.logs:.0%} of the rows the next observation does not contain the row's own "
         "action: the `action` column does not match the observations",
-        "something changed actions after ingest: ingest the logs again",
+        "something changed actions after ingest: ingest the logs again, and mix the panel again",
     ),
     Kind(
         COARSE,

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
-from restock.errors import StoreError
+from restock.errors import PanelError, RestockError, StoreError
 from restock.ingest.task.task import Task, nearness_of
 from restock.replay.panel.panel import Panel
 from restock.replay.store.parquet_views import passed_in
@@ -123,7 +123,11 @@ class FedRows:
 
 def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
     """The rows of a panel. Those whose next step is not in the panel are left out where its returns
-    are of several steps, and counted."""
+    are of several steps, and counted.
+
+    Raises:
+        PanelError: the task does not have a row's action.
+    """
     meta = panel.meta
     order = _by_step(meta)
     counts = np.unique(_text(meta, "episode_id"), return_counts=True)[1]
@@ -137,6 +141,7 @@ def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
         left_out=_not_looked_at(int((~kept).sum())),
         **_columns(meta, order),
     )
+    _check_actions(rows, PanelError, str(panel.path))
     far = _numbers(meta, "horizon")[order] > 1
     return _one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
 
@@ -145,7 +150,7 @@ def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
     """The rows of a task of a store.
 
     Raises:
-        StoreError: it has none.
+        StoreError: it has none, or the task does not have a row's action.
     """
     counted = store.connection.sql(
         "SELECT episode_id, count(*) AS rows FROM transitions WHERE task_hash = ?"
@@ -166,13 +171,30 @@ def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
         ).to_arrow_table()
     order = _by_step(table)
     task = store.task(task_hash)
-    return FedRows(
+    rows = FedRows(
         task=task,
         observation=_vectors(table["observation"], task.observation_size)[order],
         next_observation=_vectors(table["next_observation"], task.observation_size)[order],
         left_out=_not_looked_at(int(counts.sum()) - len(order)),
         **_columns(table, order),
     )
+    _check_actions(rows, StoreError, str(store.path))
+    return rows
+
+
+def _check_actions(rows: FedRows, error: type[RestockError], where: str) -> None:
+    """Nothing can be compared of an action that is in no table of actions."""
+    actions = len(rows.task.actions)
+    unknown = np.flatnonzero((rows.action < 0) | (rows.action >= actions))
+    if len(unknown):
+        first = unknown[0]
+        raise error(
+            f"transition {rows.transition_id[first]} (step {rows.step[first]} of an episode of "
+            f"recording {rows.recording[first]}) has action {rows.action[first]}, and the task has"
+            f" actions 0 to {actions - 1}; rows with such an action: {len(unknown):,}",
+            where=where,
+            remedy="something changed actions after ingest: ingest the logs again",
+        )
 
 
 def _some(counts: Ints, most: int) -> Ints:

@@ -2,7 +2,7 @@
 
 Each relation has two ends, each of one sensor or of the commands. A sensor whose readings are
 scaled, turned round or late shows in every relation that it takes part in, and in no other: so the
-end that is at fault can be named (`restock.train.diagnosis.odd_one_out`).
+end that is at fault can be named (`restock.train.diagnosis.causes`).
 """
 
 from __future__ import annotations

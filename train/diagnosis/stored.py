@@ -17,6 +17,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.store.episode_rows import label_table
 from restock.ingest.task.conditions import Condition, label
 from restock.ingest.task.task import terminated
+from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 from restock.train.diagnosis.evidence import Comparison, not_run, share_judged
 from restock.train.diagnosis.fed_rows import MOST_ROWS, FedRows
@@ -26,6 +27,7 @@ FAR = 0.25  # from a command to its action, in units of the fastest action
 COARSE = 0.1  # of the commands, those so far
 DIFFERENT = 0.02  # of the rows that have a label, or should
 _LABELS = "row's label differs from what its conditions give on the stored signals"
+_FED = "row's label in the panel differs from that in its store"
 _ENDS = "termination of the row does not agree with its signals"
 
 
@@ -46,6 +48,23 @@ def stored(
     whole = _whole(steps)
     yield from _labels(steps, whole, conditions, left_out)
     yield _terminations(steps, rows)
+
+
+def fed_labels(store: Store, rows: FedRows) -> Iterator[Comparison]:
+    """Of each condition the rows of a panel whose label is not the one in its store."""
+    fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
+    with passed_in(store.connection, fed=fed):
+        found = store.connection.sql(
+            "WITH labels AS (SELECT fed, coalesce(condition, '') AS stored"
+            " FROM fed JOIN transitions USING (transition_id) WHERE task_hash = ?)"
+            " SELECT name, count(*) FILTER (fed <> stored), count(*)"
+            " FROM (SELECT fed AS name, fed, stored FROM labels UNION ALL"
+            " SELECT stored, fed, stored FROM labels WHERE fed <> stored)"
+            " GROUP BY ALL ORDER BY ALL",
+            params=[rows.task.hash],
+        ).fetchall()
+    for name, differ, either in found:
+        yield share_judged(f"fed labels: {name}", _FED, differ, either, DIFFERENT)
 
 
 def _far_commands(store: Store, task_hash: str) -> Comparison:
@@ -131,4 +150,4 @@ def _terminations(steps: LoggedSteps, rows: FedRows) -> Comparison:
     return share_judged("terminations", _ENDS, int((again != stored_ends).sum()), either, DIFFERENT)
 
 
-__all__ = ["stored"]
+__all__ = ["fed_labels", "stored"]

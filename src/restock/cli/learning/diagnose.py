@@ -146,7 +146,8 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
     out.print(f"{diagnosis.cause}")
     for line in diagnosis.evidence:
         out.print(f"  {line}", markup=False, soft_wrap=True)
-    out.print(f"to confirm: {diagnosis.experiment}", markup=False, soft_wrap=True)
+    to = "to decide" if diagnosis.cause == "UNDETERMINED" else "to confirm"
+    out.print(f"{to}: {diagnosis.experiment}", markup=False, soft_wrap=True)
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:

@@ -1,0 +1,310 @@
+"""What the evaluations of a run show of its critic, its rows and its target: windows and limits.
+
+A window is one evaluation with the batches before it. Its figures, of a condition k or of all:
+
+    G_k  |TD| held out / |TD| in replay, in condition k
+    O_k  |TD| held out in k / the median condition's
+    L    mean |Q - Q_target| / mean |Q|
+    S    |TD| with the online network bootstrapping / |TD| with the target network
+
+A network that generalises, or memorises few rows, hides what is wrong with its replay from
+all of these. So three figures look at the rows, not at the critic
+(`restock.train.feed.log_fidelity`): how much of replay a condition is, beside how often it is met;
+how many of its logged rows look like it; and whether their next observations follow from them.
+And a condition may be well supplied, and an action of it not (`action_coverage`): neither logs nor
+fresh rows say what it leads to, and the policy wants it.
+
+The limits are from faults planted in the twin (benchmarks/planted_faults.py; the table is in
+docs/diagnose.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from statistics import median
+from typing import Any, Literal
+
+import numpy as np
+
+from restock.errors import RunError
+from restock.train.comparison.action_coverage import ActionSymptom
+from restock.train.run.run import Run
+
+Cause = Literal[
+    "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
+]
+_LEAST_ROWS = 20  # held out, for a condition to be diagnosed
+_LEAST_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
+_LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
+
+
+@dataclass(frozen=True)
+class DiagnosisLimits:
+    """From where on a figure is a symptom."""
+
+    gap: float = 3.0  # G_k of a condition; O_k where replay has none of it
+    relative: float = 3.0  # and G_k over the median G
+    gap_everywhere: float = 6.0  # the median G: everything is worse held out
+    lag: float = 0.25  # L: the target is far behind
+    no_lag: float = 0.002  # L below this: there is no target network to speak of
+    clock: float = 2.0  # S
+    explained: float = 0.2  # of the targets' variance: a critic below it has learnt nothing
+    supply: float = 0.1  # a condition's share of replay over its share of what driving meets
+    agreement: float = 0.1  # of a condition's logged rows that look like it
+    unexplained: float = 1.0  # of the variance of its next observations: their mean explains more
+    unexplained_relative: float = 1.6  # and over that of the condition with the least
+    quota_met: float = 0.5  # a smaller part of a quota is worth saying beside a gap
+    wanted: float = 0.18  # of a condition's fresh rows, those where the policy takes an action …
+    logged: float = 0.02  # … and of its logged rows drawn, those with it: the logs lack it …
+    fresh: float = 0.02  # … and of its fresh rows drawn: nor does driving supply it
+
+
+@dataclass(frozen=True)
+class Symptom:
+    """One condition in one window, or over several."""
+
+    condition: str
+    gap: float | None  # G_k; None: not in replay, or too few rows
+    outlier: float | None  # O_k; None: too few rows
+    replay_share: float
+    met_share: float | None  # of the evaluations' steps
+    agreement: float | None  # of its logged rows with fresh ones
+    unexplained: float | None  # of the variance of its logged rows' next observations
+    quota_met: float | None
+
+    @property
+    def supply(self) -> float | None:
+        """Its share of replay over its share of what driving meets."""
+        return self.replay_share / self.met_share if self.met_share else None
+
+
+@dataclass(frozen=True)
+class Window:
+    """What one evaluation shows, or several."""
+
+    gradient_steps: int
+    symptoms: list[Symptom]
+    gap_median: float
+    lag: float  # L
+    clock: float  # S
+    explained: float | None  # of the targets' variance, the median condition's
+    q_abs_max: float
+    q_bound: float  # the largest value that rewards seen could add up to
+    actions: list[ActionSymptom] = field(default_factory=list)  # over several windows only
+
+    def relative(self, symptom: Symptom) -> float | None:
+        """G_k over the median G: how much worse held out this condition is than the others."""
+        return symptom.gap / max(self.gap_median, 1e-12) if symptom.gap is not None else None
+
+    def bad(self, limits: DiagnosisLimits) -> dict[str, list[str]]:
+        """The conditions whose replay is in doubt, with what is wrong, for people."""
+        follows = [s.unexplained for s in self.symptoms if s.unexplained is not None]
+        least = min(follows, default=0.0)
+        doubts = {}
+        for symptom in self.symptoms:
+            reasons = [*self._supply(symptom, limits), *self._rows(symptom, least, limits)]
+            relative = self.relative(symptom)
+            if relative is not None and symptom.gap is not None:
+                if symptom.gap >= limits.gap and relative >= limits.relative:
+                    reasons.append(
+                        f"held-out |TD| is {symptom.gap:.1f} times that in replay,"
+                        f" {relative:.1f} times the median condition's gap"
+                    )
+            elif not symptom.replay_share and (symptom.outlier or 0.0) >= limits.gap:
+                reasons.append(
+                    f"held-out |TD| is {symptom.outlier:.1f} times the median condition's, and "
+                    "the condition is not in replay"
+                )
+            if reasons and symptom.quota_met is not None and symptom.quota_met < limits.quota_met:
+                reasons.append(f"got {symptom.quota_met:.0%} of its quota")
+            if reasons:
+                doubts[symptom.condition] = reasons
+        return doubts
+
+    def _supply(self, symptom: Symptom, limits: DiagnosisLimits) -> list[str]:
+        if symptom.supply is None:  # a run from before it was kept
+            return [] if symptom.replay_share else ["is not in replay"]
+        if symptom.supply >= limits.supply:
+            return []
+        share, met = symptom.replay_share, symptom.met_share
+        return [f"is {share:.2%} of replay and {met:.1%} of the steps when driving"]
+
+    def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
+        reasons = []
+        if symptom.agreement is not None and symptom.agreement < limits.agreement:
+            reasons.append(
+                f"{symptom.agreement:.0%} of its logged rows look like it: check the label"
+            )
+        rest = symptom.unexplained
+        if (
+            rest is not None
+            and rest >= limits.unexplained
+            and rest >= limits.unexplained_relative * least
+        ):
+            reasons.append(
+                f"its logged rows leave {rest:.0%} of the variance of their next observations "
+                f"unexplained (another condition: {least:.0%}): check that observations, actions "
+                "and next observations match"
+            )
+        return reasons
+
+    def unlogged(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+        """Actions that the policy wants in a condition, and whose logged rows hardly have them."""
+        return [
+            symptom
+            for symptom in self.actions
+            if symptom.condition_rows >= _LEAST_LOGGED
+            and symptom.wanted_low >= limits.wanted
+            and symptom.logs_share <= limits.logged
+        ]
+
+    def lacking(self, limits: DiagnosisLimits) -> list[ActionSymptom]:
+        """Of these, the ones that fresh rows do not supply either."""
+        unlogged = self.unlogged(limits)
+        return [symptom for symptom in unlogged if (symptom.fresh_share or 0.0) <= limits.fresh]
+
+    def target(self, limits: DiagnosisLimits) -> list[str]:
+        """Why the target is in doubt, for people: the figures past their limit; none if it is not.
+
+        A value that is not a number is past every limit.
+        """
+        reasons = []
+        if self.lag < limits.no_lag:
+            reasons.append(
+                f"L is {self.lag:.2g} (at least {limits.no_lag:g} is expected): there is no target"
+                " network to speak of"
+            )
+        elif not self.lag < limits.lag:
+            reasons.append(f"L is {self.lag:.3g} (limit {limits.lag:g}): the target is far behind")
+        if self.clock >= limits.clock:
+            reasons.append(f"S is {self.clock:.3g} (limit {limits.clock:g}): the networks disagree")
+        if self.gap_median >= limits.gap_everywhere:
+            reasons.append(
+                f"the median G is {self.gap_median:.3g} (limit {limits.gap_everywhere:g}):"
+                " everything is worse held out"
+            )
+        return reasons
+
+    def diverged(self, limits: DiagnosisLimits) -> bool:
+        """Whether values are beyond what rewards can add up to, or say nothing of their targets."""
+        if not np.isfinite(self.q_abs_max) or self.q_abs_max > self.q_bound:
+            return True
+        # A frozen target can be far from what it is learnt from; then the target is at fault.
+        if self.explained is None or self.target(limits):
+            return False
+        return self.explained < limits.explained
+
+    def cause(self, limits: DiagnosisLimits) -> Cause:
+        """The rule."""
+        if self.diverged(limits):
+            return "DIVERGENCE"
+        bad = self.bad(limits)
+        buffer = 0 < len(bad) <= len(self.symptoms) / 2
+        if self.target(limits):
+            return "BOTH" if buffer else "TARGET"
+        if buffer:
+            return "BUFFER"
+        if bad:
+            return "UNDETERMINED"
+        return "ACTION_COVERAGE" if self.lacking(limits) else "HEALTHY"
+
+
+def median_window(windows: Sequence[Window]) -> Window:
+    """The median of each figure over windows, of each condition over those in which it was met."""
+
+    def middle(name: str, of: Sequence[Any] = windows) -> Any:
+        known = [value for item in of if (value := getattr(item, name)) is not None]
+        return median(known) if known else None
+
+    conditions = dict.fromkeys(s.condition for window in windows for s in window.symptoms)
+    symptoms = []
+    for condition in conditions:
+        same = [s for window in windows for s in window.symptoms if s.condition == condition]
+        names = [name for name in Symptom.__dataclass_fields__ if name != "condition"]
+        symptoms.append(Symptom(condition, **{name: middle(name, same) for name in names}))
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    return Window(
+        gradient_steps=windows[-1].gradient_steps,
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=middle("lag"),
+        clock=middle("clock"),
+        explained=middle("explained"),
+        q_abs_max=windows[-1].q_abs_max,
+        q_bound=windows[-1].q_bound,
+    )
+
+
+def windows_of(run: Run) -> list[Window]:
+    """The windows of a run, one an evaluation that had updates before it."""
+    import duckdb
+
+    query = files("restock.train.comparison").joinpath("diagnose.sql").read_text(encoding="utf-8")
+    with duckdb.connect() as connection:
+        names = ("evaluation_buffer", "conditions", "strata", "progress")
+        for name in names:  # one that an older run has not is empty
+            connection.register(f"run_{name}", run.table(name))
+        rows = connection.sql(query).to_arrow_table().to_pylist()
+    if not rows:
+        remedy = "continue the run past its first evaluation (evaluation.every_env_steps)"
+        if not run.document["config"]["env"].get("twin", True):
+            remedy = (
+                "it learned from the logs alone, without evaluations: use `restock eval "
+                f"{run.path} --on-logs own`"
+            )
+        raise RunError("has no evaluation to diagnose", where=str(run.path), remedy=remedy)
+    bound = _value_bound(run)
+    steps = sorted({row["gradient_steps"] for row in rows})
+    return [_window([row for row in rows if row["gradient_steps"] == at], bound) for at in steps]
+
+
+def _window(rows: list[dict[str, Any]], bound: float) -> Window:
+    known_well = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
+    judged = [row for row in known_well if row["evaluation_rows"] >= _LEAST_TD_ROWS]
+    middle = median(row["evaluation_td"] for row in judged or known_well)
+    symptoms = [
+        Symptom(
+            row["condition"],
+            row["evaluation_td"] / row["replay_td"] if row in judged and row["replay_td"] else None,
+            row["evaluation_td"] / max(middle, 1e-12) if row in judged else None,
+            row["replay_share"] or 0.0,
+            row["met_share"],
+            row["agreement"],
+            row["unexplained"],
+            row["quota_met"],
+        )
+        for row in known_well
+    ]
+    gaps = [symptom.gap for symptom in symptoms if symptom.gap is not None]
+    weight = sum(row["evaluation_rows"] for row in known_well)
+    # Less than nothing counts as nothing: where robots stand, targets hardly vary, and a share of
+    # that is of any size.
+    told = [row["explained"] for row in judged or known_well if row["explained"] is not None]
+    known = [max(share, 0.0) for share in told]
+
+    def mean(name: str) -> float:
+        return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)
+
+    return Window(
+        gradient_steps=rows[0]["gradient_steps"],
+        symptoms=symptoms,
+        gap_median=median(gaps) if gaps else 1.0,
+        lag=max(rows[0]["lag"] or 0.0, mean("evaluation_lag")),
+        clock=mean("evaluation_td_online") / max(mean("evaluation_td"), 1e-12),
+        explained=median(known) if known else None,
+        q_abs_max=rows[0]["q_abs_max"],
+        q_bound=bound,
+    )
+
+
+def _value_bound(run: Run) -> float:
+    """r_max / (1 - gamma), with the largest reward in the audited batches."""
+    rewards = run.table("audit")["reward"].to_numpy()
+    largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
+    discount = run.document["config"]["loss"]["discount"]
+    return largest / (1 - discount) if largest > 0 else float("inf")
+
+
+__all__ = ["Cause", "DiagnosisLimits", "Symptom", "Window", "median_window", "windows_of"]
