@@ -110,7 +110,7 @@ class FlatAdam(Stateful):
         device = self.values.device
         size = len(self.values) if device.type == "cpu" else _SLICE
         whole = (self.values, self.gradient, *self._moments)
-        self._moved = [list(tensor.split(size)) for tensor in whole]
+        self._moved = [list(torch.split(tensor, size)) for tensor in whole]
         self._step = torch.zeros(len(self._moved[0]), device=device)
         self._steps = 0
 
