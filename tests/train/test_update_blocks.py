@@ -11,6 +11,7 @@ import torch
 from support.toy_run import assert_same_run, config, logs, run_to_end, session, tables
 from support.toy_twin import TASK
 
+from restock.cli.failures import as_restock_error
 from restock.errors import MixtureError
 from restock.replay.ring.ring import FreshRing
 from restock.train.loop import train
@@ -193,3 +194,10 @@ def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Pa
     at = int(str(raised.value).split("at update ")[1].split(";")[0])
     assert at == live.learner.gradient_steps
     live.close()
+
+
+def test_a_gpu_whose_memory_does_not_suffice_is_said_to_be_too_small() -> None:
+    full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 90.00 GiB.")
+    error = as_restock_error(full, ["train", "--device", "cuda"])
+    assert "GPU's memory does not suffice: CUDA out of memory" in error.what
+    assert "--device cpu" in str(error.remedy)
