@@ -17,11 +17,12 @@ from restock.files import first_line
 
 TRACEBACK = "RESTOCK_TRACEBACK"
 _CHECK = "a file is damaged, or is of another kind than the command expects"
+_OF_A_STORE = f"{_CHECK}; `restock compact STORE --drop-damaged --dry-run` looks for one in a store"
 # package of an exception -> what to do
 _REMEDIES = {
-    "duckdb": _CHECK,
-    "_duckdb": _CHECK,
-    "pyarrow": _CHECK,
+    "duckdb": _OF_A_STORE,
+    "_duckdb": _OF_A_STORE,
+    "pyarrow": _OF_A_STORE,
     "json": _CHECK,
     "msgspec": f"{_CHECK}; or a newer Restock wrote it",
     "deltalake": "the store's log or files are damaged: restore them, or ingest again",
