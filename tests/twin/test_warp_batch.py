@@ -1,12 +1,18 @@
-"""The twin on MuJoCo Warp drives the same episodes as on MuJoCo, over short horizons."""
+"""The twin on MuJoCo Warp drives the same episodes as on MuJoCo, over short horizons.
+
+What the host changes between two rollouts its device gets, once; a graph does what its substeps do.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
+from mujoco.batch import Batch
 
 from restock.errors import ConfigError
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -15,6 +21,8 @@ from restock.train.twin.physics.perturbation import Perturbation
 KINDS = {"nominal": 1.0, "wheel_slip": 1.0, "blocked_aisle": 1.0, "near_collision": 1.0}
 HEAVY = Perturbation(name="heavy", payload_kg=30.0, wheel_radius_scale=0.96, friction_scale=0.6)
 STEPS = 10  # of .2 s
+SUBSTEPS = 10
+BOTH = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
 @pytest.fixture(params=["cpu", "cuda:0"])
@@ -70,6 +78,169 @@ def test_what_blows_up_is_cut_and_counted(device: str) -> None:
     observation, *_, info = env.step(np.zeros(2, np.int64))
     assert np.isfinite(observation).all()
     assert not info["invalid"].any()
+
+
+class Driven:
+    """A batch of robots at the beginning of their episodes, and what its rollouts are given."""
+
+    def __init__(self, env: WarehouseVectorEnv, batch: Any) -> None:
+        of = env.simulation.batch
+        self.batch = batch
+        batch.expand("geom_friction")[:] = of.expand("geom_friction")
+        batch.state[:] = of.state
+        rng = np.random.default_rng(0)
+        self.wheels = rng.uniform(1, 6, (env.num_envs, 1, 2))
+        self.chassis = env.simulation.handles.chassis_body
+        self.wheel_geoms = list(env.simulation.handles.wheel_geoms)
+
+    def rollout(self, times: int = 1, record: tuple[str, ...] = ("sensordata",)) -> Any:
+        """Some blocks of substeps; the records of the last."""
+        places = self.batch.bind("mocap_pos").reshape(self.batch.nsim, 1, -1)
+        control = np.concatenate([self.wheels, places], axis=-1)
+        for _ in range(times):
+            records = self.batch.rollout(SUBSTEPS, control, BOTH, record)
+        return records
+
+    def rays(self) -> np.ndarray:
+        """Distances along rays from above the robots, (N, 8), nothing left out."""
+        angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+        level = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=-1)
+        above = self.batch.bind("qpos")[:, None, :3] + [0, 0, 0.2]
+        return self.batch.ray(above, level, bodyexclude=self.chassis)[0]
+
+
+def episodes(count: int = 6) -> WarehouseVectorEnv:
+    env = WarehouseVectorEnv(count, conditions=KINDS, seed=3)
+    env.reset(seed=3)
+    return env
+
+
+def on_warp(env: WarehouseVectorEnv, device: str, capture: bool) -> Driven:
+    from restock.train.twin.physics.warp_batch import WarpBatch
+
+    return Driven(env, WarpBatch(env.simulation.model, env.num_envs, 1, device, capture))
+
+
+def change(driven: Driven) -> None:
+    """What a host may change between rollouts, in one simulation each; in the last nothing."""
+    batch = driven.batch
+    start = batch.bind("qpos")[0].copy()
+    batch.reset(np.array([0]), stage=int(mujoco.mjtStage.mjSTAGE_NONE))
+    batch.bind("qpos")[0] = start
+    batch.bind("qvel")[1, :2] += 0.4
+    batch.bind("mocap_pos")[2, 0, :2] = batch.bind("qpos")[2, :2]  # it is pushed out
+    batch.bind("qvel")[3, :2] += 0.4
+    batch.expand("geom_friction")[3, driven.wheel_geoms, 0] = 0.02
+    batch.bind("xfrc_applied")[4, driven.chassis, 2] = 300.0
+    batch.bind("xfrc_applied")[4, driven.chassis, 5] = 20.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capture", [False, True], ids=["launched", "captured"])
+def test_what_the_host_changes_between_rollouts_is_seen(device: str, capture: bool) -> None:
+    env = episodes()
+    ours, theirs = Driven(env, Batch(env.simulation.model, 6, 1)), on_warp(env, device, capture)
+    unchanged = Driven(env, Batch(env.simulation.model, 6, 1))
+    for driven in (ours, theirs, unchanged):
+        driven.rollout(3)
+        if driven is not unchanged:
+            change(driven)
+        driven.rollout(3)
+    assert theirs.batch.captured == capture
+    for field in ("qpos", "mocap_pos"):
+        np.testing.assert_allclose(theirs.batch.bind(field), ours.batch.bind(field), atol=1e-4)
+    assert theirs.batch.bind("time") == pytest.approx(ours.batch.bind("time"))
+    moved = np.abs(ours.batch.bind("qpos") - unchanged.batch.bind("qpos")).max(axis=1)
+    assert (moved[:5] > 0.01).all()
+    assert moved[5] == 0
+
+
+@pytest.mark.slow
+def test_a_graph_does_what_its_substeps_do(device: str) -> None:
+    env = episodes()
+    launched, captured = (on_warp(env, device, capture) for capture in (False, True))
+    graphs = []
+    for block in range(6):
+        if block == 3:  # a field of its own more: the device's model is another one
+            for driven in (launched, captured):
+                driven.batch.expand("body_mass")[:, driven.chassis] *= np.linspace(1, 2, 6)
+                driven.batch.set_const(np.arange(6))
+        mine, its = (
+            driven.rollout(record=("sensordata", "qvel")) for driven in (launched, captured)
+        )
+        graphs.append(captured.batch.captured)
+        for name in mine:
+            np.testing.assert_allclose(its[name], mine[name], atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(captured.batch.state, launched.batch.state, atol=1e-4)
+    assert graphs == [False, True, True] * 2
+    assert not launched.batch.captured
+    assert captured.batch.not_captured == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", ["capture_begin", "capture_launch"])
+def test_what_cannot_be_captured_runs_all_the_same(
+    device: str, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import warp
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise RuntimeError("not on this device")
+
+    env = episodes()
+    launched, refused = (on_warp(env, device, capture) for capture in (False, True))
+    monkeypatch.setattr(warp, call, refuse)
+    for driven in (launched, refused):
+        driven.rollout(3)
+    assert not refused.batch.captured
+    assert refused.batch.not_captured == "RuntimeError: not on this device"
+    np.testing.assert_allclose(refused.batch.state, launched.batch.state, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_what_the_device_has_is_not_sent_again(device: str) -> None:
+    env = episodes()
+    driven = on_warp(env, device, False)
+    batch = driven.batch
+
+    def sent(run: Any) -> dict[str, int]:
+        batch.sent.clear()
+        run()
+        return dict(batch.sent)
+
+    given = {"ctrl", "mocap_pos"}  # with the controls of every substep
+    rest = {"qpos", "qvel", "qacc_warmstart", "mocap_quat", "xfrc_applied", "geom_friction"}
+    assert sent(driven.rollout) == dict.fromkeys(rest, 1)
+    assert sent(driven.rollout) == sent(driven.rays) == sent(driven.rays) == {}
+    assert sent(lambda: batch.rollout(SUBSTEPS)) == {}  # under the last controls
+    batch.bind("qvel")[2] = 0.0
+    batch.bind("mocap_pos")[1, 0, 0] += 1.0
+    assert sent(driven.rays) == {"qvel": 1, "mocap_pos": 1}
+    batch.expand("geom_friction")[0, :, 0] = 0.1
+    batch.bind("mocap_pos")[1, 0, 0] += 1.0
+    assert sent(driven.rollout) == {"geom_friction": 1}
+    batch.state[:] = env.simulation.batch.state  # as when a saved state is restored
+    assert not given & set(sent(driven.rollout))
+    batch.reset(np.array([4]))
+    assert {"qpos", "qvel"} <= set(sent(driven.rays))
+
+
+@pytest.mark.slow
+def test_rays_end_where_mujoco_has_them_end(device: str) -> None:
+    env = episodes()
+    ours, theirs = Driven(env, Batch(env.simulation.model, 6, 1)), on_warp(env, device, False)
+    before = ours.rays()
+    np.testing.assert_allclose(theirs.rays(), before, atol=1e-3)
+    for driven in (ours, theirs):
+        driven.rollout(5)
+    np.testing.assert_allclose(theirs.rays(), ours.rays(), atol=5e-3)
+    for driven in (ours, theirs):
+        batch = driven.batch
+        batch.state[:] = env.simulation.batch.state
+        batch.bind("mocap_pos")[:, 0] = batch.bind("qpos")[:, :3] + [0.9, 0, 0]
+    np.testing.assert_allclose(theirs.rays(), ours.rays(), atol=1e-3)
+    assert (ours.rays()[:, 0] < 0.9).all()
+    assert (before[:, 0] != ours.rays()[:, 0]).any()
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
