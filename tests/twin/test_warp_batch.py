@@ -194,7 +194,8 @@ def test_what_cannot_be_captured_runs_all_the_same(
         driven.rollout(3)
     assert not refused.batch.captured
     assert refused.batch.not_captured == "RuntimeError: not on this device"
-    np.testing.assert_allclose(refused.batch.state, launched.batch.state, atol=1e-4)
+    # A GPU adds contact forces up in no fixed order: .00015 apart in one velocity after 3 blocks.
+    np.testing.assert_allclose(refused.batch.state, launched.batch.state, atol=1e-3)
 
 
 @pytest.mark.slow
