@@ -6,14 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 import torch
+from support.panels import panel_of
+from support.stores import CONDITIONS, recording_transitions
 from support.toy_run import assert_same_run, config, logs, run_to_end, session, tables
 from support.toy_twin import TASK
 
 from restock.cli.failures import as_restock_error
 from restock.errors import MixtureError
 from restock.replay.ring.ring import FreshRing
+from restock.train.feed.logs import Logs
 from restock.train.loop import train
 from restock.train.session import Session
 from restock.train.update_blocks import LONGEST, DeviceTable, UpdateBlocks
@@ -30,9 +34,12 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def in_blocks(path: Path, device: str, *, resume: bool = False, **changes: Any) -> Session:
+def in_blocks(
+    path: Path, device: str, *, resume: bool = False, logs: Logs | None = None, **changes: Any
+) -> Session:
     """Not trained yet."""
-    live = session(path, config(device=device, **changes), resume=resume)
+    parts = {} if logs is None else {"logs": logs}
+    live = session(path, config(device=device, **changes), resume=resume, **parts)
     if live.blocks is None:
         live.blocks = UpdateBlocks(
             live.config, live.learner, live.batches, live.imitation, live.log_terms
@@ -136,6 +143,28 @@ def test_behaviour_and_critic_learn_online_after_the_critic_alone(
     assert blocks.learner.gradient_steps == one.learner.gradient_steps
     for value in blocks.learner.policy.state_dict().values():
         assert torch.isfinite(value).all()
+
+
+@pytest.mark.parametrize("mixture", ["sampling = 'chunked'\n", "within = 'per'\n"])
+def test_panels_of_all_kinds_feed_blocks_as_they_feed_one_by_one(
+    mixture: str, device: str, tmp_path: Path
+) -> None:
+    """Read in chunks, their rows are sent; by priority, a draw follows the TD errors before it."""
+    text = f"discount = 0.9\n{mixture}[each_condition]\nshare = 'equal'\n"
+    table = recording_transitions(1, task=TASK)
+    built = panel_of(table, text, tmp_path / "panel", task=TASK, conditions=CONDITIONS)
+    changes = {"schedule": {"env_steps": 200, "warmup_env_steps": 40, "offline_updates": 40}}
+    one = run_to_end(tmp_path / "one", config(**changes), logs=Logs.of_panel(built))
+    live = in_blocks(tmp_path / "blocks", device, logs=Logs.of_panel(built), **changes)
+    assert live.batches.reads_chunks == ("chunked" in mixture)
+    assert live.batches.needs_td == ("per" in mixture)
+    blocks = trained(live)
+    fed, expected = tables(blocks.run.path)["audit"], tables(one.run.path)["audit"]
+    of_logs = [table.filter(pc.equal(table["source"], "logs")) for table in (fed, expected)]
+    rows = ["gradient_step", "batch_row", "row_hash", "transition_id", "reward"]
+    assert len(of_logs[0]) == len(of_logs[1]) > 0
+    if device == "cpu" or not live.batches.needs_td:  # a GPU's priorities differ by rounding
+        assert of_logs[0].select(rows).equals(of_logs[1].select(rows))
 
 
 def test_rows_on_the_device_follow_the_ring(device: str) -> None:
