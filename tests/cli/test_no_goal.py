@@ -42,6 +42,7 @@ def test_training_records_no_success(run: Path) -> None:
         assert set(table["success"].to_pylist()) == {None}, name
 
 
+@pytest.mark.long
 def test_eval_report_card_and_compare_say_no_goal(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

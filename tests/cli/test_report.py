@@ -556,6 +556,7 @@ def test_estimates_from_logs_are_on_the_page_with_what_was_refused(html: str) ->
     assert "refused: &lt;script&gt;" in part
 
 
+@pytest.mark.long
 def test_a_measured_gap_is_a_section(run: Path, tmp_path: Path) -> None:
     position = {"condition": "nominal", "horizon_s": 3.0, "quantity": "position", "unit": "m"}
     position |= {"source": "nominal", "segments": 40, "episodes": 9}

@@ -255,6 +255,7 @@ def test_an_edited_profile_is_taken_and_never_replaced(
     assert profile.read_text() == mine
 
 
+@pytest.mark.long
 def test_where_nothing_says_that_the_twin_is_right_a_policy_comes_from_the_logs_alone(
     tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

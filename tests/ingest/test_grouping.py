@@ -83,6 +83,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_mcap(tmp_path_factory.mktemp("mcap") / "run.mcap", count=25)
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(
     chunk_size=st.integers(500, 30_000),

@@ -55,6 +55,7 @@ def test_the_whole_after_a_part_is_said(
     assert any(str(part) in note and "same drive twice" in note for note in whole["notes"])
 
 
+@pytest.mark.long
 def test_a_part_after_the_whole_is_refused_where_asked(
     part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

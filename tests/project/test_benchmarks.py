@@ -11,6 +11,7 @@ from support.paths import ROOT
 PEERS = ("cpprb", "mcap_ros2", "rerun", "stable_baselines3", "tianshou", "torchrl")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["ingest", "replay", "train", "train_loop"])
 def test_a_benchmark_starts_without_its_peers(name: str) -> None:
     script = str(ROOT / "benchmarks" / f"{name}.py")

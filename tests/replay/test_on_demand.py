@@ -98,6 +98,7 @@ def test_audits_leave_views_as_they_found_them(tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.long
 def test_lists_of_views_have_all_of_them(tmp_path: Path) -> None:
     path = write_store(tmp_path / "store", [recording_transitions(1)])
     for text in (

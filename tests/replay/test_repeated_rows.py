@@ -59,6 +59,7 @@ def copy_of(
     return part
 
 
+@pytest.mark.long
 def test_a_salvaged_part_and_the_whole_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -280,6 +280,7 @@ def test_the_verb_prints_a_trace_and_its_document(
     assert "was not audited" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("newer_beside", one_in(2, [True, False]))
 def test_a_store_that_an_older_version_wrote_audits_mixes_and_traces(
     tmp_path: Path, newer_beside: bool

@@ -37,6 +37,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return run_to_end(tmp_path_factory.mktemp("runs") / "undisturbed", config())
 
 
+@pytest.mark.long
 def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
     live = run_to_end(tmp_path / "a", config(schedule={"env_steps": 6000}), logs=None)
     assert live.best is not None
@@ -151,6 +152,7 @@ def test_killed_after_a_checkpoint_and_resumed_is_bit_exact(
     assert_same_run(undisturbed, again)
 
 
+@pytest.mark.long
 def test_an_earlier_checkpoint_leads_to_the_same_end(undisturbed: Session, tmp_path: Path) -> None:
     path = tmp_path / "run"
     live = run_to_end(path, config())
@@ -198,6 +200,7 @@ def quick_clone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jump_start, "FittedQConfig", partial(FittedQConfig, cloning_updates=200))
 
 
+@pytest.mark.long
 def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path, quick_clone: None) -> None:
     live = run_to_end(tmp_path / "run", config(**JUMP_START))
     meta = {name: values[: len(live.ring)] for name, values in live.ring.meta.items()}

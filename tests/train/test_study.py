@@ -66,6 +66,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     assert "made with other settings" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
     text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)

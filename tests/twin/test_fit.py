@@ -167,6 +167,7 @@ def recovered(store: Path, names: tuple[str, ...], **options: object) -> FittedT
         return fit(opened, FitConfig(parameters=names, **options))  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_known_latency_gain_and_wheels_are_recovered(known: Path, tmp_path: Path) -> None:
     base = Perturbation(name="before", timestep_s=0.01)
     found = recovered(
