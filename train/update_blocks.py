@@ -81,7 +81,7 @@ class UpdateBlocks:
         def of_table(of_logs: Tensor | None) -> Tensor | None:
             if of_logs is None:
                 return None
-            return torch.cat([of_logs, of_logs.new_zeros(ring.capacity)]).to(learner.device)
+            return torch.cat([of_logs, of_logs.new_zeros(ring.capacity)])
 
         self._updates = CapturedUpdates(
             learner,

@@ -115,7 +115,8 @@ treatment = "method"
     ]
 
 
-def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
+def study_of_two_comparisons(tmp_path: Path) -> Path:
+    """Writes s.toml; its folder of results, in which all was trained and evaluated before."""
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
     (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
     out = tmp_path / "out"
@@ -123,6 +124,11 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     for job in plan.jobs:  # all were trained and evaluated before
         job.path.mkdir(parents=True)
         job.done.write_text(plan.fingerprint(job))
+    return out
+
+
+def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
+    out = study_of_two_comparisons(tmp_path)
     dueling = Difference("config.network.dueling", "algorithm", False, True)
     own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
@@ -153,13 +159,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
 
 
 def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:
-    arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
-    (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
-    out = tmp_path / "out"
-    plan = StudyPlan(load_study(tmp_path / "s.toml"), tmp_path, out)
-    for job in plan.jobs:  # all were trained and evaluated before
-        job.path.mkdir(parents=True)
-        job.done.write_text(plan.fingerprint(job))
+    out = study_of_two_comparisons(tmp_path)
 
     def compared(first, second, *, treatment):
         if treatment == "algorithm":
