@@ -100,8 +100,7 @@ class Restock:
             step = learner.gradient_steps
             if self.feed is not None:
                 self.feed.batch(step, step * 4, batch, loss, learner.target.last_sync, tail=tail)
-            if learner.target.last_sync != step:
-                learner.target.after(step)
+            learner.target.after(step)
             if self.feed is not None and step % 500 == 0:
                 self.feed.flush(step * 4, step, "online")
 

@@ -300,8 +300,7 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
         interval.distance_before_sync = learner.target.distance()
         if session.probe is not None:
             interval.lag_before_sync = session.probe.measure(learner)[1]
-    if learner.target.last_sync != step:  # of a block it has followed already
-        learner.target.after(step)
+    learner.target.after(step)
     if step % every == 0:
         _close_interval(session, phase, notify)
 

@@ -76,8 +76,11 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def after(self, gradient_step: int) -> bool:
-        """Call after update number `gradient_step` (from 1); returns whether the target moved."""
-        if not self.rule.syncs_at(gradient_step):
+        """Call after update number `gradient_step` (from 1); returns whether the target moved.
+
+        It does not again for an update that it has followed, as in `Learner.move`.
+        """
+        if gradient_step == self.last_sync or not self.rule.syncs_at(gradient_step):
             return False
         self.pull()
         self.last_sync = gradient_step
