@@ -25,9 +25,9 @@ from restock.replay.export.trajectory import (
     REQUIRED,
     missing_columns,
 )
-from restock.replay.panel.candidates import LATER
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import open_place
+from restock.replay.plan.candidates import LATER
 from restock.replay.store.query import fetch, interruptible
 from restock.replay.store.query import query as run_query
 from restock.replay.store.store import Store

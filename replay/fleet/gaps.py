@@ -22,7 +22,7 @@ from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
-from restock.replay.panel.plan import LOGS, PanelPlan, plan_panel
+from restock.replay.plan.plan import LOGS, PanelPlan, plan_panel
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 

@@ -28,10 +28,10 @@ from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel
-from restock.replay.panel.plan import PanelPlan, plan_panel
 from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord, seal
-from restock.replay.panel.stores import AllStores, PinnedStore, all_stores
+from restock.replay.plan.plan import PanelPlan, plan_panel
+from restock.replay.plan.stores import AllStores, PinnedStore, all_stores
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
 
 

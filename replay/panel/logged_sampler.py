@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.panel.plan import outcome_column
-from restock.replay.panel.strata import rules_of
-from restock.replay.panel.weights import WeightsInForce
+from restock.replay.plan.plan import outcome_column
+from restock.replay.plan.strata import rules_of
+from restock.replay.plan.weights import WeightsInForce
 from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.sampler import QuotaSampler, Sampler

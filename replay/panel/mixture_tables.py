@@ -21,7 +21,7 @@ from duckdb.func import PythonUDFType
 from restock.replay.store.store import Store
 
 if TYPE_CHECKING:
-    from restock.replay.panel.plan import PanelPlan
+    from restock.replay.plan.plan import PanelPlan
 
 # Columns of `mixture`, with their types; each is of `Stratum`, two under the names that a run uses.
 STRATA = {
@@ -68,7 +68,7 @@ def install_mixtures(store: Store) -> None:
     def planned(name: str, _changed_ns: int) -> PanelPlan:
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.panel.build import open_source
-        from restock.replay.panel.plan import plan_panel
+        from restock.replay.plan.plan import plan_panel
 
         with Store(store_path, version=version, memory_limit=limit) as own:
             mixture = load_mixture(name)

@@ -25,10 +25,10 @@ from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import row_columns, row_width
-from restock.replay.panel.candidates import any_order, as_stored, matrix
-from restock.replay.panel.plan import PanelPlan
 from restock.replay.panel.scratch import STRETCH, SourceSteps
-from restock.replay.panel.strata import NO_STRATUM
+from restock.replay.plan.candidates import any_order, as_stored, matrix
+from restock.replay.plan.plan import PanelPlan
+from restock.replay.plan.strata import NO_STRATUM
 from restock.replay.sampling.row_file import read_into
 
 ROW_GROUP_ROWS = 65_536

@@ -26,9 +26,9 @@ from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION, row_columns, row_width
 from restock.replay.panel.seal import AGAIN, FileRecord, packed_by, unseal
-from restock.replay.panel.stores import PinnedStore
-from restock.replay.panel.strata import Stratum
-from restock.replay.panel.weights import RatioFit
+from restock.replay.plan.stores import PinnedStore
+from restock.replay.plan.strata import Stratum
+from restock.replay.plan.weights import RatioFit
 
 if TYPE_CHECKING:
     from restock.replay.panel.logged_sampler import LoggedSampler

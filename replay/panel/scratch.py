@@ -25,7 +25,7 @@ from restock.replay.mixture.n_step import (
     return_to_go,
     step_flags,
 )
-from restock.replay.panel.candidates import codes
+from restock.replay.plan.candidates import codes
 
 STRETCH = 1 << 18  # scalars in memory at a time
 

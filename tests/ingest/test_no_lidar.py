@@ -33,7 +33,7 @@ from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.panel.plan import plan_panel
+from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
 from restock.replay.trace.trace import TracePlaces, trace_row

@@ -46,14 +46,15 @@ MAY_IMPORT = {
     "replay/mixture": "",
     "replay/sampling": "mixture",
     "replay/ring": "mixture",
-    "replay/panel": "mixture sampling store ingest/store ingest/task",
-    "replay/fleet": "mixture panel store ingest/task",
+    "replay/plan": "mixture store ingest/task",
+    "replay/panel": "mixture plan sampling store ingest/store ingest/task",
+    "replay/fleet": "mixture panel plan store ingest/task",
     "replay/review": "store ingest ingest/store",
     "replay/trace": (
         "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
         " ingest/store ingest/task"
     ),
-    "replay/export": "replay panel store ingest/camera ingest/store ingest/profile ingest/task",
+    "replay/export": "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task",
     "train": (
         "dqn evaluation evaluation/off_policy feed run twin/env twin/floors twin/physics"
         " replay/fleet replay/mixture replay/panel replay/ring replay/sampling replay/store"
@@ -101,7 +102,7 @@ MAY_IMPORT = {
     "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
     "report/look": "",
     "report/run": (
-        "look replay/panel replay/store train/evaluation train/run train/twin/calibration"
+        "look replay/panel replay/plan replay/store train/evaluation train/run train/twin/calibration"
         " train/twin/floors train/twin/survey"
     ),
     "report/fleet": "look replay/fleet replay/store",
@@ -110,7 +111,7 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/propose/evidence"
         " ingest/steps ingest/store ingest/task replay replay/export replay/fleet replay/mixture"
-        " replay/panel replay/review replay/store report train/comparison train/dqn"
+        " replay/panel replay/plan replay/review replay/store report train/comparison train/dqn"
         " train/evaluation train/twin/physics"
     ),
     "cli/learning": (

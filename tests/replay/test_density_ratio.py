@@ -13,9 +13,9 @@ from support.stores import CONDITIONS, TASK, recording_transitions, write_store
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import CorrectionRule, StratumRule, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
-from restock.replay.panel.plan import plan_panel
-from restock.replay.panel.strata import ResolvedStratum
-from restock.replay.panel.weights import (
+from restock.replay.plan.plan import plan_panel
+from restock.replay.plan.strata import ResolvedStratum
+from restock.replay.plan.weights import (
     OutcomeModel,
     density_ratio,
     effective_count,

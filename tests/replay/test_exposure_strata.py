@@ -15,7 +15,7 @@ from restock.errors import ConfigError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
-from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.store.audit import load_thresholds, run_audits, shipped_audits
 from restock.replay.store.store import Store
 

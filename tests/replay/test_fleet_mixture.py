@@ -12,8 +12,8 @@ from support.stores import recording_transitions, write_store
 from restock.errors import ConfigError, MixtureError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.plan import plan_panel
 from restock.replay.places import open_place
+from restock.replay.plan.plan import plan_panel
 from restock.replay.store.audit import run_audits, shipped_audits
 from restock.replay.store.store import Store
 

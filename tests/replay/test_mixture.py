@@ -37,9 +37,9 @@ from restock.replay.mixture.mixture import (
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise
 from restock.replay.mixture.shares import plan_shares, scaled_within, wanted_shares
 from restock.replay.panel.build import build_panel, open_source
-from restock.replay.panel.plan import PanelPlan, plan_panel
-from restock.replay.panel.strata import ResolvedStratum, assign, resolve_strata
-from restock.replay.panel.weights import effective_count, effective_shares, importance_weights
+from restock.replay.plan.plan import PanelPlan, plan_panel
+from restock.replay.plan.strata import ResolvedStratum, assign, resolve_strata
+from restock.replay.plan.weights import effective_count, effective_shares, importance_weights
 
 
 def shares(plan: PanelPlan) -> dict[str, float]:

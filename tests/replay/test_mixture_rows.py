@@ -29,7 +29,7 @@ from restock.replay.mixture.mixture import (
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.store import Store
 

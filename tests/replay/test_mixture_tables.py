@@ -15,7 +15,7 @@ from restock.errors import ConfigError
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.mixture_tables import ROWS, STRATA
-from restock.replay.panel.plan import plan_panel
+from restock.replay.plan.plan import plan_panel
 from restock.replay.store.store import Store
 
 MIXTURES = {

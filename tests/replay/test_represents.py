@@ -20,9 +20,9 @@ from restock.replay.mixture.represented import look_for_archives, odds_ratio
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.logged_sampler import sampler_for
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.plan import PanelPlan, plan_panel
-from restock.replay.panel.strata import ResolvedStratum
-from restock.replay.panel.weights import effective_shares, importance_weights, stands_for
+from restock.replay.plan.plan import PanelPlan, plan_panel
+from restock.replay.plan.strata import ResolvedStratum
+from restock.replay.plan.weights import effective_shares, importance_weights, stands_for
 from restock.replay.store.store import Store
 
 TWO = """

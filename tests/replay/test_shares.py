@@ -14,7 +14,7 @@ from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Adaptive, StratumRule
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise, mean_over, value_at
 from restock.replay.mixture.shares import wanted_shares, within_limits
-from restock.replay.panel.strata import ResolvedStratum, assign
+from restock.replay.plan.strata import ResolvedStratum, assign
 from restock.replay.sampling.share_controller import GroupDro
 
 PARTS = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)

@@ -15,8 +15,8 @@ from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
 from restock.replay.mixture.mixture import parse_mixture, shipped_mixtures
-from restock.replay.panel.exclusions import split_for_evaluation
 from restock.replay.panel.panel import Panel
+from restock.replay.plan.exclusions import split_for_evaluation
 
 SEED = 3  # of an episode of 58 steps
 

@@ -19,16 +19,16 @@ from restock import cli
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import StratumRule, load_mixture, parse_mixture
 from restock.replay.mixture.shares import missing_rows, plan_shares
-from restock.replay.panel.plan import hours_of
-from restock.replay.panel.source_plan import below_natural
-from restock.replay.panel.strata import (
+from restock.replay.places import open_place
+from restock.replay.plan.plan import hours_of
+from restock.replay.plan.source_plan import below_natural
+from restock.replay.plan.strata import (
     NO_STRATUM,
     ResolvedStratum,
     Stratum,
     assign,
     deal_episodes,
 )
-from restock.replay.places import open_place
 from restock.replay.store.audit import load_audits, load_thresholds, run_audits
 
 AUDITS = {audit.name: audit for audit in load_audits()}

@@ -11,7 +11,7 @@ import pyarrow as pa
 from restock.replay.mixture.mixture import Mixture, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.plan import PanelPlan, plan_panel
+from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.store.store import Store
 from support.stores import CONDITIONS, TASK
 

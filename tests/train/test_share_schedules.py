@@ -18,7 +18,7 @@ from restock.replay.mixture.mixture import Prioritised, parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.logged_sampler import LoggedSampler
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.strata import rules_of
+from restock.replay.plan.strata import rules_of
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.share_controller import PlannedDraws, SampledStratum, ShareController

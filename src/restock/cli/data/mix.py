@@ -13,8 +13,8 @@ import tyro
 from restock.errors import MixtureError
 
 if TYPE_CHECKING:
-    from restock.replay.panel.plan import PanelPlan
-    from restock.replay.panel.strata import Stratum
+    from restock.replay.plan.plan import PanelPlan
+    from restock.replay.plan.strata import Stratum
 
 _UNCERTAIN = {
     "drop": "they are left out",
@@ -64,7 +64,7 @@ class MixCommand:
         from restock.ingest.store.version import given_version
         from restock.replay.mixture.mixture import load_mixture, shipped_schema
         from restock.replay.panel.build import open_source, write_panel
-        from restock.replay.panel.plan import plan_panel
+        from restock.replay.plan.plan import plan_panel
         from restock.replay.store.store import Store
 
         if self.schema:

@@ -12,7 +12,7 @@ import numpy as np
 from restock.errors import RestockError, RunError
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
-from restock.replay.panel.strata import Stratum
+from restock.replay.plan.strata import Stratum
 from restock.replay.store.store import Store
 from restock.report.look.blocks import Rows, words
 from restock.report.look.queries import ask, rows_of, statements

@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from restock.replay.panel.exclusions import DAY_NS
+from restock.replay.plan.exclusions import DAY_NS
 from restock.report.look import charts, floor_map
 from restock.report.look.blocks import (
     Figure,

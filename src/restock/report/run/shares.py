@@ -6,7 +6,7 @@ from typing import Any
 
 import altair as alt
 
-from restock.replay.panel.source_plan import TOLERANCE
+from restock.replay.plan.source_plan import TOLERANCE
 from restock.report.look import charts
 from restock.report.look.blocks import (
     Drawing,

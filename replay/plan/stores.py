@@ -12,7 +12,7 @@ import msgspec
 
 from restock.errors import MixtureError, StoreError
 from restock.replay.mixture.mixture import Mixture, OtherStore
-from restock.replay.panel.candidates import STORE_COLUMN
+from restock.replay.plan.candidates import STORE_COLUMN
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import parquet_view
 from restock.replay.store.store import Store

@@ -18,7 +18,7 @@ from restock.arrays import Bools, Ints
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.panel.strata import ResolvedStratum
+from restock.replay.plan.strata import ResolvedStratum
 
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
@@ -35,7 +35,7 @@ _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(unce
 _CODED = pa.dictionary(pa.int32(), pa.string())
 _VIEWS = "SELECT table_name FROM information_schema.tables"
 BATCH_ROWS = 65_536  # read at a time
-# Of a view of several stores, which one a row is from (`replay.panel.stores`).
+# Of a view of several stores, which one a row is from (`replay.plan.stores`).
 STORE_COLUMN = "mixture_store"
 
 

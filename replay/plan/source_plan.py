@@ -13,9 +13,9 @@ from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.shares import SharePlan, missing_rows, plan_shares
-from restock.replay.panel.exclusions import scramble
-from restock.replay.panel.strata import ResolvedStratum, Stratum
-from restock.replay.panel.weights import (
+from restock.replay.plan.exclusions import scramble
+from restock.replay.plan.strata import ResolvedStratum, Stratum
+from restock.replay.plan.weights import (
     RatioFit,
     RatioRows,
     effective_count,

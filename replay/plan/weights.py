@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import CorrectionRule
-from restock.replay.panel.candidates import any_order, as_stored, matrix
+from restock.replay.plan.candidates import any_order, as_stored, matrix
 
 BATCH_ROWS = 4_096  # of observations in memory at a time
 COLUMNS = 16  # of features in memory at a time

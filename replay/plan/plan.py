@@ -23,7 +23,7 @@ from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
 from restock.replay.mixture.represented import look_for_archives, represented_shares
 from restock.replay.mixture.schedules import mean_over
-from restock.replay.panel.candidates import (
+from restock.replay.plan.candidates import (
     META_COLUMNS,
     bools,
     codes,
@@ -33,7 +33,7 @@ from restock.replay.panel.candidates import (
     unknown_conditions,
     without_measured_actions,
 )
-from restock.replay.panel.exclusions import (
+from restock.replay.plan.exclusions import (
     EvaluationRows,
     LeftOut,
     leave_out,
@@ -41,9 +41,9 @@ from restock.replay.panel.exclusions import (
     repeats_of,
     split_for_evaluation,
 )
-from restock.replay.panel.source_plan import SourcePlan, SourceRows, plan_source
-from restock.replay.panel.stores import PinnedStore
-from restock.replay.panel.strata import (
+from restock.replay.plan.source_plan import SourcePlan, SourceRows, plan_source
+from restock.replay.plan.stores import PinnedStore
+from restock.replay.plan.strata import (
     NO_STRATUM,
     ResolvedStratum,
     Stratum,
@@ -53,7 +53,7 @@ from restock.replay.panel.strata import (
     least_steps,
     resolve_strata,
 )
-from restock.replay.panel.weights import RatioFit, effective_count
+from restock.replay.plan.weights import RatioFit, effective_count
 
 LOGS = "logs"  # the name of the first store's part
 
