@@ -9,9 +9,11 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 import duckdb
 import msgspec
@@ -172,16 +174,34 @@ def write_panel(
             cut_at_off_policy=plan.mixture.cut_at_off_policy,
         )
         packer = Packer(source.connection, plan, steps, scratch)
-        size = packer.write_rows(partial / ROWS, advance)
-        packer.write_meta(partial / META, partial / EVALUATION_SPLIT)
+        size, record = _write_all(packer, partial, advance)
         identity = panel_id(source, plan, packer.digest())
         shutil.rmtree(scratch)
-        header = _header(source, plan, identity, task_json, size, partial)
+        files = {ROWS: record} | {
+            name: FileRecord.of(partial / name) for name in (META, EVALUATION_SPLIT)
+        }
+        header = _header(source, plan, identity, task_json, size, files)
         (partial / HEADER).write_bytes(seal(header))
         for name in (HEADER, *header.files):
             _finish(partial / name)
         _put(partial, out, force)
     return Panel.open(out)
+
+
+def _write_all(
+    packer: Packer, folder: Path, advance: Callable[[int], None]
+) -> tuple[int, FileRecord]:
+    """Write rows, and what stands beside them meanwhile; see `Packer.write_rows`."""
+    stop = Event()
+    with ThreadPoolExecutor(1, "restock-meta") as beside:
+        meta = beside.submit(packer.write_meta, folder / META, folder / EVALUATION_SPLIT, stop)
+        try:
+            written = packer.write_rows(folder / ROWS, advance)
+        except BaseException:
+            stop.set()
+            raise
+        meta.result()
+    return written
 
 
 @contextmanager
@@ -293,7 +313,7 @@ def _header(
     identity: str,
     task_json: str,
     observation_size: int,
-    partial: Path,
+    files: dict[str, FileRecord],
 ) -> Header:
     read_by = (*source.profiles(plan.task_hash), StoredProfile("", "", ""))[0]
     outcomes = of_kind(source.conditions, "outcome")
@@ -325,5 +345,5 @@ def _header(
         mixture=plan.mixture,
         others=[msgspec.structs.replace(o, path=_address(o.path)) for o in plan.others],
         ratios=list(plan.ratios),
-        files={name: FileRecord.of(partial / name) for name in (ROWS, META, EVALUATION_SPLIT)},
+        files=files,
     )

@@ -9,15 +9,16 @@ both, so what is written together lies together, and a block is full soon after 
 from __future__ import annotations
 
 import hashlib
-import itertools
-import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -25,22 +26,22 @@ from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import row_columns, row_width
-from restock.replay.panel.scratch import STRETCH, SourceSteps
+from restock.replay.panel.packed_file import PackedFile
+from restock.replay.panel.scratch import SourceSteps
+from restock.replay.panel.seal import FileRecord
 from restock.replay.plan.candidates import any_order, as_stored, matrix
 from restock.replay.plan.plan import PanelPlan
 from restock.replay.plan.strata import NO_STRATUM
-from restock.replay.sampling.row_file import read_into
+from restock.replay.plan.transition_ids import stretches
 
 ROW_GROUP_ROWS = 65_536
-BATCH_ROWS = 16_384  # of what stands beside the rows, in memory at a time
-BLOCK_ROWS = 512  # of packed rows, written together
-HELD_BYTES = 128 << 20  # of blocks that are not full, in memory at a time
 BATCH_BYTES = 4 << 20  # of observations, in memory at a time
 FINITE = (
     'where = "isfinite(list_sum(observation::FLOAT[]) + list_sum(next_observation::FLOAT[])'
     ' + reward)"'
 )
-_TEXT = pa.dictionary(pa.int32(), pa.string())
+# Of these hardly two rows have the same.
+_NO_DICTIONARY = ("transition_id", "stamp_ns", "logged_ns", "reward", "return_to_go")
 _SPLIT_COLUMNS = (
     "transition_id",
     "recording_id",
@@ -78,8 +79,7 @@ class Packer:
 
     def _stretches(self) -> Iterator[tuple[int, int, Ints]]:
         """Stretches of the source, and which of their rows are packed."""
-        for begin in range(0, self.steps.rows, STRETCH):
-            end = min(begin + STRETCH, self.steps.rows)
+        for begin, end in stretches(self.steps.rows):
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 
     def digest(self) -> str:
@@ -102,8 +102,8 @@ class Packer:
             at += len(rows)
         return hashlib.blake2b(b"".join(d.digest() for d in digests), digest_size=8).hexdigest()
 
-    def write_rows(self, path: Path, advance: Callable[[int], None]) -> int:
-        """Write the packed rows; returns the observation size.
+    def write_rows(self, path: Path, advance: Callable[[int], None]) -> tuple[int, FileRecord]:
+        """Write the packed rows; returns the observation size, and the file's record.
 
         Raises PanelError where an observation or reward is not finite, or of another size.
         """
@@ -111,27 +111,25 @@ class Packer:
         first = self.connection.sql(f"SELECT len(observation) {of_task} LIMIT 1").fetchall()
         size = int(first[0][0])
         at_a_time = max(BATCH_BYTES // (8 * size), 1)
-        names = "transition_id, recording_id, action, terminated, observation, next_observation"
+        names = "transition_id, action, terminated, observation, next_observation"
         query = f"SELECT {names} {of_task}"
         places = self.steps.places()
         # Two halves of a row: what is observed and done, and what comes of it.
         with (
-            _PackedRows(path, len(self.chosen), row_width(size), parts=2) as rows,
+            PackedFile(path, len(self.chosen), row_width(size), parts=2) as rows,
             any_order(self.connection),  # each row knows where it belongs
         ):
-            for batch in self.connection.sql(query).to_arrow_reader(at_a_time):
+            for batch in filter(len, self.connection.sql(query).to_arrow_reader(at_a_time)):
                 place = places.of(batch.column("transition_id").to_numpy())
                 self._write(rows, size, batch, place)
                 advance(len(batch))
-            if not rows.is_full:
-                raise PanelError("the source changed while it was read", where=str(path.parent))
-        return size
+            return size, rows.finish()
 
-    def _write(self, rows: _PackedRows, size: int, batch: pa.RecordBatch, place: Ints) -> None:
+    def _write(self, rows: PackedFile, size: int, batch: pa.RecordBatch, place: Ints) -> None:
         """Put a batch's values where they belong."""
         part = row_columns(size)
-        target = np.searchsorted(self.chosen, place)
-        packed = np.flatnonzero(_at(self.chosen, target) == place)
+        target, behind = _between(self.chosen, place)
+        packed = np.flatnonzero(behind > target)  # those that are there
         target = target[packed]
         observation = _chosen(matrix(batch.column("observation"), size), packed)
         next_observation = matrix(batch.column("next_observation"), size)
@@ -149,7 +147,7 @@ class Packer:
             (part["reward"], returns[:, None]),
         )
         # Returns that end with a row of this batch take its next observation.
-        first, behind = (np.searchsorted(self.last, place, side) for side in ("left", "right"))
+        first, behind = _between(self.last, place)
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
         next_observation = _chosen(next_observation, source)
@@ -162,153 +160,81 @@ class Packer:
         if not all(np.isfinite(one).all() for one in (observation, next_observation, returns)):
             raise PanelError(
                 "an observation or a reward is NaN or infinite, which makes training fail",
-                where=f"recording {batch.column('recording_id')[0].as_py()}",
+                where=f"recording {self.plan.rows['recording_id'][int(place.max())]}",
                 remedy=f"`restock audit` lists the rows; a mixture leaves them out with {FINITE}",
             )
 
-    def write_meta(self, meta: Path, evaluation_split: Path) -> None:
-        """Write what stands beside the rows, and the evaluation split, in the same order."""
+    def write_meta(self, meta: Path, evaluation_split: Path, stop: Event) -> None:
+        """Write what stands beside the rows, and the evaluation split, in the same order; where
+        `stop` is set meanwhile, no more of it."""
+        held = np.flatnonzero(self.plan.evaluation_split)
+        with _writer(evaluation_split) as write:
+            for begin in _groups(len(held), stop):
+                part = self.plan.rows.select(_SPLIT_COLUMNS).take(pa.array(held[begin]))
+                # For the audit `leakage`.
+                split_by = pa.array([self.plan.split_by], pa.string())
+                column = pa.DictionaryArray.from_arrays(np.zeros(len(part), np.int8), split_by)
+                write(part.append_column("split_by", column))
         names = pa.array([line.name for line in self.plan.strata], pa.string())
         to_go = None
         if self.mixture.return_to_go:
             to_go = self.steps.returns_to_go(self.mixture.discount)
-        at = 0
-        with _Table(meta) as kept, _Table(evaluation_split) as left:
-            for begin in range(0, self.steps.rows, BATCH_ROWS):
-                table = _compact(self.plan.rows.slice(begin, BATCH_ROWS))
-                end = begin + len(table)
-                split = table.select(_SPLIT_COLUMNS).filter(
-                    pa.array(self.plan.evaluation_split[begin:end])
-                )
-                # For the audit `leakage`.
-                split_by = pa.repeat(self.plan.split_by, len(split))
-                left.write(split.append_column("split_by", split_by))
-                code = self.plan.stratum[begin:end]
-                rows = np.flatnonzero(code != NO_STRATUM)
-                table, code = table.take(pa.array(rows)), code[rows]
-                packed = slice(at, at + len(rows))
+        with _writer(meta) as write:
+            for packed in _groups(len(self.chosen), stop):
+                chosen = np.asarray(self.chosen[packed])
+                part, code = self.plan.rows.take(pa.array(chosen)), self.plan.stratum[chosen]
                 beside: dict[str, Any] = {
                     "stratum": pa.DictionaryArray.from_arrays(pa.array(code, pa.int32()), names),
                     "stratum_code": pa.array(code),
-                    "horizon": pa.array(
-                        (self.last[packed] - self.chosen[packed] + 1).astype(np.int16)
-                    ),
+                    "horizon": pa.array((self.last[packed] - chosen + 1).astype(np.int16)),
                     "weight": pa.array(self.plan.weight[packed]),
                     **{name: pa.array(v[packed]) for name, v in self.plan.beside.items()},
                 }
                 if to_go is not None:
-                    beside["return_to_go"] = pa.array(to_go[0][begin:end][rows])
-                    beside["return_to_go_whole"] = pa.array(to_go[1][begin:end][rows])
+                    beside["return_to_go"] = pa.array(to_go[0][chosen])
+                    beside["return_to_go_whole"] = pa.array(to_go[1][chosen])
                 for name, values in beside.items():
-                    table = table.append_column(name, values)
-                kept.write(table)
-                at += len(rows)
+                    part = part.append_column(name, values)
+                write(part)
 
 
-class _PackedRows:
-    """Rows (n, W) float32 of a file, put there part by part, in any order, each part once.
-
-    Blocks are written when they are full; those that wait for the rest of their rows are held, and
-    where they are too many, written as they are and read again.
-    """
-
-    def __init__(self, path: Path, rows: int, width: int, *, parts: int) -> None:
-        self._rows, self._width, self._parts = rows, width, parts
-        self._path = str(path)
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
-        self._put: Ints = np.zeros(-(-rows // BLOCK_ROWS), np.int64)  # parts of rows, of each block
-        self._held: dict[int, NDArray[np.float32]] = {}
-
-    def __enter__(self) -> _PackedRows:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._file)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether every part of every row was put."""
-        return int(self._put.sum()) == self._rows * self._parts
-
-    def put(self, rows: Ints, *values: tuple[slice, NDArray[Any]]) -> None:
-        """One part of rows (m,): some of their columns, with what they hold, (m, c)."""
-        if (np.diff(rows) < 0).any():
-            order = np.argsort(rows, kind="stable")
-            rows, values = rows[order], tuple((columns, held[order]) for columns, held in values)
-        block = rows // BLOCK_ROWS
-        for begin, end in itertools.pairwise([0, *np.flatnonzero(np.diff(block)) + 1, len(rows)]):
-            if begin == end:
-                continue
-            number = int(block[begin])
-            packed = self._block(number)
-            inside = rows[begin:end] - number * BLOCK_ROWS
-            to: Ints | slice = inside
-            if inside[-1] - inside[0] == end - begin - 1 and (np.diff(inside) == 1).all():
-                to = slice(int(inside[0]), int(inside[-1]) + 1)
-            for columns, held in values:
-                packed[to, columns] = held[begin:end]
-            self._put[number] += end - begin
-            if self._put[number] == len(packed) * self._parts:
-                self._write(number)
-        while len(self._held) * BLOCK_ROWS * self._width * 4 > HELD_BYTES:
-            self._write(next(iter(self._held)))
-
-    def _block(self, number: int) -> NDArray[np.float32]:
-        if (held := self._held.get(number)) is None:
-            count = min(BLOCK_ROWS, self._rows - number * BLOCK_ROWS)
-            held = np.zeros((count, self._width), "<f4")
-            if self._put[number] and not read_into(held, self._file, self._place(number)):
-                raise PanelError("what was written of it is gone", where=self._path)
-            self._held[number] = held
-        return held
-
-    def _write(self, number: int) -> None:
-        rest = self._held.pop(number).data.cast("B")
-        place = self._place(number)
-        while rest:  # a full disk is an OSError; what is written short goes on
-            written = os.pwrite(self._file, rest, place)
-            rest, place = rest[written:], place + written
-
-    def _place(self, number: int) -> int:
-        return number * BLOCK_ROWS * self._width * 4
+def _groups(rows: int, stop: Event) -> Iterator[slice]:
+    """Row groups of a table of so many rows; one of none where it has none."""
+    for begin in range(0, max(rows, 1), ROW_GROUP_ROWS):
+        if stop.is_set():
+            return
+        yield slice(begin, min(begin + ROW_GROUP_ROWS, rows))
 
 
-class _Table:
-    """A Parquet file, written a row group at a time."""
+@contextmanager
+def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
+    """Writes a Parquet file, a row group at a time."""
+    made: list[pq.ParquetWriter] = []
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._waiting: list[pa.Table] = []
-        self._writer: pq.ParquetWriter | None = None
+    def write(rows: pa.Table) -> None:
+        for place, field in enumerate(rows.schema):
+            if pa.types.is_dictionary(field.type):
+                column = _compact(rows.column(place).combine_chunks())
+                rows = rows.set_column(place, field.name, column)
+        if not made:
+            coded = [name for name in rows.schema.names if name not in _NO_DICTIONARY]
+            writer = pq.ParquetWriter(path, rows.schema, compression="zstd", use_dictionary=coded)
+            made.append(writer)
+        made[0].write_table(rows)
 
-    def __enter__(self) -> _Table:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._flush()
-        if self._writer is not None:
-            self._writer.close()
-
-    def write(self, table: pa.Table) -> None:
-        self._waiting.append(table)
-        if sum(map(len, self._waiting)) >= ROW_GROUP_ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._waiting:
-            table, self._waiting = pa.concat_tables(self._waiting), []
-            if self._writer is None:
-                self._writer = pq.ParquetWriter(self._path, table.schema, compression="zstd")
-            self._writer.write_table(table.unify_dictionaries())
+    try:
+        yield write
+    finally:
+        for writer in made:
+            writer.close()
 
 
-def _compact(table: pa.Table) -> pa.Table:
+def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
     """Text as codes of what these rows have alone: readers keep them so."""
-    for place, field in enumerate(table.schema):
-        if field.type == _TEXT:
-            column = table.column(place).cast(pa.string()).cast(_TEXT)
-            table = table.set_column(place, field, column)
-    return table
+    used = column.indices.unique().drop_null()
+    order = used.take(pc.array_sort_indices(used))
+    codes = pc.index_in(column.indices, value_set=order)
+    return pa.DictionaryArray.from_arrays(codes, column.dictionary.take(order))
 
 
 def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:
@@ -317,12 +243,13 @@ def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:
     return matrix if whole else matrix[rows]
 
 
-def _at(values: Ints, place: Ints) -> Ints:
-    """values[place], and -1 beyond the end."""
-    if not len(values):
-        return np.full(len(place), -1)
-    at: Ints = np.where(place < len(values), values[np.minimum(place, len(values) - 1)], -1)
-    return at
+def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
+    """Where each of these values (n,) begins and ends in an ascending array."""
+    # Those of one batch mostly lie together: the part of the array that may have them is small.
+    low, high = np.searchsorted(ascending, [values.min(), values.max() + 1])
+    near = np.asarray(ascending[low:high])
+    begin, end = (low + np.searchsorted(near, values, side) for side in ("left", "right"))
+    return np.asarray(begin, np.int64), np.asarray(end, np.int64)
 
 
 def _starts(counts: Ints) -> Ints:

@@ -6,7 +6,6 @@ gone when the panel is there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,7 @@ from restock.replay.mixture.n_step import (
     step_flags,
 )
 from restock.replay.plan.candidates import codes
-
-STRETCH = 1 << 18  # scalars in memory at a time
+from restock.replay.plan.transition_ids import STRETCH, Places, stretches
 
 
 class SourceSteps:
@@ -54,7 +52,7 @@ class SourceSteps:
         self.reward: F32 = rows["reward"].to_numpy()
         self.flags: NDArray[np.uint8] = _on_disk(folder / "flags", np.uint8, self.rows)
         self._folder = folder
-        for begin, end in _stretches(self.rows - 1):
+        for begin, end in stretches(self.rows - 1):
             # With the row behind: what that one is to the last.
             self.flags[begin:end] = _flags(rows.slice(begin, end + 1 - begin), random_probability)
         if rows["terminated"][-1].as_py():
@@ -101,44 +99,6 @@ class SourceSteps:
         return Places(self.ids)
 
 
-class Places:
-    """Finds ids (N,) in their order: they rise within each recording, so runs are searched.
-
-    Where the runs of two recordings overlap (ids that `restock ingest` did not give), the ids are
-    sorted in memory.
-    """
-
-    def __init__(self, ids: Ints) -> None:
-        self._ids = ids
-        self._order: Ints | None = None
-        starts = [0]
-        for begin, end in _stretches(len(ids) - 1):
-            falls = np.flatnonzero(ids[begin + 1 : end + 1] <= ids[begin:end]) + begin + 1
-            starts += falls.tolist()
-        begins = np.array(starts, np.int64)
-        ends = np.append(begins[1:], len(ids))
-        order = np.argsort(ids[begins])
-        self._begins, self._ends = begins[order], ends[order]
-        self._first = ids[self._begins]
-        if (ids[self._ends - 1][:-1] >= self._first[1:]).any():
-            self._order = np.argsort(ids, kind="stable")
-            self._ids = ids[self._order]
-            self._begins, self._ends = np.array([0]), np.array([len(ids)])
-            self._first = self._ids[:1]
-
-    def of(self, ids: Ints) -> Ints:
-        """The place of each of these ids; -1 of one that is not there."""
-        place = np.empty(len(ids), np.int64)
-        run = np.maximum(np.searchsorted(self._first, ids, "right") - 1, 0)
-        for number in np.unique(run).tolist():
-            in_run = run == number
-            begin, end = int(self._begins[number]), int(self._ends[number])
-            place[in_run] = begin + np.searchsorted(self._ids[begin:end], ids[in_run])
-        place = np.minimum(place, len(self._ids) - 1)
-        there = self._ids[place] == ids
-        return np.where(there, place if self._order is None else self._order[place], -1)
-
-
 def _flags(rows: pa.Table, random_probability: float) -> NDArray[np.uint8]:
     # A row without a version is of the version "" of its policy.
     version = pc.coalesce(rows["behaviour_version"].cast(pa.string()), "")
@@ -146,18 +106,13 @@ def _flags(rows: pa.Table, random_probability: float) -> NDArray[np.uint8]:
     policy = codes(rows, "behaviour_policy")
     pair = policy * len(version.dictionary) + version.indices.to_numpy()
     return step_flags(
-        episode=codes(rows, "episode_id"),
+        episode=codes(rows, "episode_id").astype(np.int64),
         step_index=rows["step_index"].to_numpy(),
         policy=np.where(policy < 0, -1, pair),
         terminated=rows["terminated"].to_numpy(),
         truncated=rows["truncated"].to_numpy(),
         explored=rows["action_probability"].to_numpy() < random_probability,
     )
-
-
-def _stretches(rows: int) -> Iterator[tuple[int, int]]:
-    for begin in range(0, rows, STRETCH):
-        yield begin, min(begin + STRETCH, rows)
 
 
 def _on_disk(path: Path, dtype: Any, rows: int) -> NDArray[Any]:

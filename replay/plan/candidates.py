@@ -1,6 +1,7 @@
 """The rows a mixture may choose from: what DuckDB says of each transition, as columns.
 
-They are read as they come and put in order here: DuckDB would sort whole rows, text and all.
+They are read as they come and put in order here (`rows_in_order`): DuckDB would sort whole rows,
+text and all.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints
+from restock.arrays import Bools, Codes
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
+from restock.replay.plan.rows_in_order import RowsInOrder
 from restock.replay.plan.strata import ResolvedStratum
 
 META_COLUMNS = (
@@ -32,7 +34,6 @@ _TEXT = (
     *("task_hash", *LATER),
 )
 _CERTAIN = "list_filter(conditions, lambda held: NOT list_contains(coalesce(uncertain, []), held))"
-_CODED = pa.dictionary(pa.int32(), pa.string())
 _VIEWS = "SELECT table_name FROM information_schema.tables"
 BATCH_ROWS = 65_536  # read at a time
 # Of a view of several stores, which one a row is from (`replay.plan.stores`).
@@ -79,26 +80,26 @@ def read_candidates(
         f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
     )
     store = STORE_COLUMN if several_stores else "0"
-    rows, has_uncertain = "transitions", "false"
+    source, has_uncertain = "transitions", "false"
     if "uncertain" in connection.sql("FROM transitions LIMIT 0").columns:
         has_uncertain = "coalesce(len(uncertain) > 0, false)"
         if mixture.uncertain == "nominal":
-            rows = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
+            source = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
     query = (
         f"SELECT {meta_columns(connection)}, task_hash, episode_index, ({store})::TINYINT AS store,"
         " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
-        f" {has_uncertain} AS uncertain, {tests} FROM {rows}"
+        f" {has_uncertain} AS uncertain, {tests} FROM {source}"
     )
     try:
         with any_order(connection):
-            # Text becomes codes batch by batch: whole columns of it would be most of the memory.
             reader = connection.sql(query).to_arrow_reader(BATCH_ROWS)
-            batches = [_encoded(batch) for batch in reader]
-            schema = _schema(reader.schema)
+            rows = RowsInOrder(reader.schema, text=_TEXT, dropped=("episode_index",))
+            for batch in reader:
+                rows.add(batch)
     except duckdb.Error as error:
         _blame(connection, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
-    return _in_order(batches, schema)
+    return rows.table()
 
 
 def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
@@ -116,59 +117,6 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
         yield
     finally:
         connection.execute("RESET preserve_insertion_order")
-
-
-def _in_order(batches: list[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
-    """The rows by recording, episode and step; a column at a time, to hold one of them twice.
-
-    Empties `batches`, which are freed on the way.
-    """
-    table = pa.Table.from_batches(batches, schema).unify_dictionaries()
-    batches.clear()
-    recording = table["recording_id"].combine_chunks()
-    rank = np.empty(len(recording.dictionary), np.int64)
-    rank[pc.array_sort_indices(recording.dictionary).to_numpy()] = np.arange(len(rank))
-    keys = ("transition_id", "step_index", "episode_index")  # the id where all others are the same
-    parts = [table[name].combine_chunks().to_numpy() for name in keys]
-    order = pa.array(np.lexsort([*parts, rank[recording.indices.to_numpy()]]))
-    del recording, parts
-    columns = dict(zip(table.column_names, table.columns, strict=True))
-    del table, columns["episode_index"]
-    for name in list(columns):
-        column = columns.pop(name).combine_chunks().take(order)
-        columns[name] = _by_appearance(column) if name in _TEXT else column
-    return pa.table(columns)
-
-
-def _by_appearance(column: pa.DictionaryArray) -> pa.DictionaryArray:
-    """The same text with codes in the order of its first rows, whichever thread read them first."""
-    size, code = len(column.dictionary), column.indices.fill_null(-1).to_numpy()
-    first = np.full(size + 1, len(code))  # the last is of null
-    first[code[::-1]] = np.arange(len(code) - 1, -1, -1)
-    names = np.argsort(first[:size], kind="stable")
-    new = np.empty(size + 1, np.int32)
-    new[names] = np.arange(size)
-    indices = pa.array(new[code], mask=code < 0)
-    return pa.DictionaryArray.from_arrays(indices, column.dictionary.take(pa.array(names)))
-
-
-def _schema(schema: pa.Schema) -> pa.Schema:
-    for name in _TEXT:
-        place = schema.get_field_index(name)
-        schema = schema.set(place, schema.field(place).with_type(_CODED))
-    return schema
-
-
-def _encoded(batch: pa.RecordBatch) -> pa.RecordBatch:
-    schema = _schema(batch.schema)
-    columns = [
-        column.cast(pa.string()).dictionary_encode()
-        if field.name in _TEXT
-        # A copy: any column of DuckDB's batch holds all of it, text too.
-        else pa.concat_arrays([column, column[:0]])
-        for column, field in zip(batch.columns, schema, strict=True)
-    ]
-    return pa.RecordBatch.from_arrays(columns, schema=schema)
 
 
 def _blame(connection: duckdb.DuckDBPyConnection, predicates: dict[str, tuple[str, str]]) -> None:
@@ -286,8 +234,7 @@ def one_task(table: pa.Table) -> str:
         MixtureError: it admits none.
         StoreError: they are of several tasks.
     """
-    admitted = table.filter(table["admitted"])
-    hashes = sorted(admitted["task_hash"].unique().to_pylist())
+    hashes = sorted(table["task_hash"].filter(table["admitted"]).unique().to_pylist())
     if not hashes:
         raise MixtureError("the mixture's `where` admits no transition")
     if len(hashes) > 1:
@@ -300,10 +247,10 @@ def one_task(table: pa.Table) -> str:
     return str(hashes[0])
 
 
-def codes(table: pa.Table, name: str) -> Ints:
+def codes(table: pa.Table, name: str) -> Codes:
     """Dictionary codes of a text column, (N,); -1 for null."""
     column = table[name].combine_chunks()
-    return np.asarray(column.indices.fill_null(-1).to_numpy(), np.int64)
+    return np.asarray(column.indices.fill_null(-1).to_numpy(), np.int32)
 
 
 def bools(table: pa.Table, name: str) -> Bools:

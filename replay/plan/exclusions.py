@@ -16,6 +16,7 @@ from restock.replay.mixture.mixture import EvaluationSplit, Mixture
 from restock.replay.mixture.packed_row import GOLDEN
 from restock.replay.plan.candidates import bools, codes
 from restock.replay.plan.strata import NO_STRATUM, ResolvedStratum
+from restock.replay.plan.transition_ids import Places
 from restock.replay.store.definitions import install_repeated_rows
 from restock.words import counted
 
@@ -89,7 +90,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
 
 
 def repeats_of(
-    connection: duckdb.DuckDBPyConnection, table: pa.Table, evaluation_split: Bools
+    connection: duckdb.DuckDBPyConnection, table: pa.Table, places: Places, evaluation_split: Bools
 ) -> Bools:
     """Rows (N,) outside the evaluation split that show its steps again, under other ids.
 
@@ -107,11 +108,15 @@ def repeats_of(
         "SELECT transition_id, same_as_transition_id FROM repeated_rows(1)"
     ).to_arrow_table()
     copy, original = (found[name].to_numpy() for name in found.column_names)
-    ids = table["transition_id"].to_numpy()
-    held = ids[evaluation_split]
-    shown = np.union1d(original[np.isin(copy, held)], original[np.isin(original, held)])
-    same = np.concatenate([shown, copy[np.isin(original, shown)]])
-    repeated = np.isin(ids, same) & ~evaluation_split
+
+    def held(ids: Ints) -> Bools:
+        place = places.of(ids)  # of a row that is not among the candidates: -1
+        return np.asarray((place >= 0) & evaluation_split[place], np.bool_)
+
+    shown = np.union1d(original[held(copy)], original[held(original)])
+    same = places.of(np.concatenate([shown, copy[np.isin(original, shown)]]))
+    repeated[same[same >= 0]] = True
+    repeated &= ~evaluation_split
     episode = codes(table, "episode_id")
     whole = np.bincount(episode[repeated], minlength=1) >= EPISODE_REPEATS
     repeated |= np.isin(episode, np.flatnonzero(whole)) & ~evaluation_split

@@ -15,6 +15,7 @@ import duckdb
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from restock.arrays import F32, Bools, Ints
@@ -53,6 +54,7 @@ from restock.replay.plan.strata import (
     least_steps,
     resolve_strata,
 )
+from restock.replay.plan.transition_ids import Places
 from restock.replay.plan.weights import RatioFit, effective_count
 
 LOGS = "logs"  # the name of the first store's part
@@ -119,9 +121,8 @@ def plan_panel(
     if not mixture.odometry_as_command:
         table, measured = without_measured_actions(connection, table)
     task_hash = one_task(table)
-    ids = table["transition_id"].to_numpy()
-    in_order = np.sort(ids)
-    if twice := int((in_order[1:] == in_order[:-1]).sum()):
+    places = Places(table["transition_id"].to_numpy())
+    if twice := places.twice:
         raise StoreError(
             f"{twice} transition ids occur twice",
             remedy="`restock audit` names them; ingest those recordings again",
@@ -141,7 +142,7 @@ def plan_panel(
         else nanoseconds(mixture.as_of)
     )
     out = leave_out(table, mixture, split, as_of_ns)
-    out.add("same steps as the evaluation split", repeats_of(connection, table, split.held))
+    out.add("same steps as the evaluation split", repeats_of(connection, table, places, split.held))
     if measured:
         out.reasons["odometry in place of a command"] = measured
     for other in others:
@@ -205,7 +206,7 @@ def _dealt(
     """Strata (N,) and those of the state alone with each episode at its rarest, store by store."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     stratum, state_code = stratum.copy(), state_code.copy()
-    for number in np.unique(store).tolist():
+    for number in pc.unique(table["store"]).to_pylist():
         at = np.flatnonzero(store == number)
         given = deal_episodes(stratum[at], member[at], episode[at], strata, counted[at])
         stratum[at] = as_dealt(stratum[at], given, episode[at], strata)

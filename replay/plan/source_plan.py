@@ -9,7 +9,7 @@ import duckdb
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.shares import SharePlan, missing_rows, plan_shares
@@ -40,7 +40,7 @@ class SourceRows:
     state_code: NDArray[np.int16]  # the one their state alone would put them in
     transition_id: Ints
     action: Ints
-    episode: Ints
+    episode: Codes
     hours: float  # of logging that its store is of
 
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import Bools, Ints
+from restock.arrays import Bools, Codes, Ints
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import NOMINAL, Condition, of_kind
 from restock.replay.mixture.mixture import (
@@ -188,7 +188,7 @@ def assign(
 def deal_episodes(
     code: NDArray[np.int16],
     member: Bools,
-    episode: Ints,
+    episode: Codes,
     strata: Sequence[ResolvedStratum],
     counted: Bools,
 ) -> NDArray[np.int16]:
@@ -209,7 +209,11 @@ def deal_episodes(
     rows = np.flatnonzero(np.isin(code, dealt))
     if not len(rows):
         return given
-    names, first, place = np.unique(episode[rows], return_index=True, return_inverse=True)
+    here = episode[rows]
+    first_of = np.full(len(given), -1, np.int64)
+    first_of[here[::-1]] = np.arange(len(rows) - 1, -1, -1)
+    names = np.flatnonzero(first_of >= 0)
+    first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[here]
     may = member[rows[first]][:, dealt]  # (n episodes, K)
     size = np.bincount(place, weights=counted[rows]).astype(np.int64)
     taken = np.zeros(len(names), np.bool_)
@@ -236,7 +240,7 @@ def deal_episodes(
 def as_dealt(
     code: NDArray[np.int16],
     given: NDArray[np.int16],
-    episode: Ints,
+    episode: Codes,
     strata: Sequence[ResolvedStratum],
 ) -> NDArray[np.int16]:
     """Strata (N,) by priority with those of `deal_episodes` in place of the other dealt ones."""

@@ -5,12 +5,15 @@ Their shapes stand in comments, where they are declared.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Codes = NDArray[np.signedinteger[Any]]  # of texts, in as few bytes as it takes
 Bools = NDArray[np.bool_]
 
 
@@ -22,4 +25,4 @@ def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return result
 
 
-__all__ = ["F32", "F64", "Bools", "Ints", "splitmix64"]
+__all__ = ["F32", "F64", "Bools", "Codes", "Ints", "splitmix64"]

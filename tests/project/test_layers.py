@@ -54,7 +54,9 @@ MAY_IMPORT = {
         "replay panel store ingest/containers ingest/decoding ingest/profile ingest/steps"
         " ingest/store ingest/task"
     ),
-    "replay/export": "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task",
+    "replay/export": (
+        "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task"
+    ),
     "train": (
         "dqn evaluation evaluation/off_policy feed run twin/env twin/floors twin/physics"
         " replay/fleet replay/mixture replay/panel replay/ring replay/sampling replay/store"
@@ -102,8 +104,8 @@ MAY_IMPORT = {
     "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
     "report/look": "",
     "report/run": (
-        "look replay/panel replay/plan replay/store train/evaluation train/run train/twin/calibration"
-        " train/twin/floors train/twin/survey"
+        "look replay/panel replay/plan replay/store train/evaluation train/run"
+        " train/twin/calibration train/twin/floors train/twin/survey"
     ),
     "report/fleet": "look replay/fleet replay/store",
     "report/study": "look",

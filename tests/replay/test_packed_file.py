@@ -1,0 +1,127 @@
+"""The file of packed rows: whatever order their parts come in, the same bytes and checksum."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.errors import PanelError
+from restock.replay.panel import packed_file
+from restock.replay.panel.packed_file import PackedFile
+from restock.replay.panel.seal import FileRecord, Leaves, checksum, sample_checksum
+
+WIDTH = 5
+HALVES = (slice(0, 2), slice(2, WIDTH))
+
+
+def small_blocks(patch: pytest.MonkeyPatch, held_blocks: int) -> None:
+    patch.setattr(packed_file, "BLOCK_ROWS", 8)
+    patch.setattr(packed_file, "HELD_BYTES", held_blocks * 8 * WIDTH * 4)
+    patch.setattr(packed_file, "WAITING_BYTES", 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 90), st.integers(0, 4), st.integers(0, 2**32), st.integers(1, 40))
+def test_parts_in_any_order_make_the_same_file(
+    tmp_path_factory: pytest.TempPathFactory, count: int, held: int, seed: int, at_once: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(count, WIDTH)).astype("<f4")
+    path = tmp_path_factory.mktemp("packed") / "rows"
+    puts = [
+        (part, some)
+        for part in HALVES
+        for some in np.split(rng.permutation(count), range(at_once, count, at_once))
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        small_blocks(patch, held)
+        with PackedFile(path, count, WIDTH, parts=2) as file:
+            for place in rng.permutation(len(puts)).tolist():
+                part, some = puts[place]
+                file.put(some, (part, rows[some, part]))
+            record = file.finish()
+    assert path.read_bytes() == rows.tobytes()
+    assert record.bytes == rows.nbytes
+    assert record.leaf_bytes == 8 * WIDTH * 4
+    record.check(path, verify=True)
+
+
+def test_every_changed_byte_is_found(tmp_path: Path) -> None:
+    content = np.random.default_rng(0).bytes(4 * 100 + 7)
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    record = FileRecord(len(content), checksum(path, 100), sample_checksum(path), 100)
+    record.check(path, verify=True)
+    for place in range(0, len(content), 13):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        with pytest.raises(PanelError, match="checksum"):
+            record.check(path, verify=True)
+
+
+def test_leaves_that_changed_places_are_found(tmp_path: Path) -> None:
+    path, content = tmp_path / "file", b"a" * 100 + b"b" * 100
+    path.write_bytes(content)
+    before = checksum(path, 100)
+    path.write_bytes(content[100:] + content[:100])
+    assert checksum(path, 100) != before
+    assert checksum(path, 50) != checksum(path, 100)
+
+
+def test_the_checksum_is_that_of_blake2_in_tree_mode(tmp_path: Path) -> None:
+    path, content = tmp_path / "file", bytes(range(250))
+    path.write_bytes(content)
+    tree = {"digest_size": 16, "fanout": 0, "depth": 2, "leaf_size": 100, "inner_size": 16}
+    leaves = [
+        hashlib.blake2b(content[100 * n : 100 * n + 100], **tree, node_offset=n, last_node=n == 2)
+        for n in range(3)
+    ]
+    joined = b"".join(leaf.digest() for leaf in leaves)
+    root = hashlib.blake2b(joined, **tree, node_depth=1, last_node=True).hexdigest()
+    assert checksum(path, 100) == root
+    found = Leaves(len(content), 100)
+    for n in (2, 0, 1):
+        found.add(n, memoryview(content)[100 * n : 100 * n + 100])
+    assert found.root() == root
+
+
+def test_a_record_of_an_older_restock_is_checked_as_it_was_made(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"rows")
+    whole = hashlib.blake2b(b"rows", digest_size=16).hexdigest()
+    record = FileRecord(4, whole, sample_checksum(path))
+    record.check(path, verify=True)
+    path.write_bytes(b"Rows")
+    with pytest.raises(PanelError, match="checksum"):
+        record.check(path, verify=True)
+
+
+def test_a_row_that_never_came_is_an_error(tmp_path: Path) -> None:
+    rows = np.zeros((20, WIDTH), np.float32)
+    with PackedFile(tmp_path / "rows", 20, WIDTH, parts=2) as file:
+        file.put(np.arange(20), (HALVES[0], rows[:, HALVES[0]]))
+        file.put(np.arange(19), (HALVES[1], rows[:19, HALVES[1]]))
+        with pytest.raises(PanelError, match="changed while it was read"):
+            file.finish()
+
+
+def test_a_full_disk_is_said_by_whoever_fills_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    small_blocks(monkeypatch, 2)
+    monkeypatch.setattr(os, "pwrite", full)
+    rows = np.zeros((8_000, WIDTH), np.float32)
+    with (
+        pytest.raises(OSError, match="No space left"),
+        PackedFile(tmp_path / "rows", len(rows), WIDTH, parts=1) as file,
+    ):
+        file.put(np.arange(len(rows)), (slice(0, WIDTH), rows))

@@ -1,0 +1,130 @@
+"""Candidates put in order: the same table whatever batches their rows came in."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock.replay.plan import rows_in_order
+from restock.replay.plan.rows_in_order import KEYS, RowsInOrder
+
+TEXT = ("recording_id", "episode_id", "zone")
+BY = [("recording_id", "ascending"), *((key, "ascending") for key in KEYS)]
+
+
+def rows_of(recordings: int, episodes: int, steps: int) -> pa.Table:
+    """Recordings whose ids do not lie in the order of their names; one zone in three is null."""
+    rng = np.random.default_rng(recordings * 100 + steps)
+    count = recordings * episodes * steps
+    recording = np.repeat(np.arange(recordings), episodes * steps)
+    episode = np.tile(np.repeat(np.arange(episodes), steps), recordings)
+    zones = [["aisle", "dock", None][n] for n in rng.integers(0, 3, count)]
+    names = [f"{(7 * n) % 11:x}-{n}" for n in recording.tolist()]
+    return pa.table(
+        {
+            "recording_id": names,
+            "episode_id": [f"{a}/{b}" for a, b in zip(names, episode.tolist(), strict=True)],
+            "episode_index": pa.array(episode, pa.int32()),
+            "step_index": pa.array(np.tile(np.arange(steps), recordings * episodes), pa.int32()),
+            "transition_id": (recording.astype(np.int64) << 32) + np.arange(count),
+            "zone": pa.array(zones, pa.string()),
+            "reward": pa.array(rng.normal(size=count), pa.float32()),
+            "terminated": rng.integers(0, 2, count).astype(bool),
+        }
+    )
+
+
+def in_order(batches: list[pa.RecordBatch], schema: pa.Schema) -> pa.Table:
+    rows = RowsInOrder(schema, text=TEXT, dropped=("episode_index",))
+    for batch in batches:
+        rows.add(batch)
+    return rows.table()
+
+
+def expected(table: pa.Table) -> pa.Table:
+    return table.sort_by(BY).drop_columns(["episode_index"])
+
+
+def check(found: pa.Table, table: pa.Table) -> None:
+    wanted = expected(table)
+    assert found.column_names == wanted.column_names
+    assert found.to_pylist() == wanted.to_pylist()
+    for name in TEXT:  # codes in the order of the first rows that have them
+        values = [value for value in wanted[name].to_pylist() if value is not None]
+        column = found[name].combine_chunks()
+        assert column.dictionary.to_pylist() == list(dict.fromkeys(values))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(1, 5),
+    st.integers(1, 4),
+    st.integers(1, 9),
+    st.lists(st.integers(1, 60), max_size=6),
+    st.randoms(use_true_random=False),
+    st.sampled_from(["files", "batches", "rows"]),
+    st.booleans(),
+)
+def test_any_batches_in_any_order_give_the_same_table(
+    recordings: int,
+    episodes: int,
+    steps: int,
+    cuts: list[int],
+    random: object,
+    mixed: str,
+    few: bool,
+) -> None:
+    table = rows_of(recordings, episodes, steps)
+    if mixed == "rows":
+        order = list(range(len(table)))
+        random.shuffle(order)  # type: ignore[attr-defined]
+        table = table.take(pa.array(order))
+    ends = sorted({min(cut, len(table)) for cut in np.cumsum([0, *cuts]).tolist()} | {len(table)})
+    batches = [
+        batch
+        for begin, end in itertools.pairwise(ends)
+        for batch in table.slice(begin, end - begin).combine_chunks().to_batches()
+    ]
+    if mixed == "batches":
+        random.shuffle(batches)  # type: ignore[attr-defined]
+    with pytest.MonkeyPatch.context() as patch:
+        if few:  # short stretches: rows are sorted
+            patch.setattr(rows_in_order, "MOST_STRETCHES", 0)
+        check(in_order(batches, table.schema), table)
+
+
+def test_stretches_that_overlap_are_sorted() -> None:
+    table = rows_of(2, 2, 6)
+    odd, even = (table.take(pa.array(range(begin, len(table), 2))) for begin in (1, 0))
+    batches = [part.combine_chunks().to_batches()[0] for part in (odd, even)]
+    check(in_order(batches, table.schema), table)
+
+
+@pytest.mark.parametrize("names", [1, 127, 128, 129, 32_768, 32_769])
+def test_codes_are_as_wide_as_their_dictionary_needs(names: int) -> None:
+    count = names + 3
+    table = pa.table(
+        {
+            "recording_id": ["r"] * count,
+            "episode_id": [f"e{min(n, names - 1)}" for n in range(count)],
+            "episode_index": pa.array(np.zeros(count), pa.int32()),
+            "step_index": pa.array(range(count), pa.int32()),
+            "transition_id": pa.array(range(count), pa.int64()),
+            "zone": pa.array([None] * count, pa.string()),
+        }
+    )
+    batches = table.to_batches(max_chunksize=max(count // 3, 1))
+    found = in_order(batches[::-1], table.schema)
+    check(found, table)
+    bits = 8 if names <= 128 else 16 if names <= 32_768 else 32
+    assert found["episode_id"].type.index_type.bit_width == bits
+
+
+def test_no_rows() -> None:
+    table = rows_of(1, 1, 1).slice(0, 0)
+    assert in_order([], table.schema).num_rows == 0
