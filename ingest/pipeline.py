@@ -228,6 +228,7 @@ class _Ingest:
             "labels_version": table["labels_version"][0].as_py(),
             "corrections": correction_rows(self.corrections),
         }
+        steps = steps.without_values()
         kept = kept_frames(steps.cameras, rows.tick)
         path = own_path(provenance.recording_id, self.ingest_id)
         file = path if sum(len(one.row) for one in kept) else ""

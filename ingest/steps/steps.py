@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.camera.frames import CameraFrames
@@ -48,6 +50,29 @@ class Steps:
 
     def __len__(self) -> int:
         return len(self.segment)
+
+    def without_values(self) -> Steps:
+        """What is known of the recording as a whole: what is known at each tick, most of the
+        memory, is gone."""
+        ticks, flags = np.zeros(0, np.int64), np.zeros(0, np.bool_)
+        return replace(
+            self,
+            signals={},
+            segment=ticks,
+            follows=flags,
+            break_reason=[],
+            problem=[],
+            route_problem=[],
+            routing=Routing.none(0),
+            action=ticks,
+            residual=np.zeros(0),
+            policy=[],
+            policy_version=[],
+            probability=[],
+            truth=[],
+            true_exposure=[],
+            perturbed=Perturbed.unknown(0),
+        )
 
 
 def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import TypeVar
 
+import numpy as np
 import pyarrow as pa
 from deltalake import CommitProperties, DeltaTable, Schema, Transaction
 from deltalake.exceptions import CommitFailedError, DeltaError
@@ -273,3 +274,20 @@ def delta_columns(schema: pa.Schema) -> pa.Schema:
             for field in schema
         ]
     )
+
+
+def plain_lists(rows: pa.Table) -> pa.Table:
+    """The same rows with `delta_columns`; the lists' values stay where they are."""
+    schema = delta_columns(rows.schema).with_metadata(rows.schema.metadata)
+    columns = []
+    for field, column in zip(schema, rows.columns, strict=True):
+        if pa.types.is_fixed_size_list(column.type) and not column.null_count:
+            column = pa.chunked_array([_plain(c, field.type) for c in column.chunks], field.type)
+        columns.append(column)
+    return pa.table(columns, schema=schema)
+
+
+def _plain(lists: pa.FixedSizeListArray, kind: pa.DataType) -> pa.ListArray:
+    size = lists.type.list_size
+    offsets = pa.array(np.arange(len(lists) + 1) * size, pa.int32())
+    return pa.ListArray.from_arrays(offsets, lists.flatten(), type=kind)

@@ -23,8 +23,30 @@ WITH own_signals AS (
         FROM recordings
     )
 ), cleared AS (
+    -- By name: what is windowed below is kept in memory as a whole, with texts that no row needs.
     SELECT
-        * EXCLUDE (observation, next_observation),
+        recording_id,
+        episode_id,
+        step_index,
+        stamp_ns,
+        pose_stamp_ns,
+        pose_yaw_rad,
+        wheel_speed_mps,
+        wheel_yaw_rate_radps,
+        gyro_yaw_rate_radps,
+        accel_x_mps2,
+        localised_speed_mps,
+        localised_lateral_mps,
+        command_speed_mps,
+        command_yaw_rate_radps,
+        clearance_m,
+        clearance_ahead_m,
+        reward,
+        conditions,
+        top_mps,
+        top_radps,
+        period_s,
+        range_max_m,
         list_transform(
             observation[13 + actions:12 + actions + sectors], lambda nearness: nearness * nearness * range_max_m
         ) AS sector_m

@@ -27,7 +27,7 @@ LEAST_HASHES = 3  # that two recordings must share
 LARGELY = 0.5  # of the smaller recording's rows
 # Replaced meanwhile, or damaged: no fault of the recording that is being ingested.
 UNREADABLE = (OSError, StoreError, pa.ArrowException)
-PART_ROWS = 8192  # hashed at a time: bounds memory
+PART_ROWS = 2048  # hashed at a time: bounds memory
 _LARGE = 2e15  # what stands for infinity
 Hashes = NDArray[np.uint64]
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import atexit
 import re
+from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from itertools import pairwise
 from typing import Any
 
 import duckdb
@@ -23,6 +25,16 @@ from restock.ingest.task.schema import COLUMNS
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 VERSION = 3  # of summary.sql: a summary by another one is not used
+# Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
+STRETCH_ROWS = 16_384
+# Tables whose rows are made of one episode's each, by queries of their names, and their order.
+BY_EPISODE = {
+    "measured_signals": "episode_id, signal",
+    "flawed_rows": "transition_id",
+    "zone_steps": "ALL",
+    "condition_steps": "ALL",
+}
+WIDE = ("observation", "next_observation")  # columns that only those look at
 
 
 def _rows_of(**columns: pa.DataType) -> pa.DataType:
@@ -111,19 +123,21 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
         "sketch": sketch(hashes).decode(),
         "packed_ends": ((rows.schema.metadata or {}).get(ENDS) or b"").decode() or None,
     }
+    in_order = np.argsort(at)
+    tables = {
+        "distinctive_rows": pa.table(
+            {
+                "transition_id": rows["transition_id"].take(pa.array(at[in_order])),
+                "content": hashes[in_order].view(np.int64),
+            }
+        )
+    }
     with _database().cursor() as connection:  # with temporary tables of its own
-        connection.register("transitions", _complete(rows))
         connection.register("recordings", manifest)
+        rows = _complete(rows)
+        tables |= _of_episodes(connection, rows)
+        connection.register("transitions", rows.drop_columns(list(WIDE)))
         connection.execute(_definitions())
-        in_order = np.argsort(at)
-        tables = {
-            "distinctive_rows": pa.table(
-                {
-                    "transition_id": rows["transition_id"].take(pa.array(at[in_order])),
-                    "content": hashes[in_order].view(np.int64),
-                }
-            )
-        }
         tables |= {n: connection.table(n).to_arrow_table() for n in TABLES.keys() - tables.keys()}
     for field in SUMMARY_SCHEMA:
         column = (
@@ -143,6 +157,39 @@ def _complete(rows: pa.Table) -> pa.Table:
     return rows
 
 
+def _of_episodes(connection: duckdb.DuckDBPyConnection, rows: pa.Table) -> dict[str, pa.Table]:
+    """The tables BY_EPISODE, which are made some whole episodes at a time: an episode's rows of
+    them depend on its own steps alone. A window over all steps would hold them all twice."""
+    begun = False
+    for stretch in _whole_episodes(rows):
+        connection.register("transitions", stretch)
+        for name in BY_EPISODE:
+            into = f"INSERT INTO {name}" if begun else f"CREATE TEMP TABLE {name} AS"
+            connection.execute(f"{into}\n{_query(name)}")
+        begun = True
+    return {
+        name: connection.sql(f"FROM {name} ORDER BY {order}").to_arrow_table()
+        for name, order in BY_EPISODE.items()
+    }
+
+
+def _whole_episodes(rows: pa.Table) -> Iterator[pa.Table]:
+    """The rows, about STRETCH_ROWS at a time, none of an episode in two of them; all at once where
+    an episode's rows do not lie together."""
+    coded = rows["episode_id"].combine_chunks().dictionary_encode()
+    codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    begins = np.flatnonzero(np.diff(codes)) + 1
+    cuts = begins[np.flatnonzero(np.diff(begins // STRETCH_ROWS)) + 1].tolist()
+    if len(begins) >= len(np.unique(codes)):
+        cuts = []
+    for first, stop in pairwise([0, *cuts, len(rows)]):
+        stretch = rows.slice(first, stop - first)
+        for name in WIDE:  # of many chunks, each of which is a batch for DuckDB
+            place = stretch.schema.get_field_index(name)
+            stretch = stretch.set_column(place, name, stretch[name].combine_chunks())
+        yield stretch
+
+
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:
     """A recording's rows with the ends of their episodes, from its manifest, in their metadata."""
     metadata = {ENDS: packed_ends.encode()} if packed_ends else None
@@ -159,6 +206,11 @@ def _database() -> duckdb.DuckDBPyConnection:
 @cache
 def _definitions() -> str:
     return with_included("-- include: summary.sql")
+
+
+@cache
+def _query(name: str) -> str:
+    return with_included(f"-- include: {name}.sql")
 
 
 def with_included(text: str, beside: Traversable | None = None) -> str:

@@ -1,6 +1,7 @@
 -- What the common views need of a recording, from its `transitions` and its manifest (`recordings`). Kept
 -- in its manifest; summaries.sql adds them up over the store. Cells are counted as views.sql, which scans,
--- counts them: a test holds that both give the same.
+-- counts them: a test holds that both give the same. What is of one episode alone (measured_signals,
+-- flawed_rows, zone_steps, condition_steps) has files of its own: it is worked out some episodes at a time.
 CREATE TEMP TABLE steps AS
 SELECT
     *,
@@ -79,19 +80,3 @@ SELECT condition, action, count(*) AS rows FROM held GROUP BY condition, action 
 
 CREATE TEMP TABLE held_episodes AS
 SELECT condition, count(DISTINCT episode_id) AS episodes FROM held GROUP BY condition ORDER BY ALL;
-
-CREATE TEMP TABLE measured_signals AS
--- include: measured_signals.sql
-ORDER BY episode_id, signal;
-
-CREATE TEMP TABLE flawed_rows AS
--- include: flawed_rows.sql
-ORDER BY transition_id;
-
-CREATE TEMP TABLE zone_steps AS
--- include: zone_steps.sql
-ORDER BY ALL;
-
-CREATE TEMP TABLE condition_steps AS
--- include: condition_steps.sql
-ORDER BY ALL;

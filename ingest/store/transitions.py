@@ -22,6 +22,7 @@ from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import (
     COVERAGE,
+    PROVENANCE,
     STEP_BITS,
     signal_columns,
     transition_ids,
@@ -31,6 +32,7 @@ from restock.ingest.task.task import observe, reward
 
 # Columns that rows of an older store may lack.
 _LATER = {column.name: pa.field(column.name, column.type) for column in COVERAGE if column.nullable}
+_WIDE = "sector_clearance_m"  # the one signal of many numbers a step
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,31 @@ def recording_table(
         RecordingError: as `transitions`.
     """
     tables, ends, parts = [], [], []
+    same: dict[str, pa.ChunkedArray] = {}  # the longest so far of each column of one value
     for group in groups(episodes):
         rows = episode_rows(profile, steps, episodes, group)
-        tables.append(transitions(profile, steps, episodes, rows, provenance))
+        made = transitions(profile, steps, episodes, rows, provenance)
+        tables.append(_sharing(made, same))
+        del made
         ends.append(rows.ends_table())
         parts.append(rows.without_signals())
         done(int(rows.tick.max()) + 1)
     table = pa.concat_tables(tables)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
     return table.replace_schema_metadata(metadata), EpisodeRows.join(parts)
+
+
+def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
+    """The rows with their columns of one value, the same in every group, over one memory."""
+    for name in ("recording_id", *(column.name for column in PROVENANCE)):
+        longest = same.setdefault(name, rows[name])
+        if len(longest) < len(rows):
+            same[name] = rows[name]
+        else:
+            place = rows.schema.get_field_index(name)
+            column = longest.slice(0, len(rows))
+            rows = rows.set_column(place, rows.schema.field(place), column)
+    return rows
 
 
 def transitions(
@@ -108,9 +126,10 @@ def transitions(
     tick = rows.tick[begin]
     previous_tick = rows.tick - steps.follows[rows.tick]
     previous_action = np.where(steps.follows[rows.tick], steps.action[previous_tick], 0)
-    before = {name: column[previous_tick] for name, column in steps.signals.items()}
-    now = {name: column[begin] for name, column in rows.signals.items()}
-    after = {name: column[begin + 1] for name, column in rows.signals.items()}
+    before = {_WIDE: steps.signals[_WIDE][previous_tick]}
+    narrow = {name: column for name, column in rows.signals.items() if name != _WIDE}
+    now = {name: column[begin] for name, column in narrow.items()}
+    after = {name: column[begin + 1] for name, column in narrow.items()}
     progress_m = steps.routing.progress_m(task, steps.routing.plan[tick], now, after)
     terminates = np.array([episode.terminated for episode in episodes.episodes], np.bool_)
     values = TransitionValues(
@@ -152,16 +171,17 @@ def transition_table(
     # The twin evaluates no condition over signals that it does not fill.
     evaluated = [one for one in profile.conditions if one.name in rows.labels]
     named = primary(rows.labels, evaluated) or [NOMINAL] * len(rows.tick)
+    observation, next_observation = _vectors(values.observation, begin)
     columns: dict[str, Any] = {
         "transition_id": transition_ids(provenance.recording_id, tick),
         "recording_id": provenance.recording_id,
         "episode_id": [f"{provenance.recording_id}/{e}" for e in rows.episode[begin]],
         "episode_index": rows.episode[begin],
         "step_index": rows.step[begin],
-        "observation": _vectors(values.observation[begin]),
+        "observation": observation,
         "action": values.action,
         "reward": values.reward,
-        "next_observation": _vectors(values.observation[begin + 1]),
+        "next_observation": next_observation,
         "terminated": last & values.terminates,
         "truncated": last & ~values.terminates,
         "condition": [named[row] for row in begin],
@@ -200,12 +220,27 @@ def _sorted_truth(text: str | None) -> str | None:
     return None if text is None else truth_text(true_names(text))
 
 
-def _vectors(rows: NDArray[np.float32]) -> pa.Array:
-    """(N, D) float32 to a fixed-size list array, without a copy of each row."""
-    size = rows.shape[1]
-    flat = pa.array(np.ascontiguousarray(rows, np.float32).reshape(-1))
+def _vectors(
+    observation: NDArray[np.float32], begin: Ints
+) -> tuple[pa.ChunkedArray, pa.ChunkedArray]:
+    """What is observed (R, D) at the steps that begin a transition (N,), and at those after them.
+
+    Two columns of fixed-size lists over the same memory, a chunk an episode: all but the first and
+    the last observation of an episode are in both.
+    """
+    size = observation.shape[1]
+    flat = pa.array(np.ascontiguousarray(observation, np.float32).reshape(-1))
     kind = pa.list_(pa.field("element", pa.float32()), size)
-    return pa.FixedSizeListArray.from_arrays(flat, type=kind)
+    edges = np.flatnonzero(np.diff(begin) > 1) + 1
+    runs = [(int(run[0]), len(run)) for run in np.split(begin, edges) if len(run)]
+
+    def column(later: int) -> pa.ChunkedArray:
+        parts = (flat.slice((first + later) * size, count * size) for first, count in runs)
+        return pa.chunked_array(
+            [pa.FixedSizeListArray.from_arrays(part, type=kind) for part in parts], kind
+        )
+
+    return column(0), column(1)
 
 
 def column_array(values: Any, kind: pa.DataType, count: int) -> pa.Array:

@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from restock.errors import StoreError
-from restock.ingest.store.commits import TableCommits, delta_columns, recording_columns
+from restock.ingest.store.commits import TableCommits, delta_columns, plain_lists, recording_columns
 from restock.ingest.store.data_files import AddedFile, parquet_options, written_whole
 from restock.ingest.store.lineage import own_path, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
@@ -282,7 +282,7 @@ class StoreWriter(TableCommits):
 
         Lists of fixed size become plain lists, which every engine that knows Delta reads.
         """
-        rows = rows.cast(delta_columns(rows.schema).with_metadata(rows.schema.metadata))
+        rows = plain_lists(rows)
         options = parquet_options(rows.schema)
         with written_whole(self.path, path):
             return self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)

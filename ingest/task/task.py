@@ -178,7 +178,10 @@ class Mirror:
 
 
 def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:
-    """The observation at t, (N, D) float32, from signals at t and t - 1 and the action before t."""
+    """The observation at t, (N, D) float32, from signals at t and t - 1 and the action before t.
+
+    Of the signals at t - 1 it takes `sector_clearance_m` alone.
+    """
     near = np.arctan2(now["waypoint_near_y_m"], now["waypoint_near_x_m"])
     far = np.arctan2(now["waypoint_far_y_m"], now["waypoint_far_x_m"])
     routed = 1.0 if task.goal == "route" else 0.0  # without a goal these entries are all zero
