@@ -82,7 +82,7 @@ class ChunkReader:
     def __init__(self, file: FileBytes, checks: Checks, cut: Chunk | None) -> None:
         self.walked: dict[int, Positions] = {}  # chunk.at -> its messages, where it has no index
         self._file, self._checks, self._cut = file, checks, cut
-        self._scratch = [np.zeros(0, np.uint8) for _ in range(AHEAD + 1)]
+        self._scratch = _no_scratch()
 
     def inflate(self, chunk: Chunk) -> bytes:
         """One chunk's records; nothing where they cannot be read."""
@@ -118,6 +118,7 @@ class ChunkReader:
                 else:
                     self._checks.lost(chunk, bad)
             yield from self._messages(inflated.buffer, inflated.parts, wanted)
+        self._scratch = _no_scratch()  # the file stays open while rows are made
 
     def _messages(
         self, buffer: NDArray[np.uint8], parts: list[_Part], wanted: set[int]
@@ -219,6 +220,10 @@ class ChunkReader:
         if cut and chunk is not self._cut:
             self._checks.damaged(f"chunk at byte {chunk.at:,}: {cut}", {})
         return positions
+
+
+def _no_scratch() -> list[NDArray[np.uint8]]:
+    return [np.zeros(0, np.uint8) for _ in range(AHEAD + 1)]
 
 
 def _ahead(works: Iterable[Callable[[int], _Inflated]]) -> Iterator[_Inflated]:

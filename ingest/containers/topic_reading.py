@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from restock.arrays import Ints
 from restock.ingest.containers.compression import decompressed
 from restock.ingest.decoding.columns import (
     FieldColumn,
@@ -92,7 +93,8 @@ class TopicReading:
         self._account = Account(topic.name, topic.type, topic.expected)
         self._wanted, self._reduction = list(dict.fromkeys(wanted)), reduction
         no_times = np.zeros(0, np.int64)
-        self._log, self._publish = GrowingArray(no_times), GrowingArray(no_times)
+        self._log = GrowingArray(no_times)
+        self._publish: GrowingArray | None = None  # None while all are sent when they are logged
         self._fields: dict[str, GrowingArray | GrowingRagged] = {}
         self.decodable = False
 
@@ -132,10 +134,17 @@ class TopicReading:
         decoded = decode(batch)
         self._add(decoded.bad)
         account.decoded += len(decoded.rows)
-        self._log.add(batch.log_time_ns[decoded.rows], account.expected)
-        self._publish.add(batch.publish_time_ns[decoded.rows], account.expected)
+        self._add_times(batch.log_time_ns[decoded.rows], batch.publish_time_ns[decoded.rows])
         for path, column in self._kept(decoded.fields).items():
             self._fields[path].add(column, account.expected)
+
+    def _add_times(self, log_ns: Ints, publish_ns: Ints) -> None:
+        if self._publish is None and not np.array_equal(log_ns, publish_ns):
+            self._publish = GrowingArray(log_ns[:0])
+            self._publish.add(self._log.column(), self._account.expected)
+        self._log.add(log_ns, self._account.expected)
+        if self._publish is not None:
+            self._publish.add(publish_ns, self._account.expected)
 
     def _kept(self, fields: Fields) -> dict[str, FieldColumn]:
         kept = {path: fields[path] for path in self._wanted}
@@ -158,13 +167,16 @@ class TopicReading:
 
     def columns(self) -> TopicColumns:
         """All of it, in the order of log time."""
-        log, publish = self._log.column(), self._publish.column()
+        log = self._log.column()
         fields: dict[str, FieldColumn] = {}
         order = None
         self._account.log_backsteps = int((log[1:] < log[:-1]).sum())
         if self._account.log_backsteps:
             order = np.argsort(log, kind="stable")
-            log, publish = log[order], publish[order]
+            log = log[order]
+        publish = log
+        if self._publish is not None:
+            publish = self._publish.column() if order is None else self._publish.column()[order]
         for path in list(self._fields):  # one by one: the unordered column is freed first
             column = self._fields.pop(path).column()
             fields[path] = column if order is None else take(column, order)

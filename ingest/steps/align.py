@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
 TOLERANCE_S = 0.1  # half a control period
+Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
 
 
 @dataclass(frozen=True)
@@ -122,52 +123,59 @@ def align(
         topics = {name: columns for name, columns in topics.items() if name != CLOCK_TOPIC}
     else:
         simulated = None
+    every = np.arange(max(map(len, topics.values()), default=0))  # shared by all topics
     if clock.alignment == "log_time":
-        samples = {name: _ordered(c.log_time_ns, np.arange(len(c))) for name, c in topics.items()}
+        samples = {name: _ordered(c.log_time_ns, every[: len(c)]) for name, c in topics.items()}
         return [ClockSegment(samples, 0)], report
-    delay = delays(topics, latched | transforms)
-    if not delay:
+    stamped = stamped_topics(topics, latched | transforms)
+    if not stamped:
         raise RecordingError(
             "none of the profile's topics has a header stamp",
             remedy='set [clock] alignment = "log_time" in the profile',
         )
-    reference = max(delay, key=lambda name: (len(delay[name]), name))
-    edges = jumps(topics[reference].log_time_ns, delay[reference], round(clock.jump_s * NS))
+    reference = max(stamped, key=lambda name: (len(stamped[name]), name))
+    log_time_ns = topics[reference].log_time_ns
+    edges = jumps(log_time_ns, delay_ns(topics[reference]), round(clock.jump_s * NS))
     report.jumps = len(edges)
     drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
     segments = []
     for index in range(len(edges) + 1):
-        inside = {
-            name: np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
-            for name, columns in topics.items()
-        }
-        clock_map, middle = drifts.map_of(topics, delay, reference, inside, edges, index)
+        inside = {name: _during(edges, index, columns) for name, columns in topics.items()}
+        clock_map, middle = drifts.map_of(topics, stamped, reference, inside, edges, index)
         segments.append(
-            _segment(topics, inside, clock_map, middle, clock, latched, transforms, report)
+            _segment(topics, inside, every, clock_map, middle, clock, latched, transforms, report)
         )
     report.offset_ns = segments[0].offset_ns
     if report.mapped_by is None:
-        report.spread_ns = spread_ns(delay[reference])
+        report.spread_ns = spread_ns(delay_ns(topics[reference]))
     _carry_latched(segments, latched)
     return segments, report
 
 
 def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
     """Whether the stamps of the topic with most of them run at another pace than log time."""
-    delay = delays(topics, frozenset())
-    reference = max(delay, key=lambda name: len(delay[name]), default=None)
+    stamped = stamped_topics(topics, frozenset())
+    reference = max(stamped.values(), key=len, default=None)
     if reference is None:
         return False
-    return drift_ns(topics[reference].log_time_ns, delay[reference]) > round(tolerance_s * NS)
+    return drift_ns(reference.log_time_ns, delay_ns(reference)) > round(tolerance_s * NS)
 
 
-def delays(topics: Mapping[str, TopicColumns], besides: frozenset[str]) -> dict[str, Ints]:
-    """Log time - header stamp, (N,), of every stamped topic but those `besides`."""
+def stamped_topics(
+    topics: Mapping[str, TopicColumns], besides: frozenset[str]
+) -> dict[str, TopicColumns]:
+    """Every topic with header stamps and messages, but those `besides`."""
     return {
-        name: columns.log_time_ns - np.asarray(columns.fields[STAMP], np.int64)
+        name: columns
         for name, columns in topics.items()
         if STAMP in columns.fields and name not in besides and len(columns)
     }
+
+
+def delay_ns(columns: TopicColumns, rows: Rows = slice(None)) -> Ints:
+    """Log time - header stamp, (N,), of messages of a stamped topic. Worked out where it is
+    needed: that of all topics would be half as large as all their times."""
+    return columns.log_time_ns[rows] - np.asarray(columns.fields[STAMP], np.int64)[rows]
 
 
 def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[Ints, int]:
@@ -190,9 +198,19 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
     return np.array(kept, np.int64), len(stamps) - len(kept)
 
 
+def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
+    """The messages of a topic that were received in a segment."""
+    if not len(edges):
+        return slice(0, len(columns))
+    return np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
+
+
 def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
-    order = np.argsort(stamp_ns, kind="stable")  # of equal stamps the last received wins
-    return Samples(np.asarray(stamp_ns, np.int64)[order], row[order])
+    """Samples in the order of their stamps: over the same memory where that is theirs already."""
+    if (stamp_ns[1:] < stamp_ns[:-1]).any():
+        order = np.argsort(stamp_ns, kind="stable")  # of equal stamps the last received wins
+        stamp_ns, row = stamp_ns[order], row[order]
+    return Samples(stamp_ns, row)
 
 
 @dataclass
@@ -207,18 +225,22 @@ class _Drifts:
     def map_of(
         self,
         topics: Mapping[str, TopicColumns],
-        delay: Mapping[str, Ints],
+        stamped: Mapping[str, TopicColumns],
         reference: str,
-        inside: Mapping[str, NDArray[np.intp]],
+        inside: Mapping[str, Rows],
         edges: Ints,
         index: int,
     ) -> tuple[ClockMap, int]:
         """The map of one segment, and the median delay of the reference topic in it."""
         jump_ns, rows = round(self.clock.jump_s * NS), inside[reference]
-        log, late = topics[reference].log_time_ns[rows], delay[reference][rows]
+        log = stamped[reference].log_time_ns[rows]
+        late = delay_ns(stamped[reference], rows)
         middle = median(late)
         if drift_ns(log, late) <= self.tolerance_ns:
-            medians = [median(delay[name][inside[name]]) for name in delay if len(inside[name])]
+            medians = [middle]
+            for name in stamped.keys() - {reference}:
+                if len(delay := delay_ns(stamped[name], inside[name])):
+                    medians.append(median(delay))
             # Latency only ever adds to the clocks' offset: the least delayed topic shows it best.
             offset = min(each for each in medians if abs(each - middle) <= jump_ns)
             return ClockMap.constant(offset), middle
@@ -233,7 +255,10 @@ class _Drifts:
                     source, knots = CLOCK_TOPIC, (times[during], behind[during])
         fitted = ClockMap.of_delays(*knots)
         spread = spread_ns(residual_ns(knots[0], knots[0] - knots[1]))
-        unstamped = any(STAMP not in topics[name].fields and len(inside[name]) for name in topics)
+        unstamped = any(
+            STAMP not in columns.fields and len(columns.log_time_ns[inside[name]])
+            for name, columns in topics.items()
+        )
         if unstamped and spread > self.tolerance_ns:
             raise RecordingError(
                 f"log time and header stamps drift apart, and {source} gives the time of a "
@@ -242,10 +267,11 @@ class _Drifts:
                 remedy='set [clock] alignment = "log_time" in the profile',
             )
         ahead = []  # of the map, by topic: the least delayed one shows best when it was sent
-        for name, late in delay.items():
-            log = topics[name].log_time_ns[inside[name]]
+        for name, columns in stamped.items():
+            log = columns.log_time_ns[inside[name]]
             if len(log):
-                ahead.append(median(log - late[inside[name]] - fitted.stamped(log)))
+                late = delay_ns(columns, inside[name])
+                ahead.append(median(log - late - fitted.stamped(log)))
         shift = max((each for each in ahead if abs(each) <= jump_ns), default=0)
         report = self.report
         report.mapped_by = source
@@ -256,7 +282,8 @@ class _Drifts:
 
 def _segment(
     topics: Mapping[str, TopicColumns],
-    inside: Mapping[str, NDArray[np.intp]],
+    inside: Mapping[str, Rows],
+    every: NDArray[np.intp],
     clock_map: ClockMap,
     middle: int,
     clock: Clock,
@@ -267,24 +294,26 @@ def _segment(
     jump_ns = round(clock.jump_s * NS)
     samples = {}
     for name, rows in inside.items():
-        columns = topics[name]
+        columns, numbers = topics[name], every[rows]
         log_time = columns.log_time_ns[rows]
-        received = clock_map.stamped(log_time)  # on the alignment clock
         if STAMP not in columns.fields:
-            samples[name] = _ordered(received, rows)
+            samples[name] = _ordered(clock_map.stamped(log_time), numbers)
             continue
         stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]
         if name in transforms:
+            received = clock_map.stamped(log_time)  # on the alignment clock
             stamp = np.where(stamp - received > AHEAD_NS, received, stamp)
-        expected = log_time - middle if clock_map.is_constant else received
-        off = np.abs(expected - stamp) > jump_ns
+        away = log_time - middle if clock_map.is_constant else clock_map.stamped(log_time)
+        away -= stamp
+        off = np.abs(away, out=away) > jump_ns
+        del away
         if off.any() and name in latched:
             report.restamped[name] = report.restamped.get(name, 0) + int(off.sum())
-            stamp = np.where(off, received, stamp)
+            stamp = np.where(off, clock_map.stamped(log_time), stamp)
         elif off.any():
             report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
-            stamp, rows = stamp[~off], rows[~off]
-        samples[name] = _ordered(stamp, rows)
+            stamp, numbers = stamp[~off], numbers[~off]
+        samples[name] = _ordered(stamp, numbers)
     return ClockSegment(samples, clock_map.offset_ns)
 
 

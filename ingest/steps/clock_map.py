@@ -90,10 +90,14 @@ def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
     """
     if not len(log_ns):
         return 0
-    window = (log_ns - log_ns.min()) // WINDOW_NS
-    order = np.argsort(window, kind="stable")
-    begins = np.flatnonzero(np.diff(window[order], prepend=-1))
-    least = np.minimum.reduceat(smoothed(delay_ns)[order], begins)
+    smooth = smoothed(delay_ns)
+    window = log_ns - log_ns.min()
+    window //= WINDOW_NS
+    if (window[1:] < window[:-1]).any():
+        order = np.argsort(window, kind="stable")
+        window, smooth = window[order], smooth[order]
+    begins = np.flatnonzero(window[1:] != window[:-1]) + 1
+    least = np.minimum.reduceat(smooth, np.append(0, begins))
     low, high = np.percentile(least - least[0], [5, 95])
     return int(high - low)
 

@@ -47,10 +47,15 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
     stamps = columns.fields.get(STAMP)
     if not isinstance(stamps, np.ndarray) or not count:
         return TopicClock(topic, count, sent)
-    stamp = stamps.astype(np.int64)
+    stamp = np.asarray(stamps, np.int64)
+    backsteps = int((stamp[1:] < stamp[:-1]).sum())
     stamped = stamp != 0
-    delay = log[stamped] - stamp[stamped]
-    values, repeats = np.unique(stamp, return_counts=True)
+    if not stamped.all():
+        log, stamp = log[stamped], stamp[stamped]
+    ascending = np.sort(stamp) if backsteps else stamp
+    duplicates = int((ascending[1:] == ascending[:-1]).sum())
+    del ascending
+    delay = log - stamp
     middle = median(delay) if len(delay) else 0
     low, high = np.percentile(delay - middle, [1, 99]) if len(delay) else (0, 0)
     return TopicClock(
@@ -59,10 +64,10 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
         sent,
         middle,
         int(high - low),
-        len(jumps(log[stamped], delay, round(jump_s * 1e9))),
-        int((np.diff(stamp) < 0).sum()),
-        int((repeats[(repeats > 1) & (values != 0)] - 1).sum()),
-        int((~stamped).sum()),
+        len(jumps(log, delay, round(jump_s * 1e9))),
+        backsteps,
+        duplicates,
+        count - len(stamp),
     )
 
 
@@ -93,23 +98,28 @@ def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[Topi
 
 def median(delay_ns: Ints) -> int:
     """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
-    return int(np.sort(delay_ns)[len(delay_ns) // 2])
+    middle = len(delay_ns) // 2
+    return int(np.partition(delay_ns, middle)[middle])
 
 
 def smoothed(delay_ns: Ints) -> Ints:
     """The running median of five delays (N,): single bad stamps are gone."""
     if len(delay_ns) < 5:
         return delay_ns
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(delay_ns, 2, mode="edge"), 5)
     smooth = delay_ns.copy()
-    for start in range(0, len(windows), _BLOCK):
-        smooth[start : start + _BLOCK] = np.sort(windows[start : start + _BLOCK], axis=1)[:, 2]
+    for start in range(0, len(delay_ns), _BLOCK):
+        stop = min(start + _BLOCK, len(delay_ns))
+        around = delay_ns[max(start - 2, 0) : stop + 2]
+        edges = (max(2 - start, 0), max(stop + 2 - len(delay_ns), 0))
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(around, edges, mode="edge"), 5)
+        smooth[start:stop] = np.sort(windows, axis=1)[:, 2]
     return smooth
 
 
 def jumps(log_time_ns: Ints, delay_ns: Ints, jump_ns: int) -> Ints:
     """The log times at which a topic's clock jumps, single bad stamps aside."""
-    if not (np.abs(np.diff(delay_ns)) > jump_ns).any():
+    change_ns = np.diff(delay_ns)
+    if not (np.abs(change_ns, out=change_ns) > jump_ns).any():
         return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do
     at = np.flatnonzero(np.abs(np.diff(smoothed(delay_ns))) > jump_ns) + 1
     return np.asarray(log_time_ns[at], np.int64)

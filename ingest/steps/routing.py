@@ -62,18 +62,17 @@ class Routing:
         aimed = np.flatnonzero(goal >= 0)
         position = np.stack([now["pose_x_m"], now["pose_y_m"]], axis=-1)
         distance[aimed] = np.linalg.norm(self.goals_m[goal[aimed]] - position[aimed], axis=-1)
-        near, far = seen.look_ahead_m[:, PLAN_PARTS], seen.look_ahead_m[:, 2 * PLAN_PARTS]
+        # Copies: of the points between them nothing is kept.
+        near, far = (seen.look_ahead_m[:, part * PLAN_PARTS].T.copy() for part in (1, 2))
         way_m, gap_m = returns_on_plan(task, now["sector_clearance_m"], seen.look_ahead_m)
         return {
-            "waypoint_near_x_m": near[:, 0],
-            "waypoint_near_y_m": near[:, 1],
-            "waypoint_far_x_m": far[:, 0],
-            "waypoint_far_y_m": far[:, 1],
+            "waypoint_near_x_m": near[0],
+            "waypoint_near_y_m": near[1],
+            "waypoint_far_x_m": far[0],
+            "waypoint_far_y_m": far[1],
             "route_remaining_m": seen.remaining_m,
             "goal_distance_m": distance,
-            "clearance_ahead_m": clearance_ahead(
-                task, now["sector_clearance_m"], near[:, 0], near[:, 1]
-            ),
+            "clearance_ahead_m": clearance_ahead(task, now["sector_clearance_m"], near[0], near[1]),
             "plan_return_m": way_m,
             "plan_gap_m": gap_m,
         }

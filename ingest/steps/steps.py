@@ -82,6 +82,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is
             not what its input needs.
     """
+    clocks = topic_clocks(topics, profile.clock.jump_s)
     aligned = align_inputs(profile, topics)
     filling = Filling(aligned)
     signals = filling.fill()
@@ -110,6 +111,6 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         aligned.commands_between,
         custom,
         aligned.camera_frames(),
-        topic_clocks(topics, profile.clock.jump_s),
+        clocks,
         [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
     )

@@ -23,7 +23,7 @@ WITH own_signals AS (
         FROM recordings
     )
 ), cleared AS (
-    -- By name: what is windowed below is kept in memory as a whole, with texts that no row needs.
+    -- By name, and clearance as it is observed, in half the bytes: windows keep all of it in memory.
     SELECT
         recording_id,
         episode_id,
@@ -42,21 +42,19 @@ WITH own_signals AS (
         clearance_m,
         clearance_ahead_m,
         reward,
-        conditions,
+        NOT list_contains(conditions, 'wheel_slip') AS grips,
         top_mps,
         top_radps,
         period_s,
         range_max_m,
-        list_transform(
-            observation[13 + actions:12 + actions + sectors], lambda nearness: nearness * nearness * range_max_m
-        ) AS sector_m
+        observation[13 + actions:12 + actions + sectors] AS nearness
     FROM transitions
     JOIN tasks USING (task_hash)
 ), steps AS (
     SELECT
         *,
-        lag(sector_m) OVER episode AS sector_before_m,
-        lag(sector_m, 2) OVER episode AS sector_long_before_m,
+        lag(nearness) OVER episode AS nearness_before,
+        lag(nearness, 2) OVER episode AS nearness_long_before,
         (stamp_ns - lag(stamp_ns) OVER episode) / 1e9 AS elapsed_s,
         (wheel_speed_mps + lag(wheel_speed_mps) OVER episode) / 2 AS mean_wheel_mps,
         (wheel_yaw_rate_radps + lag(wheel_yaw_rate_radps) OVER episode) / 2 AS mean_wheel_radps,
@@ -68,8 +66,7 @@ WITH own_signals AS (
         lag(command_speed_mps, 3) OVER episode AS command_long_before_mps,
         -- Where there is no new pose, or no gyroscope, the wheels stand in for it.
         localised_speed_mps <> wheel_speed_mps AS has_pose,
-        gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro,
-        NOT list_contains(conditions, 'wheel_slip') AS grips
+        gyro_yaw_rate_radps <> wheel_yaw_rate_radps AS has_gyro
     FROM cleared
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index)
 ), kinds AS (
@@ -92,7 +89,10 @@ WITH own_signals AS (
         straight AND moving AND abs(wheel_change_mps) < 0.05 * top_mps AND accel_x_mps2 <> 0 AS steady,
         -- A straight wall's range changes evenly: what is left of the change is noise.
         CASE WHEN straight THEN list_median(list_transform(
-            list_zip(sector_m, sector_before_m, sector_long_before_m),
+            list_transform(
+                list_zip(nearness, nearness_before, nearness_long_before),
+                lambda n: [n[1] * n[1] * range_max_m, n[2] * n[2] * range_max_m, n[3] * n[3] * range_max_m]
+            ),
             lambda m: CASE WHEN greatest(m[1], m[2], m[3]) < range_max_m
                 THEN abs(m[1] - 2 * m[2] + m[3]) END
         )) END AS unevenness_m
@@ -102,7 +102,10 @@ WITH own_signals AS (
     FROM (
         SELECT episode_id, sector, max(m) - min(m) AS spread_m
         FROM (
-            SELECT episode_id, unnest(sector_m) AS m, generate_subscripts(sector_m, 1) AS sector
+            SELECT
+                episode_id,
+                unnest(list_transform(nearness, lambda n: n * n * range_max_m)) AS m,
+                generate_subscripts(nearness, 1) AS sector
             FROM cleared
         )
         GROUP BY episode_id, sector
