@@ -26,7 +26,7 @@ from restock.ingest.task.schema import COLUMNS
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
 VERSION = 3  # of summary.sql: a summary by another one is not used
 # Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
-STRETCH_ROWS = 16_384
+STRETCH_ROWS = 8192
 # Tables whose rows are made of one episode's each, by queries of their names, and their order.
 BY_EPISODE = {
     "measured_signals": "episode_id, signal",
@@ -160,34 +160,36 @@ def _complete(rows: pa.Table) -> pa.Table:
 def _of_episodes(connection: duckdb.DuckDBPyConnection, rows: pa.Table) -> dict[str, pa.Table]:
     """The tables BY_EPISODE, which are made some whole episodes at a time: an episode's rows of
     them depend on its own steps alone. A window over all steps would hold them all twice."""
-    begun = False
-    for stretch in _whole_episodes(rows):
-        connection.register("transitions", stretch)
+    for number, (first, stop) in enumerate(_whole_episodes(rows)):
+        connection.register("transitions", _unchunked(rows.slice(first, stop - first)))
         for name in BY_EPISODE:
-            into = f"INSERT INTO {name}" if begun else f"CREATE TEMP TABLE {name} AS"
+            into = f"INSERT INTO {name}" if number else f"CREATE TEMP TABLE {name} AS"
             connection.execute(f"{into}\n{_query(name)}")
-        begun = True
+        connection.unregister("transitions")  # its copies go before the next are made
     return {
         name: connection.sql(f"FROM {name} ORDER BY {order}").to_arrow_table()
         for name, order in BY_EPISODE.items()
     }
 
 
-def _whole_episodes(rows: pa.Table) -> Iterator[pa.Table]:
-    """The rows, about STRETCH_ROWS at a time, none of an episode in two of them; all at once where
-    an episode's rows do not lie together."""
+def _whole_episodes(rows: pa.Table) -> Iterator[tuple[int, int]]:
+    """Where to cut the rows, as first and one past the last, some STRETCH_ROWS apart: no episode
+    lies in two parts. All at once where an episode's rows do not lie together."""
     coded = rows["episode_id"].combine_chunks().dictionary_encode()
     codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
     begins = np.flatnonzero(np.diff(codes)) + 1
-    cuts = begins[np.flatnonzero(np.diff(begins // STRETCH_ROWS)) + 1].tolist()
-    if len(begins) >= len(np.unique(codes)):
-        cuts = []
-    for first, stop in pairwise([0, *cuts, len(rows)]):
-        stretch = rows.slice(first, stop - first)
-        for name in WIDE:  # of many chunks, each of which is a batch for DuckDB
-            place = stretch.schema.get_field_index(name)
-            stretch = stretch.set_column(place, name, stretch[name].combine_chunks())
-        yield stretch
+    cuts = begins[np.flatnonzero(np.diff(begins // STRETCH_ROWS, prepend=0))].tolist()
+    together = len(begins) < len(np.unique(codes))
+    return pairwise([0, *(cuts if together else []), len(rows)])
+
+
+def _unchunked(rows: pa.Table) -> pa.Table:
+    """The rows with the chunks of their WIDE columns, one an episode, put together: for DuckDB
+    each is a batch."""
+    for name in WIDE:
+        place = rows.schema.get_field_index(name)
+        rows = rows.set_column(place, name, rows[name].combine_chunks())
+    return rows
 
 
 def with_ends(rows: pa.Table, packed_ends: str | None) -> pa.Table:

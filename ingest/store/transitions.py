@@ -17,7 +17,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows, episode_rows, groups, packed
-from restock.ingest.store.summary import ENDS
+from restock.ingest.store.summary import ENDS, WIDE
 from restock.ingest.task.conditions import NOMINAL, primary, too_near_to_call
 from restock.ingest.task.label_scores import true_names, truth_text
 from restock.ingest.task.schema import (
@@ -32,7 +32,8 @@ from restock.ingest.task.task import observe, reward
 
 # Columns that rows of an older store may lack.
 _LATER = {column.name: pa.field(column.name, column.type) for column in COVERAGE if column.nullable}
-_WIDE = "sector_clearance_m"  # the one signal of many numbers a step
+_OF_ONE_VALUE = ("recording_id", *(column.name for column in PROVENANCE))
+_SECTORS = "sector_clearance_m"  # the one signal of many numbers a step
 
 
 @dataclass(frozen=True)
@@ -92,14 +93,32 @@ def recording_table(
         ends.append(rows.ends_table())
         parts.append(rows.without_signals())
         done(int(rows.tick.max()) + 1)
-    table = pa.concat_tables(tables)
     metadata = {ENDS: packed(pa.concat_tables(ends).combine_chunks())}
-    return table.replace_schema_metadata(metadata), EpisodeRows.join(parts)
+    return _joined(tables).replace_schema_metadata(metadata), EpisodeRows.join(parts)
+
+
+def _joined(tables: list[pa.Table]) -> pa.Table:
+    """The groups' rows as one table, and `tables` empty.
+
+    Column by column each gets memory of its own: a group's columns lie between much that is gone
+    by now, which Arrow can only give back together with them.
+    """
+    schema = tables[0].schema
+    columns = [[table.column(place) for table in tables] for place in range(len(schema))]
+    tables.clear()
+    for place, name in enumerate(schema.names):
+        parts = [chunk for part in columns[place] for chunk in part.chunks]
+        whole = pa.chunked_array(parts, schema.field(place).type)
+        shared = name in WIDE or name in _OF_ONE_VALUE
+        columns[place] = whole if shared else whole.combine_chunks()
+        del parts, whole
+    pa.default_memory_pool().release_unused()
+    return pa.table(columns, schema=schema)
 
 
 def _sharing(rows: pa.Table, same: dict[str, pa.ChunkedArray]) -> pa.Table:
     """The rows with their columns of one value, the same in every group, over one memory."""
-    for name in ("recording_id", *(column.name for column in PROVENANCE)):
+    for name in _OF_ONE_VALUE:
         longest = same.setdefault(name, rows[name])
         if len(longest) < len(rows):
             same[name] = rows[name]
@@ -126,8 +145,8 @@ def transitions(
     tick = rows.tick[begin]
     previous_tick = rows.tick - steps.follows[rows.tick]
     previous_action = np.where(steps.follows[rows.tick], steps.action[previous_tick], 0)
-    before = {_WIDE: steps.signals[_WIDE][previous_tick]}
-    narrow = {name: column for name, column in rows.signals.items() if name != _WIDE}
+    before = {_SECTORS: steps.signals[_SECTORS][previous_tick]}
+    narrow = {name: column for name, column in rows.signals.items() if name != _SECTORS}
     now = {name: column[begin] for name, column in narrow.items()}
     after = {name: column[begin + 1] for name, column in narrow.items()}
     progress_m = steps.routing.progress_m(task, steps.routing.plan[tick], now, after)

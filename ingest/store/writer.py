@@ -187,6 +187,7 @@ class StoreWriter(TableCommits):
             StoreError: what one was to replace has changed, or other writers were faster too many
                 times. What is left is deleted when it is older than the window of `clean`.
         """
+        pa.default_memory_pool().release_unused()
         read = {one.recording_id: one.instead_of for one in staged if one.instead_of}
         version = self._commit_files(staged, read)
         for one in staged:
@@ -285,4 +286,7 @@ class StoreWriter(TableCommits):
         rows = plain_lists(rows)
         options = parquet_options(rows.schema)
         with written_whole(self.path, path):
-            return self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
+            size = self.path.write(rows, path, row_group_size=ROW_GROUP_ROWS, **options)
+        # What encoding took, tens of MB: Arrow would keep it, and a commit takes as much again.
+        pa.default_memory_pool().release_unused()
+        return size
