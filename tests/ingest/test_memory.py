@@ -1,13 +1,18 @@
-"""Memory goes with what a profile keeps of a recording, not with the recording's bytes."""
+"""Memory goes with what a profile keeps of a recording, not with the recording's bytes, and what it
+keeps lies in memory once."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -19,12 +24,27 @@ from support.bag_samples import compress_files
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
 from support.long import one_in
+from support.stores import manifest
+
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.tables import Clock
+from restock.ingest.steps.align import align
+from restock.ingest.steps.clocks import STAMP, topic_clock
+from restock.ingest.steps.episodes import split
+from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.store import episode_rows, summary
+from restock.ingest.store.commits import plain_lists
+from restock.ingest.store.transitions import Provenance, recording_table
 
 IMAGE_BYTES = 400_000
 FEW, MANY = 10, 250  # images
 # Of growth, where the larger recording holds 96 MB more. What is read ahead, some 25 MB however
 # large the recording (the same with 400 MB), differs by an allocation or two.
 ALLOWED_MB = 48
+
+PROFILE = load_profile("warehouse_amr")
+PROVENANCE = Provenance("ab" * 8, "1", "drive.mcap", "1.0")
 
 # Ingests each recording in turn, and says the peak of this process' memory after each.
 MEASURE = """
@@ -107,3 +127,76 @@ def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path:
     (few, before), (many, after) = json.loads(done.stdout)
     assert few == many > 20
     assert after - before < ALLOWED_MB
+
+
+def most_memory(work: Callable[[], Any]) -> int:
+    """The bytes that some work takes at its peak beside what was there, as NumPy counts them."""
+    work()  # what is kept for the next time is not of the work
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_aligning_takes_few_arrays_beside_the_times() -> None:
+    count = 200_000
+    rng = np.random.default_rng(1)
+    stamp = np.arange(count, dtype=np.int64) * 5_000_000 + 10**18
+    log = np.maximum.accumulate(stamp + 1_000_000 + rng.integers(0, 2_000_000, count))
+    imu = TopicColumns(log, log, {STAMP: stamp})
+    odometry = TopicColumns(log[::4], log[::4], {STAMP: stamp[::4]})
+    topics, clock = {"/imu": imu, "/odom": odometry}, Clock(alignment="header.stamp")
+    assert most_memory(lambda: align(topics, clock)) < 7 * stamp.nbytes  # 5; it was 10
+    assert most_memory(lambda: topic_clock("/imu", imu, clock.jump_s)) < 5 * stamp.nbytes  # 3; 7
+    (segment,), _ = align(topics, clock)
+    assert np.shares_memory(segment.topics["/imu"].stamp_ns, stamp)
+
+
+@pytest.fixture(scope="module")
+def steps() -> Steps:
+    """Of a drive of many episodes of much the same length."""
+    goals = [(float(t), 2.0 + t % 3, 1.0) for t in range(0, 40, 4)]
+    return steps_of(PROFILE, Drive(duration_s=45.0, goals=goals).topics())
+
+
+def test_rows_lie_in_memory_once(steps: Steps, monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes = split(PROFILE.task, steps)
+    assert len(episodes.episodes) > 5
+    monkeypatch.setattr(episode_rows, "GROUP_ROWS", 20)  # several groups
+    table, rows = recording_table(PROFILE, steps, episodes, PROVENANCE)
+    a_copy = 4 * PROFILE.task.observation_size * len(rows.tick)
+    wide = table.select(summary.WIDE)
+    assert wide.get_total_buffer_size() <= a_copy  # of both columns, ends of episodes included
+    # Parquet gets plain lists over the same memory, and their offsets.
+    offsets = 8 * (len(table) + len(rows.tick))
+    assert plain_lists(wide).get_total_buffer_size() <= a_copy + offsets
+    once = table.select(["recording_id"]).get_total_buffer_size()
+    assert once < len(table) * (4 + len(PROVENANCE.recording_id)) / 2
+    assert not steps.without_values().signals
+    assert len(steps.without_values()) == 0
+
+
+def test_a_summary_is_made_some_episodes_at_a_time(
+    steps: Steps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table, _ = recording_table(PROFILE, steps, split(PROFILE.task, steps), PROVENANCE)
+    told = manifest(table, task=PROFILE.task)
+    whole = summary.summarised(told, table)
+    looked_at: list[int] = []
+
+    def seen(rows: pa.Table) -> pa.Table:
+        looked_at.append(len(rows))
+        return unchunked(rows)
+
+    unchunked = summary._unchunked
+    monkeypatch.setattr(summary, "_unchunked", seen)
+    monkeypatch.setattr(summary, "STRETCH_ROWS", 40)
+    assert summary.summarised(told, table).equals(whole)
+    assert len(looked_at) > 2
+    assert sum(looked_at) == len(table)
+    looked_at.clear()
+    apart = table.take(np.argsort(table["step_index"].to_numpy(), kind="stable"))
+    summary.summarised(told, apart)
+    assert looked_at == [len(table)]  # rows of an episode that do not lie together stay in one
