@@ -197,10 +197,9 @@ def _write_all(
         meta = beside.submit(packer.write_meta, folder / META, folder / EVALUATION_SPLIT, stop)
         try:
             written = packer.write_rows(folder / ROWS, advance)
-        except BaseException:
-            stop.set()
-            raise
-        meta.result()
+            meta.result()
+        finally:
+            stop.set()  # where one of them failed: the other need not end
     return written
 
 
