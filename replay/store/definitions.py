@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 import duckdb
 
 from restock.ingest.store.summary import with_included
+from restock.interrupts import was_interrupted
 from restock.replay.store.column_docs import install_columns
 from restock.replay.store.same_drives import install_same_drives
 
@@ -192,6 +193,8 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
             made.hold([*(HELD if _few(connection) else ()), *named])
         except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
             made.release()
+            if was_interrupted():
+                raise
         yield
     finally:
         made.release()

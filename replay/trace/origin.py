@@ -21,6 +21,7 @@ from restock.ingest.profile.profile_text import read_profile_toml
 from restock.ingest.store.location import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts
+from restock.interrupts import was_interrupted
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store, is_store
 from restock.replay.trace.messages_at_tick import MessageAtTick, messages_at_tick
@@ -139,7 +140,7 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
             manifest = manifests[0] if manifests else None
             frames, lost = _frames(store, source.path, row, manifest)
     except (duckdb.IOException, StoreError):
-        if source.version is None:
+        if source.version is None or was_interrupted():
             raise
         return None
     origin = Origin(

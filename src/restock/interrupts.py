@@ -13,23 +13,51 @@ if TYPE_CHECKING:  # slow to import, and every command imports this
     import subprocess
 
 _running: set[subprocess.Popen[bytes]] = set()
+_interrupted = False
 
 
 @contextmanager
 def kill_as_interrupt() -> Iterator[None]:
     """A kill (SIGTERM) and the end of the terminal (SIGHUP) do what Ctrl-C does at that moment: by
-    default a KeyboardInterrupt, in a training a checkpoint. What is ignored (`nohup`) stays so."""
-    named = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [number for number in named if signal.getsignal(number) == signal.SIG_DFL]
+    default a KeyboardInterrupt, in a training a checkpoint. What is ignored (`nohup`) stays so.
+
+    Each interrupt is noted: a library that calls into Python may turn it into an error of its own
+    (see `was_interrupted`).
+    """
+    handlers = {"SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGINT": _note_interrupt}
+    usual = {
+        number: signal.getsignal(number)
+        for number in (getattr(signal, name) for name in handlers if hasattr(signal, name))
+    }
+    ours = [
+        number
+        for number, handler in usual.items()
+        if handler in (signal.SIG_DFL, signal.default_int_handler)
+    ]
     if threading.current_thread() is not threading.main_thread():  # no other may set handlers
         ours = []
+    if signal.SIGINT in ours:
+        went_on_after_interrupt()
     for number in ours:
-        signal.signal(number, _interrupt)
+        signal.signal(number, handlers[number.name])
     try:
         yield
     finally:
         for number in ours:
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, usual[number])
+
+
+def was_interrupted() -> bool:
+    """Whether an interrupt came, and nothing went on on purpose since. DuckDB and Arrow report a
+    KeyboardInterrupt in a Python function that they call as an error of theirs: who would take an
+    error for a damaged file asks here first."""
+    return _interrupted
+
+
+def went_on_after_interrupt() -> None:
+    """An interrupt has been dealt with: a later error is none of its doing."""
+    global _interrupted
+    _interrupted = False
 
 
 @contextmanager
@@ -60,4 +88,16 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     handler(number, frame)
 
 
-__all__ = ["ended_with_us", "interrupt_running", "kill_as_interrupt"]
+def _note_interrupt(number: int, frame: FrameType | None) -> None:
+    global _interrupted
+    _interrupted = True
+    raise KeyboardInterrupt
+
+
+__all__ = [
+    "ended_with_us",
+    "interrupt_running",
+    "kill_as_interrupt",
+    "was_interrupted",
+    "went_on_after_interrupt",
+]

@@ -6,11 +6,24 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
+import duckdb
 import pytest
 
-from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
+import restock.replay.plan.plan as plan
+from restock.cli import main
+from restock.errors import ExitCode
+from restock.interrupts import (
+    ended_with_us,
+    interrupt_running,
+    kill_as_interrupt,
+    was_interrupted,
+    went_on_after_interrupt,
+)
 
 WAITS = [sys.executable, "-c", "import time; print(flush=True); time.sleep(600)"]
 
@@ -62,3 +75,52 @@ def test_a_process_ends_with_the_block_that_waits_for_it_and_from_another_thread
         while process.poll() is None:
             interrupt_running()
         assert ended.result(timeout=30) != 0
+
+
+@pytest.fixture
+def usual_ctrl_c() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_ctrl_c")
+def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
+    store_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def stopped(*_: Any, **__: Any) -> None:
+        with duckdb.connect(config={"threads": 1}) as connection:
+            connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
+            connection.sql("SELECT stop(1)").fetchall()
+
+    monkeypatch.setattr(plan, "read_candidates", stopped)
+    code = main(["mix", str(store_path), "--out", str(tmp_path / "panel")])
+    assert code == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err.endswith("interrupted; nothing is left half-written\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("usual_ctrl_c")
+def test_an_error_after_an_interrupt_that_was_dealt_with_is_none() -> None:
+    with kill_as_interrupt():
+        with duckdb.connect(config={"threads": 1}) as connection:
+            connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
+            with pytest.raises(duckdb.Error):
+                connection.sql("SELECT stop(1)").fetchall()
+        assert was_interrupted()
+        went_on_after_interrupt()
+        assert not was_interrupted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert was_interrupted()
+    with kill_as_interrupt():
+        assert not was_interrupted()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def _stop(value: int) -> int:
+    signal.raise_signal(signal.SIGINT)
+    return value

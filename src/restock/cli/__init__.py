@@ -15,7 +15,7 @@ from typing import Any
 
 from restock.errors import ExitCode, RestockError
 from restock.imports import hidden, when_imported
-from restock.interrupts import kill_as_interrupt
+from restock.interrupts import kill_as_interrupt, was_interrupted
 
 # verb -> what it does, in the order of the work
 VERBS = {
@@ -89,13 +89,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # here, where a reader that went away is no error
         return code
     except KeyboardInterrupt:
-        _complain("interrupted; nothing is left half-written")
-        return int(ExitCode.INTERRUPTED)
+        return _interrupted()
     except BrokenPipeError:
         # The reader of our stdout went away (`| head`): no complaint, and none at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.OK)
     except Exception as error:  # noqa: BLE001  (the one place that maps what nobody foresaw)
+        if was_interrupted():  # a library reports it as an error of its own
+            return _interrupted()
         from restock.cli.failures import as_restock_error
 
         known = as_restock_error(error, args)
@@ -165,6 +166,11 @@ def _settle_pandas() -> None:
 def _without_ros(args: list[str]) -> list[str]:
     """The flags before `--ros-args`; rclpy reads the rest from the command line itself."""
     return args[: args.index("--ros-args")] if "--ros-args" in args else args
+
+
+def _interrupted() -> int:
+    _complain("interrupted; nothing is left half-written")
+    return int(ExitCode.INTERRUPTED)
 
 
 def _complain(message: str) -> None:

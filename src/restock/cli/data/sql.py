@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from restock.errors import QueryError
+from restock.interrupts import went_on_after_interrupt
 
 if TYPE_CHECKING:
     import duckdb
@@ -129,6 +130,7 @@ class SqlCommand:
             except EOFError:
                 return
             except KeyboardInterrupt:  # of this query, not of the prompt
+                went_on_after_interrupt()
                 text = ""
                 output.say("stopped")
             except QueryError as error:
