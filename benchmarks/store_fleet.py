@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 
@@ -33,12 +34,18 @@ EPISODE_ROWS = 34  # of the tests' builder, on average
 FIRST_DAY = datetime(2026, 1, 5, tzinfo=UTC)
 
 
-def write_fleet(path: Path, recordings: int, rows: int, *, batch: int) -> None:
+def write_fleet(
+    path: Path, recordings: int, rows: int, *, batch: int, sectors: int | None = None
+) -> None:
     """A store of so many recordings of about so many rows, `batch` of them a commit.
 
-    Manifests are folded at the end, as `restock ingest` ends.
+    `sectors` of the lidar are observed; by default the shipped task's. Manifests are folded at the
+    end, as `restock ingest` ends.
     """
-    store, fleet = StoreWriter(path), drives(recordings, rows)
+    task = load_profile("warehouse_amr").task
+    if sectors is not None:
+        task = msgspec.structs.replace(task, sectors=sectors)
+    store, fleet = StoreWriter(path), drives(recordings, rows, task)
     while part := [one for _, one in zip(range(batch), fleet, strict=False)]:
         store.write_all(part)
     fold_if_many(store)
@@ -51,9 +58,8 @@ def files_of_day(store: Path, day: int) -> list[Path]:
     return [file for folder in folders for file in folder.glob("*.parquet")]
 
 
-def drives(recordings: int, rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:
+def drives(recordings: int, rows: int, task: Task) -> Iterator[tuple[pa.Table, pa.Table]]:
     """Manifest and transitions of each recording, numbered from 1."""
-    task = load_profile("warehouse_amr").task
     episodes = max(rows // EPISODE_ROWS, 1)
     templates = [
         recording_transitions(

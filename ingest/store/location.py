@@ -232,6 +232,22 @@ class Location:
                 whole = pq.ParquetFile(file, metadata=whole.metadata, read_dictionary=shared)
             return whole.read([name for name in names if columns is None or name in columns])
 
+    def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """A Parquet file's rows, a row group at a time: of these columns, those that it has. One
+        named `list.field` has structs of that field alone. Raises as `read` does."""
+
+        def is_asked(leaf: str) -> bool:
+            # Between a list and its field lies what each writer names otherwise.
+            names = leaf.split(".")
+            return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
+
+        with self.reading(path) as file:
+            whole = pq.ParquetFile(file)
+            leaves = [whole.schema.column(number).path for number in range(len(whole.schema))]
+            read = [leaf for leaf in leaves if is_asked(leaf)]
+            for group in range(whole.num_row_groups):
+                yield whole.read_row_group(group, read)
+
     def read_schema(self, path: str) -> pa.Schema:
         """A Parquet file's schema, with its metadata. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:

@@ -4,14 +4,15 @@ A drive that was replayed, or read by another profile, has other poses, goals, a
 what was commanded and what the wheels did is as it was, at one constant shift of the clocks. What
 several rows of a recording have in common proves nothing and is left aside. Whatever two recordings
 share by chance is little beside what one drive has in common with itself, so that only pairs that
-share much are looked at row by row: contents are sorted in NumPy, one number a row, as DuckDB would
-count each in a table of all of them.
+share much are looked at row by row. DuckDB would count each content in a table of all of them; here
+it is one number a row in NumPy, and only those that may be there again are sorted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import duckdb
 import numpy as np
@@ -19,7 +20,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
+from restock.replay.store.shared_rows import MetTwice
 
+N = TypeVar("N", bound=np.generic)
 LEAST_ROWS = 2
 LEAST_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
 WITHIN_NS = 100_000_000  # of the shift
@@ -62,8 +65,7 @@ def same_drives(rows: MovingRows) -> pa.Table:
     shift, `share` of the distinctive rows of the smaller one, and `later_s`, the shift. A content
     of more than FEW recordings is compared with the first of them only: pairs grow with the square.
     """
-    recording, content, stamp = _distinctive(rows)
-    distinctive = np.bincount(recording, minlength=len(rows.names))
+    recording, content, stamp, distinctive = _distinctive(rows)
     first, second = (np.concatenate(parts) for parts in zip(*_pairs(content), strict=True))
     count = max(len(rows.names), 1)
     pair = recording[first].astype(np.int64) * count + recording[second]
@@ -101,33 +103,50 @@ def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
         names = named.dictionary.to_pylist()
         of_name = np.array([codes.setdefault(name, len(codes)) for name in names], np.int32)
         recording.append(of_name[named.indices.to_numpy()])
-        content.append(batch.column("content").to_numpy())
-        stamp.append(batch.column("stamp_ns").to_numpy())
+        # Copies: any column of DuckDB's batch holds all of it, names too.
+        content.append(batch.column("content").to_numpy().copy())
+        stamp.append(batch.column("stamp_ns").to_numpy().copy())
     names = sorted(codes)
     rank = np.empty(len(codes), np.int32)
     rank[[codes[name] for name in names]] = np.arange(len(names))
     return MovingRows(
         names,
-        rank[np.concatenate([np.empty(0, np.int32), *recording])],
-        np.concatenate([np.empty(0, np.uint64), *content]),
-        np.concatenate([np.empty(0, np.int64), *stamp]),
+        rank[_joined(recording, np.int32)],
+        _joined(content, np.uint64),
+        _joined(stamp, np.int64),
     )
+
+
+def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
+    """All of them as one array; the parts are forgotten."""
+    whole = np.concatenate([np.empty(0, kind), *parts])
+    parts.clear()
+    return whole
 
 
 def _distinctive(
     rows: MovingRows,
-) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints]:
-    """Recording, content and stamp (M,) of rows whose content is their recording's only one, by
-    content and recording."""
-    order = np.argsort(rows.content, kind="stable")
-    content, recording = rows.content[order], rows.recording[order]
+) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints, Ints]:
+    """Recording, content and stamp (M,) of rows whose content is their recording's only one and may
+    be another's, too, by content and recording; and how many rows of each recording (R,) have a
+    content that is its only one, another's or not."""
+    met = MetTwice(len(rows.content))
+    met.add(rows.content)
+    again = met.maybe(rows.content)
+    del met
+    alone = np.bincount(rows.recording[~again], minlength=len(rows.names))
+    at = np.flatnonzero(again)
+    content, recording, stamp = rows.content[at], rows.recording[at], rows.stamp_ns[at]
+    order = np.argsort(content, kind="stable")
+    content, recording = content[order], recording[order]
     alike = content[1:] == content[:-1]
     if (alike & (recording[1:] < recording[:-1])).any():  # a recording in several files
-        order = np.lexsort((rows.recording, rows.content))
-        content, recording = rows.content[order], rows.recording[order]
+        order = np.lexsort((rows.recording[at], rows.content[at]))
+        content, recording = rows.content[at][order], rows.recording[at][order]
     begins = np.concatenate([[True], ~alike | (recording[1:] != recording[:-1]), [True]])
     single = begins[1:] & begins[:-1] if len(order) else np.empty(0, np.bool_)
-    return recording[single], content[single], rows.stamp_ns[order[single]]
+    recording, content, stamp = recording[single], content[single], stamp[order[single]]
+    return recording, content, stamp, alone + np.bincount(recording, minlength=len(alone))
 
 
 def _pairs(content: NDArray[np.uint64]) -> Iterator[tuple[Ints, Ints]]:

@@ -1,54 +1,59 @@
-"""`shared_rows` from what manifests keep of their rows' contents: sorted, one number a row.
+"""`shared_rows` from what manifests keep of their rows' contents, one number a row.
 
 DuckDB would count each content in a table of all of them, and hold lists many times over on the
-way: that was most of what an audit and a panel held in memory.
+way. Here the manifests are read twice, some at a time: first each content leaves a mark, and then
+those whose mark was there already are kept, and sorted (`MetTwice`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import duckdb
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from restock.arrays import Bools, Ints
 
 SHARED = ("shared_rows", "repeated_rows", "same_steps")  # the view, and what is made of it
-COLUMNS = ("ingest_id", "distinctive_rows")  # of the manifests
+CONTENT, ROWS = "distinctive_rows.content", "distinctive_rows"  # of the manifests
+MARKED = 1 << 14  # numbers at a time
+_ODD = np.uint64(0x9E3779B97F4A7C15)
+_LEAST_BITS, _MOST_BITS = 10, 34
 
 
 def install_shared_rows(
     connection: duckdb.DuckDBPyConnection,
-    manifests: Iterable[pa.Table],
-    recording_of: Mapping[str, str],
+    manifests: Callable[[Sequence[str]], Iterable[pa.Table]],
+    recordings: Mapping[str, str],
+    rows: int,
 ) -> None:
     """Put a table in place of the connection's view `shared_rows`.
 
-    `manifests` have COLUMNS; `recording_of` names the recording of each ingest whose rows count.
+    `manifests` reads these columns of them, from the beginning each time; `recordings` names the
+    recording of each ingest whose rows count, and `rows` how many these have.
     """
-    contents: list[Ints] = []
-    ids: list[Ints] = []
-    counts: list[int] = []
-    recordings: list[str | None] = []
-    for part in manifests:
-        for chunk in part.combine_chunks().to_batches():
-            named = [recording_of.get(ingest) for ingest in chunk.column("ingest_id").to_pylist()]
-            kept = [place for place, recording in enumerate(named) if recording is not None]
-            lists = chunk.column("distinctive_rows").take(pa.array(kept, pa.int64()))
-            rows = lists.flatten()  # structs
-            contents.append(rows.field("content").to_numpy())
-            ids.append(rows.field("transition_id").to_numpy())
-            counts += lists.value_lengths().fill_null(0).to_pylist()
-            recordings += [named[place] for place in kept]
-    content = np.concatenate([np.empty(0, np.int64), *contents])
-    at = np.flatnonzero(occurs_again(content))
-    of_row = np.searchsorted(np.cumsum(counts), at, "right")
-    shared = {
-        "recording_id": pa.array(recordings, pa.string()).take(pa.array(of_row, pa.int64())),
-        "transition_id": np.concatenate([np.empty(0, np.int64), *ids])[at],
-        "content": content[at],
+    met = MetTwice(rows)
+    for _, lists in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
+        met.add(lists.flatten().field("content").to_numpy())
+    names: list[str] = []
+    parts: dict[str, list[pa.Array]] = {"recording": [], "transition_id": [], "content": []}
+    for of_ingests, lists in _of_ingests(manifests(("ingest_id", ROWS)), recordings):
+        each = lists.flatten()  # structs
+        at = np.flatnonzero(met.maybe(each.field("content").to_numpy()))
+        ends = np.cumsum(lists.value_lengths().fill_null(0).to_numpy())
+        parts["recording"].append(np.searchsorted(ends, at, "right") + len(names))
+        for name in ("transition_id", "content"):
+            parts[name].append(each.field(name).to_numpy()[at])
+        names += of_ingests
+    del met
+    found = {
+        name: np.concatenate([np.empty(0, np.int64), *several]) for name, several in parts.items()
     }
+    kept = occurs_again(found["content"])
+    recording = pa.array(names, pa.string()).take(pa.array(found.pop("recording")[kept]))
+    shared = {"recording_id": recording} | {name: values[kept] for name, values in found.items()}
     # A table of its own: joins must know that it is the small side.
     connection.register("found_shared_rows", pa.table(shared))
     connection.execute(
@@ -56,6 +61,40 @@ def install_shared_rows(
         " CREATE OR REPLACE VIEW shared_rows AS FROM stored_shared_rows"
     )
     connection.unregister("found_shared_rows")
+
+
+class MetTwice:
+    """Which of up to `count` numbers come more than once, without holding them: `add` all, then
+    ask for each again. A number has one of four to eight times as many bytes, so that about one in
+    seven of those that come once is taken for another; none that comes again is missed.
+    """
+
+    def __init__(self, count: int) -> None:
+        bits = min(max(int(4 * count).bit_length(), _LEAST_BITS), _MOST_BITS)
+        self._shift = np.uint64(64 - bits)
+        self._marks = np.zeros(1 << bits, np.uint8)  # bit 0: met, bit 1: met again
+        self._last = np.zeros(MARKED << 4, np.int32)  # by a place's low bits, who was last there
+
+    def add(self, values: NDArray[np.integer]) -> None:
+        """Mark these, (n,) of 64 bits."""
+        for part in _stretches(values):
+            place = self._places(part)
+            number = np.arange(len(part), dtype=np.int32)
+            low = place & (len(self._last) - 1)
+            self._last[low] = number
+            # Of two of a stretch at one place, one at least is not the last there.
+            again = self._marks[place].astype(np.bool_) | (self._last[low] != number)
+            self._marks[place] |= 1
+            self._marks[place[again]] = 3
+
+    def maybe(self, values: NDArray[np.integer]) -> Bools:
+        """Whether these, (n,), may come more than once."""
+        result = [self._marks[self._places(part)] == 3 for part in _stretches(values)]
+        return np.concatenate([np.empty(0, np.bool_), *result])
+
+    def _places(self, values: NDArray[np.integer]) -> Ints:
+        mixed = values.view(np.uint64) * _ODD
+        return np.asarray((mixed >> self._shift).view(np.int64))
 
 
 def occurs_again(values: Ints) -> Bools:
@@ -66,3 +105,20 @@ def occurs_again(values: Ints) -> Bools:
         return np.zeros(len(values), np.bool_)
     place = np.minimum(np.searchsorted(several, values), len(several) - 1)
     return np.asarray(several[place] == values, np.bool_)
+
+
+def _of_ingests(
+    manifests: Iterable[pa.Table], recordings: Mapping[str, str]
+) -> Iterator[tuple[list[str], pa.Array]]:
+    """Recordings of the ingests that count, and the lists of their rows."""
+    for table in manifests:
+        for part in table.combine_chunks().to_batches():
+            named = [recordings.get(ingest) for ingest in part.column("ingest_id").to_pylist()]
+            kept = [place for place, name in enumerate(named) if name is not None]
+            lists = part.column("distinctive_rows").take(pa.array(kept, pa.int64()))
+            yield [name for name in named if name is not None], lists
+
+
+def _stretches(values: NDArray[np.integer]) -> Iterator[NDArray[np.integer]]:
+    for begin in range(0, len(values), MARKED):
+        yield values[begin : begin + MARKED]

@@ -31,7 +31,7 @@ from restock.ingest.task.task import Task
 from restock.replay.store.computed import computed
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.query import query
-from restock.replay.store.shared_rows import COLUMNS, SHARED, install_shared_rows
+from restock.replay.store.shared_rows import SHARED, install_shared_rows
 from restock.replay.store.stored_tables import StoredTable, manifest_tables, register
 
 # Joins are done as they are written, the right side in memory: of files whose columns are told
@@ -283,13 +283,15 @@ class Store:
         """`shared_rows` of what the manifests keep, in place of the view over rows."""
         table = self._summaries
         held = self._ingests.to_pylist()
+        recordings = {one["ingest_id"]: one["recording_id"] for one in held}
+        rows = sum(one["rows"] for one in held)
+
+        def manifests(columns: Sequence[str]) -> Iterator[pa.Table]:
+            for path in table.paths:
+                yield from self.path.row_groups(f"{table.table}/{path}", columns)
+
         with self.path.translate_errors():
-            parts = (
-                self.path.read(f"{table.table}/{path}", columns=list(COLUMNS))
-                for path in table.paths
-            )
-            recordings = {one["ingest_id"]: one["recording_id"] for one in held}
-            install_shared_rows(self.bare, parts, recordings)
+            install_shared_rows(self.bare, manifests, recordings, rows)
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """`stored_ingests`, what the files hold, and a view `stored_…` of each table.
