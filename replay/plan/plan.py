@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Bools, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
@@ -54,8 +54,8 @@ from restock.replay.plan.strata import (
     least_steps,
     resolve_strata,
 )
-from restock.replay.plan.transition_ids import Places
-from restock.replay.plan.weights import RatioFit, effective_count
+from restock.replay.plan.transition_ids import Places, stretches
+from restock.replay.plan.weights import RatioFit
 
 LOGS = "logs"  # the name of the first store's part
 
@@ -135,6 +135,7 @@ def plan_panel(
                 member[:, index] |= ~bools(table, "labelled")
                 state[:, index] |= ~bools(table, "labelled")
     stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
+    del state
     split = split_for_evaluation(table, mixture)
     as_of_ns = (
         time.time_ns() // 10**9 * 10**9  # which `as_of` can say again
@@ -150,6 +151,7 @@ def plan_panel(
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
     if mixture.prefer == "rarest":
         stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
+    del member
     leave_out_of_strata(table, mixture, strata, stratum, out)
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
@@ -206,8 +208,9 @@ def _dealt(
     """Strata (N,) and those of the state alone with each episode at its rarest, store by store."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     stratum, state_code = stratum.copy(), state_code.copy()
-    for number in pc.unique(table["store"]).to_pylist():
-        at = np.flatnonzero(store == number)
+    numbers = pc.unique(table["store"]).to_pylist()
+    for number in numbers:
+        at = np.flatnonzero(store == number) if len(numbers) > 1 else slice(None)  # no copies
         given = deal_episodes(stratum[at], member[at], episode[at], strata, counted[at])
         stratum[at] = as_dealt(stratum[at], given, episode[at], strata)
         state_code[at] = as_dealt(state_code[at], given, episode[at], strata)
@@ -219,7 +222,6 @@ def _sources(
 ) -> list[SourceRows]:
     """What each store may give, with its share of a batch as a run begins."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
-    ids, action = table["transition_id"].to_numpy(), table["action"].to_numpy()
     recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
@@ -228,11 +230,10 @@ def _sources(
             SourceRows(
                 name,
                 mean_over(part, 0, mixture.sources.last_bend),
+                table,
                 at,
                 stratum[at],
                 state_code[at],
-                ids[at],
-                action[at].astype(np.int64),
                 episode[at],
                 hours_of(recording[store == number], stamp_ns[store == number]),
             )
@@ -302,13 +303,14 @@ def _joined(
     left_out = out.reasons | ({"in a stratum of share 0": never} if never else {})
     chosen = np.flatnonzero(code != NO_STRATUM)
     rows = np.array([line.rows for line in lines])
-    drawn = (np.array([line.share for line in lines]) / np.maximum(rows, 1))[code[chosen]]
+    drawn = np.array([line.share for line in lines]) / np.maximum(rows, 1)
+    weight, code_of_chosen = weight[chosen], code[chosen]
     return PanelPlan(
         mixture=mixture,
         rows=table.select(META_COLUMNS),
         task_hash=task_hash,
         stratum=code,
-        weight=weight[chosen],
+        weight=weight,
         beside={"state_code": state[chosen]} | {k: v[chosen] for k, v in outcome.items()},
         evaluation_split=split.held,
         split_by=split.by,
@@ -317,7 +319,7 @@ def _joined(
         logs_share=float(filled.sum()),
         logs_share_wanted=sum(source.part for source in given),
         left_out=left_out,
-        effective_rows=effective_count(drawn * weight[chosen]),
+        effective_rows=_effective_rows(drawn, code_of_chosen, weight),
         newest_ns=int(table["logged_ns"].to_numpy().max()),
         as_of_ns=None if mixture.max_age_days is None else as_of_ns,
         others=tuple(others),
@@ -325,6 +327,15 @@ def _joined(
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
         warnings=warnings,
     )
+
+
+def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
+    """`effective_count` of each row's share of the draws times its weight, (n,)."""
+    total = squares = 0.0
+    for begin, end in stretches(len(code)):
+        sizes = drawn[code[begin:end]] * weight[begin:end]
+        total, squares = total + float(sizes.sum()), squares + float((sizes**2).sum())
+    return total**2 / squares if squares > 0 else 0.0
 
 
 def outcome_column(stratum: str) -> str:

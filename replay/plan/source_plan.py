@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Codes, Ints
@@ -35,11 +36,10 @@ class SourceRows:
 
     name: str
     part: float  # of a batch that this source is to fill
-    at: Ints  # their places in the table of candidates
+    candidates: pa.Table  # all of them
+    at: Ints  # the places of these rows
     code: NDArray[np.int16]  # stratum
     state_code: NDArray[np.int16]  # the one their state alone would put them in
-    transition_id: Ints
-    action: Ints
     episode: Codes
     hours: float  # of logging that its store is of
 
@@ -177,10 +177,11 @@ def _outcomes(
     estimated = np.flatnonzero(by_ratio & (np.bincount(code, minlength=len(strata)) > 0))
     if not len(estimated):
         return None, None
-    ids = source.transition_id[kept]
+    at = source.at[kept]
+    ids = source.candidates["transition_id"].to_numpy()[at]
     rows = RatioRows(
         ids,
-        source.action[kept],
+        source.candidates["action"].to_numpy()[at].astype(np.int64),
         source.state_code[kept],
         code,
         scramble(ids, mixture.seed),
