@@ -19,7 +19,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
+from restock.ingest.store.lineage import Ingest, damage_named, ingests_table, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
@@ -288,7 +288,8 @@ class Store:
 
         def manifests(columns: Sequence[str]) -> Iterator[pa.Table]:
             for path in table.paths:
-                yield from self.path.row_groups(f"{table.table}/{path}", columns)
+                with damage_named(self.path, f"{table.table}/{path}"):
+                    yield from self.path.row_groups(f"{table.table}/{path}", columns)
 
         with self.path.translate_errors():
             install_shared_rows(self.bare, manifests, recordings, rows)

@@ -15,12 +15,13 @@ import pyarrow.parquet as pq
 import pytest
 from support.long import one_in
 from support.panels import panel_of
-from support.stores import recording_transitions, write_store
+from support.stores import one, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table, write_table
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
 from restock.train.run.run_tables import EVAL_EPISODES
 
 TINY = [
@@ -196,6 +197,29 @@ def test_a_store_with_a_damaged_file_is_said(
     assert 2 in codes
     if how != "a page":
         assert set(codes) == {2}
+
+
+def test_damaged_contents_in_a_manifest_are_said_with_their_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    StoreWriter(store).write_all([one(1), one(2)])
+    manifest = next((store / "recordings").glob("*/*.parquet"))
+    columns = pq.ParquetFile(manifest).metadata.row_group(0)
+    contents = next(
+        column
+        for column in map(columns.column, range(columns.num_columns))
+        if column.path_in_schema.startswith("distinctive_rows.")
+        and column.path_in_schema.endswith(".content")
+    )
+    content = bytearray(manifest.read_bytes())
+    begin = contents.dictionary_page_offset or contents.data_page_offset
+    content[begin : begin + contents.total_compressed_size] = bytes(contents.total_compressed_size)
+    manifest.write_bytes(content)
+    assert cli.main(["audit", str(store)]) == 2
+    said = capsys.readouterr().err
+    assert f"its file recordings/{manifest.parent.name}/{manifest.name} cannot be read" in said
+    assert "--drop-damaged" in said
 
 
 @pytest.mark.parametrize("task", ["a key", "{", ""])
