@@ -135,17 +135,16 @@ def _distinctive(
     again = met.maybe(rows.content)
     del met
     alone = np.bincount(rows.recording[~again], minlength=len(rows.names))
-    at = np.flatnonzero(again)
-    content, recording, stamp = rows.content[at], rows.recording[at], rows.stamp_ns[at]
-    order = np.argsort(content, kind="stable")
-    content, recording = content[order], recording[order]
+    rows = MovingRows(rows.names, rows.recording[again], rows.content[again], rows.stamp_ns[again])
+    order = np.argsort(rows.content, kind="stable")
+    content, recording = rows.content[order], rows.recording[order]
     alike = content[1:] == content[:-1]
     if (alike & (recording[1:] < recording[:-1])).any():  # a recording in several files
-        order = np.lexsort((rows.recording[at], rows.content[at]))
-        content, recording = rows.content[at][order], rows.recording[at][order]
+        order = np.lexsort((rows.recording, rows.content))
+        content, recording = rows.content[order], rows.recording[order]
     begins = np.concatenate([[True], ~alike | (recording[1:] != recording[:-1]), [True]])
     single = begins[1:] & begins[:-1] if len(order) else np.empty(0, np.bool_)
-    recording, content, stamp = recording[single], content[single], stamp[order[single]]
+    recording, content, stamp = recording[single], content[single], rows.stamp_ns[order[single]]
     return recording, content, stamp, alone + np.bincount(recording, minlength=len(alone))
 
 

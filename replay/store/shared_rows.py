@@ -65,8 +65,8 @@ def install_shared_rows(
 
 class MetTwice:
     """Which of up to `count` numbers come more than once, without holding them: `add` all, then
-    ask for each again. A number has one of four to eight times as many bytes, so that about one in
-    seven of those that come once is taken for another; none that comes again is missed.
+    ask for each again. Marks are bytes, at least four a number and mostly more: of numbers that
+    come once up to a quarter are taken for others, and none that comes again is missed.
     """
 
     def __init__(self, count: int) -> None:

@@ -19,7 +19,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import StoreError
-from restock.ingest.store.lineage import Ingest, damage_named, ingests_table, stored_files
+from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
@@ -281,18 +281,10 @@ class Store:
 
     def _install_shared_rows(self) -> None:
         """`shared_rows` of what the manifests keep, in place of the view over rows."""
-        table = self._summaries
         held = self._ingests.to_pylist()
         recordings = {one["ingest_id"]: one["recording_id"] for one in held}
         rows = sum(one["rows"] for one in held)
-
-        def manifests(columns: Sequence[str]) -> Iterator[pa.Table]:
-            for path in table.paths:
-                with damage_named(self.path, f"{table.table}/{path}"):
-                    yield from self.path.row_groups(f"{table.table}/{path}", columns)
-
-        with self.path.translate_errors():
-            install_shared_rows(self.bare, manifests, recordings, rows)
+        install_shared_rows(self.bare, self._summaries.row_groups, recordings, rows)
 
     def _present_all(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
         """`stored_ingests`, what the files hold, and a view `stored_…` of each table.

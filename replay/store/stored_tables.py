@@ -6,7 +6,7 @@ Delta's log: no file is looked at before it is read.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -83,6 +83,17 @@ class StoredTable:
                 where=str(self.place),
                 remedy=damage_remedy(self.place, self.table),
             ) from error
+
+    def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Its rows, some at a time: of these columns, as `Location.row_groups` names them.
+
+        Raises:
+            StoreError: a file is missing or damaged, or the place cannot be reached.
+        """
+        for path in self.paths:
+            place = f"{self.table}/{path}"
+            with damage_named(self.place, place):
+                yield from self.place.row_groups(place, columns)
 
     def _dataset(self) -> pa.Table | Dataset:
         if not self.paths:
