@@ -16,6 +16,8 @@ from restock.errors import RunError
 from restock.train.comparison.action_coverage import action_symptoms
 from restock.train.comparison.confirm import confirm, swapped
 from restock.train.comparison.diagnose import diagnose
+from restock.train.diagnosis.before_training import RowDiagnosis
+from restock.train.diagnosis.causes import Finding
 from restock.train.dqn.config import TrainConfig, apply_overrides, parse_config
 from restock.train.dqn.target import Hard, Polyak, TargetRule
 from restock.train.run.run import Run
@@ -411,6 +413,22 @@ def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None
     changes = {key for key in before if before[key] != after[key]}
     assert changes
     assert changes <= sections[cause]
+
+
+def test_no_run_confirms_rows_that_alone_are_at_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mirrored = Finding("ACTIONS_MIRRORED", "the logs' left is the twin's right", "swap them", ())
+    rows = RowDiagnosis("BUFFER", [mirrored], [], {})
+    monkeypatch.setattr("restock.train.comparison.rows_verdict.rows_of", lambda _: (rows, ""))
+    make_run(tmp_path / "r")  # its own figures are healthy, and another run's would be
+    assert main(["diagnose", str(tmp_path / "r"), "--confirm", str(tmp_path / "c")]) == 2
+    printed = capsys.readouterr()
+    assert "\nBUFFER\n" in printed.out
+    said = " ".join(printed.err.split())
+    assert "is HEALTHY by its own figures, and only its rows are at fault" in said
+    assert "restock diagnose --before-training" in said
+    assert not (tmp_path / "c").exists()
 
 
 def test_an_experiment_that_changes_nothing_is_refused(tmp_path: Path) -> None:

@@ -20,8 +20,14 @@ from restock.train.run.run import Run
 _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
 
-def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
+def confirm(
+    run: Run, diagnosis: Diagnosis, out: Path, *, rows_at_fault: bool = False
+) -> dict[str, Any]:
     """Train again with one thing swapped, to `out`, and diagnose that.
+
+    `diagnosis` is of the run's own figures (`diagnose`), without its rows: those that are wrong
+    alike leave no trace in any run's figures, so that a new run without such a trace would confirm
+    nothing. `rows_at_fault` says that the rows are, for a run whose figures are not.
 
     Returns `changed` (settings), the new run's `cause`, and `confirmed`: True where the cause is
     gone, False where it stayed, None where the new run does not say.
@@ -29,6 +35,14 @@ def confirm(run: Run, diagnosis: Diagnosis, out: Path) -> dict[str, Any]:
     Raises:
         RunError: there is nothing to confirm, or no setting changes what is suspected.
     """
+    if rows_at_fault and diagnosis.cause in (*_NOTHING, "ACTION_COVERAGE"):
+        raise RunError(
+            f"is {diagnosis.cause} by its own figures, and only its rows are at fault: another run"
+            " cannot confirm that",
+            where=str(run.path),
+            remedy="correct the rows, mix again, and ask `restock diagnose --before-training PANEL`"
+            " whether they are right now",
+        )
     if diagnosis.cause in _NOTHING:
         raise RunError(
             f"is {diagnosis.cause}: there is nothing to confirm",

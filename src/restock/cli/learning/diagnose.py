@@ -71,17 +71,24 @@ class DiagnoseCommand:
                 "needs a run, or --before-training PANEL_OR_STORE", where="restock diagnose"
             )
         runs = [Run.open(path) for path in self.runs]
-        diagnosis = diagnose(runs)
+        own = diagnosis = diagnose(runs)
         found, reason = rows_of(runs) if self.rows else (None, "")
         if found is not None:
-            diagnosis = with_rows(diagnosis, found)
+            diagnosis = with_rows(own, found)
         if not self.json:
             _show(diagnosis, self.runs)
             if found is None and self.rows:
                 say(f"the rows of its panel were not compared with the twin: {reason}")
-        confirmation = (
-            confirm(runs[0], diagnosis, self.confirm) if self.confirm is not None else None
-        )
+        confirmation = None
+        if (
+            self.confirm is not None
+        ):  # of the run's own figures: no run of the rows' says if they hold
+            confirmation = confirm(
+                runs[0],
+                own,
+                self.confirm,
+                rows_at_fault=found is not None and bool(found.findings),
+            )
         if self.json:
             of_rows = None if found is None else found.document()
             document = _document(diagnosis, self.runs)
