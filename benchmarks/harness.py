@@ -1,7 +1,8 @@
 """What the benchmarks share: options, rounds in which contenders take turns, and their targets.
 
 A benchmark measures, and ends with `finish`: `--json` prints its figures instead of lines, what is
-missed goes to stderr in either case, and `--check` exits 1 where a target is missed.
+missed goes to stderr in either case, and `--check` exits 1 where a target is missed. It imports
+nothing of training, which would count as the memory of what is measured.
 """
 
 from __future__ import annotations
@@ -20,13 +21,7 @@ from numpy.typing import NDArray
 
 from restock.cli import main as restock
 from restock.files import write_text
-from restock.ingest.profile.profile import load_profile
 from restock.stats import percentiles
-from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes, run_episodes
-from restock.train.run.run import Run
-from restock.train.study.study_run import train_words
-from restock.train.twin.env.interface import Policy
-from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 T = TypeVar("T")
 
@@ -84,33 +79,6 @@ def run_restock(arguments: Sequence[str]) -> None:
         code = restock(arguments)
     if code not in (0, 3):
         raise SystemExit(f"restock {' '.join(arguments)} failed")
-
-
-def trained(path: Path, settings: Sequence[str], panel: Path | None = None) -> Run:
-    """The run at a path, trained or resumed where it has not ended."""
-
-    def train() -> None:
-        run_restock(train_words(path, settings, panel))
-
-    once(path / "done", [*settings, str(panel)], train)
-    return Run.open(path)
-
-
-def drive_missions(
-    policy: Policy, kinds: Sequence[str], episodes: int, first_seed: int
-) -> list[EpisodeResult]:
-    """How so many fixed missions of each kind go, with the stand-in on the twin's own floor."""
-    profile = load_profile("warehouse_amr")
-    env = WarehouseVectorEnv(
-        32, task=profile.task, seed=0, nav_command=profile.inputs.nav_command is not None
-    )
-    return run_episodes(
-        env,
-        policy,
-        fixed_episodes(kinds, episodes, first_seed),
-        control_period_s=profile.task.control_period_s,
-        time_limit_steps=profile.task.time_limit_steps,
-    )
 
 
 def once(mark: Path, asked: Sequence[str], do: Callable[[], object]) -> None:

@@ -25,17 +25,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from harness import (
-    drive_missions,
-    finish,
-    markdown,
-    mean_interval,
-    once,
-    option_parser,
-    run_restock,
-    trained,
-)
+from harness import finish, markdown, mean_interval, once, option_parser, run_restock
 from numpy.typing import NDArray
+from twin_runs import drive_missions, trained
 
 from restock.ingest.profile.profile import load_profile
 from restock.stats import interval_text, wilson

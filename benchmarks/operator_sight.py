@@ -16,7 +16,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from harness import drive_missions, finish, markdown, option_parser
+from harness import finish, markdown, option_parser
+from twin_runs import drive_missions
 
 from restock.arrays import F64, Bools, Ints
 from restock.stats import interval_text, wilson

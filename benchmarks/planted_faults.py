@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from harness import finish, markdown, option_parser, run_restock, trained
+from harness import finish, markdown, option_parser, run_restock
+from twin_runs import trained
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter

@@ -23,8 +23,9 @@ from typing import Any
 
 import duckdb
 import numpy as np
-from harness import finish, markdown, mean_interval, once, option_parser, run_restock, trained
+from harness import finish, markdown, mean_interval, once, option_parser, run_restock
 from numpy.typing import NDArray
+from twin_runs import trained
 
 from restock.stats import interval_text, wilson
 

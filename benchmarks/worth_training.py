@@ -30,8 +30,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from drivers import drive
-from harness import finish, markdown, mean_interval, option_parser, trained
+from harness import finish, markdown, mean_interval, option_parser
 from numpy.typing import NDArray
+from twin_runs import trained
 
 from restock.stats import percentiles, wilson
 from restock.train.evaluation.policies import load_agent
