@@ -42,9 +42,11 @@ SUMMARIES = "summaries.sql"  # in place of others of the same name, where manife
 # What `Store.connection` has from the start, for those who ask it without `install_named`.
 COMMON = ("rows.sql", "views.sql", "labels.sql", "corrections.sql")
 # Views that are held in memory where many queries follow. Of any store, those of few rows that scan
-# many and are asked for more than once; of FEW_ROWS, those that others are made of, too: to bind a
-# table takes a tenth of the time, and its columns are read once.
+# many and are asked for more than once; where it has few enough rows, those that others are made
+# of, too: a table takes a tenth of the time to bind, and its columns are read once. Summaries lie
+# in a file of 166 columns for each recording until they are joined.
 HELD_OF_MANY = ("driven_episodes",)
+HELD_SUMMARIES = ("stored_summaries",)
 HELD = (
     "recordings",
     "transitions",
@@ -54,7 +56,8 @@ HELD = (
     "untold_conditions",
     "held_conditions",
 )
-FEW_ROWS = 50_000  # of about 1 kB
+FEW_ROWS = 100_000  # of about 1 kB
+FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes
 _INGESTS = "ingest_id IN (SELECT ingest_id FROM stored_transitions)"  # in rows.sql
 # A text with one of these words lists what there is.
 _LISTS = {
@@ -96,7 +99,7 @@ class Definitions:
         computed: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
         replaced: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
     ) -> None:
-        self._connection = connection
+        self._connection, self.summaries = connection, summaries
         self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
@@ -190,7 +193,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
     named = [view for view in HELD_OF_MANY if sum(view in text for text in texts) > 1]
     try:
         try:
-            made.hold([*(HELD if _few(connection) else ()), *named])
+            made.hold([*_held(connection, made), *named])
         except duckdb.Error:  # rows that cannot be read: the queries that ask for them say so
             made.release()
             if was_interrupted():
@@ -200,9 +203,13 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
         made.release()
 
 
-def _few(connection: duckdb.DuckDBPyConnection) -> bool:
-    rows = connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0]
-    return rows is not None and rows <= FEW_ROWS
+def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
+    """What is held of a store of this size."""
+    rows = connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
+    return [
+        *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
+        *(HELD if 0 < rows <= FEW_ROWS else ()),
+    ]
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:

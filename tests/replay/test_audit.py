@@ -19,9 +19,11 @@ from support.stores import TASK, manifest, recording_transitions, views_over, wr
 
 from restock import cli
 from restock.errors import ConfigError
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.places import open_place
+from restock.replay.store import definitions
 from restock.replay.store.audit import (
     Audit,
     Finding,
@@ -622,6 +624,46 @@ def test_thresholds_are_those_the_audits_use() -> None:
     shipped = load_thresholds()
     assert {name: set(table) for name, table in shipped.items()} == {
         name: audit.parameters for name, audit in AUDITS.items() if audit.parameters
+    }
+
+
+def test_findings_do_not_depend_on_what_is_held_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = StoreWriter(tmp_path / "store")
+    for number in (1, 2, 3):
+        rows = recording_transitions(number)
+        writer.write(manifest(rows), rows)
+
+    names = ("stored_summaries", "transitions")
+
+    def findings(most: dict[str, int]) -> list[tuple[str, str, int]]:
+        for name, limit in most.items():
+            monkeypatch.setattr(definitions, name, limit)
+        seen: dict[str, list[str]] = {}
+
+        def look(audit: str) -> None:
+            tables = store.bare.sql("SELECT table_name FROM duckdb_tables()").fetchall()
+            seen[audit] = [
+                name for (name,) in tables if name in ("transitions", "stored_summaries")
+            ]
+
+        with Store(tmp_path / "store") as store:
+            found = run_audits(store.connection, shipped_audits(), load_thresholds(), done=look)
+            kept[tuple(most.values())] = sorted(seen["missing_cells"])
+            look("after")
+            assert seen["after"] == []
+        return [(one.audit.name, one.status, one.rows) for one in found]
+
+    kept: dict[tuple[int, ...], list[str]] = {}
+    nothing = findings({"FEW_ROWS": 0, "FEW_SUMMARISED_ROWS": 0})
+    assert sum(bool(rows) for *_, rows in nothing) > 5
+    assert findings({"FEW_ROWS": 0, "FEW_SUMMARISED_ROWS": 10**6}) == nothing
+    assert findings({"FEW_ROWS": 10**6, "FEW_SUMMARISED_ROWS": 10**6}) == nothing
+    assert kept == {
+        (0, 0): [],
+        (0, 10**6): ["stored_summaries"],
+        (10**6, 10**6): ["stored_summaries", "transitions"],
     }
 
 
