@@ -635,31 +635,28 @@ def test_findings_do_not_depend_on_what_is_held_in_memory(
         rows = recording_transitions(number)
         writer.write(manifest(rows), rows)
 
-    names = ("stored_summaries", "transitions")
+    kept: dict[tuple[int, int], list[str]] = {}
 
-    def findings(most: dict[str, int]) -> list[tuple[str, str, int]]:
-        for name, limit in most.items():
-            monkeypatch.setattr(definitions, name, limit)
-        seen: dict[str, list[str]] = {}
+    def findings(rows: int, summarised_rows: int) -> list[tuple[str, str, int]]:
+        """With what is held of stores of so many rows at most."""
+        monkeypatch.setattr(definitions, "FEW_ROWS", rows)
+        monkeypatch.setattr(definitions, "FEW_SUMMARISED_ROWS", summarised_rows)
+        tables: list[str] = []
 
-        def look(audit: str) -> None:
-            tables = store.bare.sql("SELECT table_name FROM duckdb_tables()").fetchall()
-            seen[audit] = [
-                name for (name,) in tables if name in ("transitions", "stored_summaries")
-            ]
+        def look(_: str) -> None:
+            held = store.bare.sql("SELECT table_name FROM duckdb_tables()").fetchall()
+            tables[:] = {"transitions", "stored_summaries"}.intersection(name for (name,) in held)
 
         with Store(tmp_path / "store") as store:
             found = run_audits(store.connection, shipped_audits(), load_thresholds(), done=look)
-            kept[tuple(most.values())] = sorted(seen["missing_cells"])
-            look("after")
-            assert seen["after"] == []
+            kept[rows, summarised_rows] = sorted(tables)
+            look("")
+            assert not tables
         return [(one.audit.name, one.status, one.rows) for one in found]
 
-    kept: dict[tuple[int, ...], list[str]] = {}
-    nothing = findings({"FEW_ROWS": 0, "FEW_SUMMARISED_ROWS": 0})
+    nothing = findings(0, 0)
     assert sum(bool(rows) for *_, rows in nothing) > 5
-    assert findings({"FEW_ROWS": 0, "FEW_SUMMARISED_ROWS": 10**6}) == nothing
-    assert findings({"FEW_ROWS": 10**6, "FEW_SUMMARISED_ROWS": 10**6}) == nothing
+    assert findings(0, 10**6) == findings(10**6, 10**6) == nothing
     assert kept == {
         (0, 0): [],
         (0, 10**6): ["stored_summaries"],
