@@ -29,7 +29,7 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
-from restock.replay.store.definitions import install_named, rows_held
+from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
 from restock.words import between
@@ -141,7 +141,13 @@ def run_audits(
     Raises:
         ConfigError: an audit does not run, a threshold is missing, or one is given that no audit
             uses.
+        StoreError: the store has no transitions, in which no audit would find anything.
     """
+    if is_empty(connection):
+        raise StoreError(
+            "it holds no transitions: there is nothing to audit",
+            remedy="`restock ingest` recordings first",
+        )
     _check_thresholds(audits, thresholds)
     available = set(beside)
     available |= {

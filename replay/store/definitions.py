@@ -205,11 +205,21 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
     """What is held of a store of this size."""
-    rows = connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
+    rows = _rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
         *(HELD if 0 < rows <= FEW_ROWS else ()),
     ]
+
+
+def _rows(connection: duckdb.DuckDBPyConnection) -> int:
+    """How many transitions its files hold."""
+    return connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
+
+
+def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
+    """Whether it is that of a store without transitions."""
+    return connection in _OF and not _rows(connection)
 
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:

@@ -697,6 +697,19 @@ def test_the_verb_refuses_what_is_no_store(
     assert "not a store" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["audit"], ["audit", "--reward"], ["check"]], ids=" ".join)
+def test_a_store_that_lost_all_its_rows_passes_no_gate(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, rows = tmp_path / "store", recording_transitions(1)
+    StoreWriter(store).write(manifest(rows), rows)
+    for file in (store / "transitions").rglob("*.parquet"):
+        file.unlink()
+    assert cli.main(["compact", str(store), "--drop-damaged"]) == 3
+    assert cli.main([words[0], str(store), *words[1:]]) == 2
+    assert "it holds no transitions: there is nothing to audit" in capsys.readouterr().err
+
+
 def test_the_verb_refuses_a_run_that_is_none_and_a_file_it_cannot_write(
     store_path: Path, panels: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

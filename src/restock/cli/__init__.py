@@ -11,8 +11,10 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
+from restock.cli.streams import drop, substitute_what_cannot_be_shown, work_goes_on
 from restock.errors import ExitCode, RestockError
 from restock.imports import hidden, when_imported
 from restock.interrupts import kill_as_interrupt, was_interrupted
@@ -62,6 +64,7 @@ FOLDERS = {
     "robot": ("node",),
     "start": ("start", "demo"),
 }
+PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # of work that goes on where nobody reads it
 _FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
 
 
@@ -83,6 +86,7 @@ refused, 2 any other failure: wrong usage, bad input, a file that cannot be read
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
+    substitute_what_cannot_be_shown()
     try:
         with kill_as_interrupt():
             code = _dispatch(args)
@@ -92,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _interrupted()
     except BrokenPipeError:
         # The reader of our stdout went away (`| head`): no complaint, and none at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop(sys.stdout)
         return int(ExitCode.OK)
     except Exception as error:  # noqa: BLE001  (the one place that maps what nobody foresaw)
         if was_interrupted():  # a library reports it as an error of its own
@@ -142,7 +146,8 @@ def _dispatch(args: list[str]) -> int:
             )
     except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
-    code: int | None = parsed.run()
+    with work_goes_on() if verb in PRINTS_ON_THE_WAY else nullcontext():
+        code: int | None = parsed.run()
     return int(code or ExitCode.OK)
 
 

@@ -1,0 +1,71 @@
+"""Where what is printed cannot be shown, stored or read, the work is done all the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import IO
+
+import pytest
+from support.driven_robot import Drive, write_bag
+
+from restock.replay.store.store import Store
+
+FULL_DISK = Path("/dev/full")
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags")
+    for number in range(3):
+        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
+    return folder
+
+
+def ingested(bags: Path, store: Path, stdout: IO[bytes]) -> subprocess.CompletedProcess[str]:
+    words = ["ingest", str(bags), "--store", str(store)]
+    command = [sys.executable, "-m", "restock", *words]
+    return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
+
+
+def recordings(store: Path) -> int:
+    with Store(store) as opened:
+        return int(opened.sql("SELECT count(*) FROM recordings").fetchall()[0][0])
+
+
+def test_a_reader_that_goes_away_does_not_end_an_ingest(bags: Path, tmp_path: Path) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    with os.fdopen(write_end, "wb") as gone:
+        done = ingested(bags, tmp_path / "store", gone)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert recordings(tmp_path / "store") == 3
+
+
+@pytest.mark.skipif(not FULL_DISK.exists(), reason="no /dev/full here")
+def test_a_full_disk_behind_stdout_is_said_when_all_is_ingested(bags: Path, tmp_path: Path) -> None:
+    with FULL_DISK.open("wb") as full:
+        done = ingested(bags, tmp_path / "store", full)
+    assert done.returncode == 2
+    assert "what it prints (stdout): cannot be written: No space left on device" in done.stderr
+    assert recordings(tmp_path / "store") == 3
+
+
+def test_what_an_encoding_lacks_is_substituted(bags: Path, tmp_path: Path) -> None:
+    store = str(tmp_path / "store")
+    latin = os.environ | {"PYTHONIOENCODING": "ascii"}
+
+    def said(*words: str) -> str:
+        command = [sys.executable, "-m", "restock", *words]
+        done = subprocess.run(command, env=latin, capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.decode("ascii")
+
+    assert " topic " in said("ingest", str(bags), "--store", store)
+    assert recordings(tmp_path / "store") == 3
+    assert "------" in said("coverage", store)
+    (row,) = json.loads(said("sql", store, "SELECT 'ä─𝄞' AS text", "--json"))
+    assert row == {"text": "ä-𝄞"}
