@@ -116,8 +116,7 @@ class _Opening:
             raise RecordingError(
                 f"a folder that is not a bag: it has no {METADATA}",
                 where=str(self.path),
-                remedy="give one recording, or use `recordings_in` to find all recordings in a "
-                "folder",
+                remedy="give one recording of it (`restock info` lists them)",
             )
         metadata, problem = discover.read_metadata(self.path)
         if problem:

@@ -80,6 +80,11 @@ class Location:
         if isinstance(place, Location):
             return place
         text = str(place)
+        if not text.strip():
+            raise StoreError(
+                "the name of the store is empty",
+                remedy="give a folder, or s3://bucket/prefix: is a variable not set?",
+            )
         on_s3 = _S3.fullmatch(text)
         if not on_s3 and (scheme := _SCHEME.match(text)):
             raise StoreError(

@@ -52,12 +52,12 @@ class Task(Checked, frozen=True):
     goal: Literal["route", "none"] = "route"
     control_period_s: Annotated[float, Meta(gt=0)] = 0.2
     sectors: Annotated[int, Meta(ge=0)] = 36  # even, at least 4; 0: the robot has no lidar
-    range_min_m: float = 0.05
+    range_min_m: Annotated[float, Meta(ge=0)] = 0.05
     range_max_m: float = 4.0
-    near_m: float = 1.0  # distance of the near waypoint along the plan
-    far_m: float = 2.2
-    goal_radius_m: float = 0.4
-    time_limit_steps: int = 240
+    near_m: Annotated[float, Meta(gt=0)] = 1.0  # distance of the near waypoint along the plan
+    far_m: Annotated[float, Meta(gt=0)] = 2.2
+    goal_radius_m: Annotated[float, Meta(gt=0)] = 0.4
+    time_limit_steps: Annotated[int, Meta(ge=1)] = 240
     bump_terminates: bool = False  # a bump ends the episode (protective stop)
     rewards: Rewards = Rewards()
 
@@ -66,6 +66,11 @@ class Task(Checked, frozen=True):
             raise ValueError("actions must start with the stop action [0, 0]")
         if self.sectors % 2 or self.sectors == 2:
             raise ValueError(f"sectors must be even and 4 or more, or 0, got {self.sectors}")
+        if self.range_max_m <= self.range_min_m:
+            raise ValueError(
+                f"range_max_m must be above range_min_m, got {self.range_max_m:g} and"
+                f" {self.range_min_m:g}"
+            )
 
     @property
     def lidar(self) -> bool:

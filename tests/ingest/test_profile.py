@@ -59,6 +59,8 @@ def test_zones_are_looked_up_in_order():
         ("sectors = 36", "sectors = 5", "task.sectors must be even and 4 or more, or 0, got 5"),
         ("sectors = 36", "sectors = 0", "`task.sectors` is 0 (a robot without a lidar)"),
         ("control_period_s = 0.2", "control_period_s = 0", "task.control_period_s must be above 0"),
+        ("time_limit_steps = 240", "time_limit_steps = 0", "time_limit_steps must be at least 1"),
+        ("range_min_m = 0.05", "range_min_m = 4.5", "range_max_m must be above range_min_m"),
         ("  [0.0, 0.0],", "  [0.1, 0.0],", "actions must start with the stop action [0, 0]"),
         ('"recovery"', '"recvery"', "no condition named 'recvery'"),
         ('"recovery"', '"recovery", "recovery"', "recovery is given twice"),

@@ -294,6 +294,7 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
 @pytest.mark.parametrize(
     ("place", "said"),
     [
+        ("", "the name of the store is empty"),
         ("gs://bucket/store", "cannot be on gs:"),
         ("some%20where/store", "percent sign"),
         ("s3://bucket/some%20where", "percent sign"),
