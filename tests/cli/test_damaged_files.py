@@ -255,6 +255,7 @@ def writers(root: Path, out: Path) -> list[list[str]]:
     ]
 
 
+@pytest.mark.long
 def test_a_folder_that_is_not_there_is_made(root: Path, tmp_path: Path) -> None:
     for number, argv in enumerate(writers(root, tmp_path / "a" / "new")):
         assert cli.main(argv) == 0, (number, argv)

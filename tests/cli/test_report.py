@@ -653,6 +653,7 @@ def _on_floors(run: Path, path: Path, layouts: str, ended_on: str) -> str:
     return build_report(path).read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_the_floor_that_is_drawn_is_the_runs_own(run: Path, tmp_path: Path) -> None:
     hall = tmp_path / "hall.toml"
     hall.write_text("width_m = 20.0\ndepth_m = 5.0\nracks = [[1.0, 2.0, 8.0, 3.0]]\n")

@@ -194,6 +194,7 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert {row["robot"]: row["hours"] for row in table.rows} == expected
 
 
+@pytest.mark.long
 def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: Path) -> None:
     with Store(store_path) as store:
         cards, sections = coverage_of(store, missing(NEVER_SEEN))

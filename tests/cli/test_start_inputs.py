@@ -193,6 +193,7 @@ def test_what_cannot_be_used_is_refused_before_anything_is_written(
     assert not Path("out").exists()
 
 
+@pytest.mark.long
 def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on_with(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -182,6 +182,7 @@ def test_nothing_is_left_to_compact_and_a_dry_run_writes_nothing(tmp_path):
         compact(StoreWriter(tmp_path / "none"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("recording", [1, 3])
 def test_an_ingest_while_it_compacts_loses_nothing(tmp_path, monkeypatch, recording):
     """One that replaces a recording undoes the step; one that adds another does not."""
@@ -380,6 +381,7 @@ def test_an_ingest_into_a_joined_file_that_fails_leaves_no_file(tmp_path, monkey
     assert parquet(tmp_path / "s") == before
 
 
+@pytest.mark.long
 def test_manifests_are_written_again_a_bounded_number_of_times(tmp_path, monkeypatch):
     """However many there are: files of enough of them are left alone."""
     monkeypatch.setattr(compaction, "FULL_MANIFESTS", 4)

@@ -58,6 +58,7 @@ class Told(Drive):
         return found
 
 
+@pytest.mark.long
 def test_one_profile_has_what_only_some_of_the_drives_show(tmp_path, capsys):
     drives = {
         "slow": Told(duration_s=12.0, speed_mps=0.2),
@@ -193,6 +194,7 @@ def test_what_a_recording_says_of_its_robot(tmp_path: Path):
     assert "described as trolley" in str(found)
 
 
+@pytest.mark.long
 def test_where_one_drive_has_no_map_odometry_serves_all():
     """Of two bags of a TurtleBot 4, one had rows; `restock start` stopped at the other."""
     sample = ROOT / "sample_logs" / "amr_tuesday"

@@ -531,6 +531,7 @@ def family(kind: RosType) -> set[str]:
     return names
 
 
+@pytest.mark.long
 def test_the_same_drive_in_every_encoding(tmp_path: Path) -> None:
     profile, ingest_files = load_profile("warehouse_amr"), files("restock.ingest.profile")
     tables: dict[str, pa.Table] = {}

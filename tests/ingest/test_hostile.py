@@ -430,6 +430,7 @@ def test_zstd_messages_are_inflated_a_few_at_a_time(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "90\n"), done.stderr
 
 
+@pytest.mark.long
 def test_definitions_are_parsed_up_to_a_sum(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -167,6 +167,7 @@ def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [Path(row["source_file"]).name for row in one["sample"]]
 
 
+@pytest.mark.long
 def test_the_audit_names_stale_labels_until_they_are_run_again(store, tmp_path, capsys):
     """End to end: a changed condition, one recording ingested by it, the other one labelled."""
     profile = tmp_path / "amr.toml"

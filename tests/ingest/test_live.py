@@ -89,6 +89,7 @@ def test_a_recording_with_a_message_cut_short_cannot_be_played(
         list(play(Pilot(PolicyFile(policy), None), bag))
 
 
+@pytest.mark.long
 def test_a_recording_is_played_at_the_shell(
     policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_profile_has_wheels_or_motion(tmp_path, capsys):
         assert what in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")
 def test_a_real_robot_in_motion_capture(tmp_path, capsys):
     rows = []

@@ -90,6 +90,7 @@ def test_the_rows_of_a_takeover_are_the_operators(tmp_path):
     assert "[signals.restock_takeover]" not in file.read_text()
 
 
+@pytest.mark.long
 def test_start_names_the_operator_too(tmp_path, capsys):
     bag = write_topics(taken_over(), tmp_path / "bag")
     out = tmp_path / "out"

@@ -19,6 +19,8 @@ from restock.ingest.on_ray import prepare_on_ray
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:

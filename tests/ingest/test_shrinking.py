@@ -104,6 +104,7 @@ def test_zeros_in_a_chunk_and_in_a_compressed_file_are_damage(tmp_path: Path) ->
         open_recording(path)
 
 
+@pytest.mark.long
 def test_small_records_without_end_are_refused(tmp_path: Path) -> None:
     record = b"\x80" + bytes(8)
     path = tmp_path / "run.mcap"
@@ -113,6 +114,7 @@ def test_small_records_without_end_are_refused(tmp_path: Path) -> None:
         open_recording(path)
 
 
+@pytest.mark.long
 def test_large_blobs_of_a_sqlite_bag_are_read_one_by_one(tmp_path: Path) -> None:
     """Of 60 MB, and of 300: that is too large, and counted."""
     file = tmp_path / "run.db3"

@@ -86,6 +86,7 @@ def test_the_command_names_it_and_exits_3(bags, tmp_path, monkeypatch, capsys):
     assert "drive1: the process that read it was killed (SIGKILL)" in err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -156,6 +157,7 @@ def rows(store: Path) -> dict[str, int]:
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux' /proc")
 
 
+@pytest.mark.long
 @needs_proc
 @pytest.mark.parametrize(("workers", "after_s"), one_in(3, [("2", 0.0), ("1", 0.0), ("2", 0.06)]))
 def test_a_kill_of_the_whole_command_leaves_whole_recordings(bags, tmp_path, workers, after_s):

@@ -37,6 +37,7 @@ def test_importing_the_rooms_loads_none_of_the_heavy_libraries() -> None:
     assert python(f"import sys, {names}; print({heavy} & set(sys.modules))") == "set()"
 
 
+@pytest.mark.long
 def test_importing_restock_is_enough_to_reach_a_room() -> None:
     code = "import restock; print(restock.twin.EpisodeSpec.__name__, restock.train.train.__name__)"
     assert python(code) == "EpisodeSpec train"

@@ -35,6 +35,7 @@ def test_the_files_are_those_of_the_manifest(manifest: dict[str, Any]) -> None:
     assert sum(entry["bytes"] for entry in manifest["files"].values()) <= 12_000_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_every_topic_is_there_and_every_message_decodes(name: str) -> None:
     with AnyReader([SAMPLES / name]) as reader:
@@ -47,6 +48,7 @@ def test_every_topic_is_there_and_every_message_decodes(name: str) -> None:
     assert decoded["/scan"].header.frame_id == "laser_link"
 
 
+@pytest.mark.long
 def test_mcap_finds_its_chunks_whole() -> None:
     with (SAMPLES / "amr_monday.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)

@@ -78,6 +78,7 @@ def test_a_salvaged_part_and_the_whole_recording(
     assert printed(capsys, store, same) == []
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not NEATO.is_dir(), reason="needs ../shared/bags/fleet-neato")
 def test_a_drive_that_was_replayed_and_recorded_again_a_year_later(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

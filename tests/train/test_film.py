@@ -99,6 +99,7 @@ def test_a_film_is_made_of_what_was_recorded_and_of_nothing_else(
     assert "could not be read" in facts.missing[0]
 
 
+@pytest.mark.long
 def test_a_rescue_shows_who_failed_beside_who_arrived(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -234,6 +234,7 @@ def test_the_same_episodes_are_flushed_once(collecting: Collecting, tmp_path: Pa
     assert len(writer.live()) == 2
 
 
+@pytest.mark.long
 def test_what_is_kept_goes_on_exactly_from_a_checkpoint(tmp_path: Path) -> None:
     def state(made: Collecting) -> dict[str, Any]:
         return {

@@ -16,6 +16,8 @@ from restock import cli
 from restock.replay.store.store import Store
 from restock.train.finite import STOPPED, NotFinite
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(
     scope="module", params=one_in(2, [trained_sb3, trained_tianshou]), ids=["sb3", "tianshou"]

@@ -52,6 +52,7 @@ def test_every_example_is_run_and_explained() -> None:
     assert all(f"examples/{name}.py" in page for name in NEEDS)
 
 
+@pytest.mark.long
 def test_stable_baselines3_dqn() -> None:
     done = example("sb3_dqn").main(steps=320, num_envs=2)
     assert done["env_steps"] == 320
@@ -59,6 +60,7 @@ def test_stable_baselines3_dqn() -> None:
     assert isinstance(done["success"], bool)
 
 
+@pytest.mark.long
 def test_stable_baselines3_sac_on_the_continuous_face() -> None:
     done = example("sb3_sac").main(steps=200, num_envs=2)
     assert done["env_steps"] == 200

@@ -33,6 +33,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "panel"
 
 
+@pytest.mark.long
 def test_nothing_drives_and_what_was_learnt_last_is_kept(
     panel: Path,
     tmp_path: Path,

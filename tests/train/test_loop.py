@@ -217,6 +217,7 @@ def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path, quick_cl
     assert {"dqn", "cloned"} <= {r["behaviour_policy"] for r in fed if r["source"] == "fresh"}
 
 
+@pytest.mark.long
 def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path, quick_clone: None) -> None:
     whole = run_to_end(tmp_path / "whole", config(**JUMP_START))
     path = Path(shutil.copytree(whole.run.path, tmp_path / "cut"))

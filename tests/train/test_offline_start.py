@@ -159,6 +159,7 @@ def panel(tmp_path: Path) -> Panel:
     return panel_of(write_store(tmp_path / "store", tables, task=TASK), MIXTURE, tmp_path / "panel")
 
 
+@pytest.mark.long
 def test_a_run_begins_with_what_was_chosen_and_keeps_it_until_it_is_beaten(
     panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

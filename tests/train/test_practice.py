@@ -345,6 +345,7 @@ def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path
     np.testing.assert_array_equal(first.ring.rows, again.ring.rows)
 
 
+@pytest.mark.long
 def test_a_reference_drives_the_same_pool_of_every_arm_whatever_the_seed() -> None:
     given = [
         "practice={rule='regret', reference='planner', reference_missions=3}",

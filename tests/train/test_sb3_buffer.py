@@ -26,6 +26,7 @@ def panel(store: Path) -> Panel:
     return make_panel(store, store.parent / "panel", n_step=3)
 
 
+@pytest.mark.long
 def test_fresh_rows_are_what_the_environment_gave(tmp_path: Path) -> None:
     """Against Stable-Baselines3's own n-step buffer, fed the same steps."""
     from stable_baselines3.common.buffers import NStepReplayBuffer

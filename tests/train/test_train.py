@@ -146,6 +146,7 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     assert whole["exploration"] == parts["exploration"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ended_by", one_in(2, [signal.SIGINT, signal.SIGTERM]))
 def test_ctrl_c_or_a_kill_writes_a_checkpoint_and_says_how_to_go_on(
     ended_by: signal.Signals, tmp_path: Path
@@ -349,6 +350,7 @@ def test_a_panel_of_a_task_that_no_profile_has_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 def test_a_panel_brings_its_profile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     task = load_profile("turtlebot3").task
     rows = recording_transitions(1, episodes=40, task=task)

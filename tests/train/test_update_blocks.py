@@ -118,6 +118,7 @@ def test_a_draw_that_depends_on_td_errors_waits_for_them(device: str, tmp_path: 
     live.close()
 
 
+@pytest.mark.long
 def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path) -> None:
     whole = trained(in_blocks(tmp_path / "whole", device))
     assert_same_run(whole, trained(in_blocks(tmp_path / "again", device)))

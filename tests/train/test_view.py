@@ -215,6 +215,7 @@ def test_an_rrd_is_read_by_rerun(event: Event, tmp_path: Path) -> None:
     assert len(values["critic/td_error"]) == len(event.steps)
 
 
+@pytest.mark.long
 def test_an_episode_of_the_evaluation_stands_beside_it(event: Event, tmp_path: Path) -> None:
     plan = plan_evaluation(event.run, policies=("agent",), episodes="wheel_slip=1")
     drive_evaluation(plan)

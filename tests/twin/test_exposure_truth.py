@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pytest
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.episode_rows import label_table
@@ -44,6 +45,7 @@ def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
     assert (small.slip_limit_mps, usual.slip_limit_mps) == (0.03, 0.15)
 
 
+@pytest.mark.long
 def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episodes() -> None:
     """Truth comes from what is there; exposures are told by what the robot senses."""
     told: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}

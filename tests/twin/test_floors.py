@@ -333,6 +333,7 @@ def _drive(env: WarehouseVectorEnv, specs: list[EpisodeSpec], steps: int) -> np.
     return np.array(seen)
 
 
+@pytest.mark.long
 def test_an_episode_is_the_same_alone_and_among_other_floors_whatever_the_threads() -> None:
     floors = open_floors("default,generated:train:3,narrow:1")
     # What comes after a bump is drawn among the floors that are there.

@@ -50,6 +50,8 @@ from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
+pytestmark = pytest.mark.long
+
 # What the recorded robot is, and the nominal twin is not.
 TRUE = Perturbation(
     name="true", payload_kg=30.0, wheel_radius_scale=0.96, latency_s=0.15, gain=0.97

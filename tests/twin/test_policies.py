@@ -62,6 +62,7 @@ def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
     assert min(success(Operator(), kind).values()) >= 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layouts", ["default", "generated:test"])
 def test_the_operator_gets_past_pallets(layouts: str) -> None:
     """Through the gap where there is one, and around where there is none, on floors of any kind."""
@@ -102,6 +103,7 @@ def test_random_driving_hardly_ever_arrives() -> None:
     assert success(RandomPolicy(), "nominal")["none"] <= 0.1
 
 
+@pytest.mark.long
 def test_the_operator_takes_over_from_a_stuck_planner_and_hands_back() -> None:
     policy = Handover(PlannerFollower(), Operator())
     blocked = success(policy, "blocked_aisle")

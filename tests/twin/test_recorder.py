@@ -37,6 +37,7 @@ from restock.train.twin.recording.recorder import (
 )
 
 
+@pytest.mark.long
 def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
     """Whose it is, too: ingest reads the tags that the recorder writes."""
     tables = []
@@ -146,6 +147,7 @@ def test_a_recording_is_never_overwritten(
     assert (tmp_path / "log.mcap").read_text() == "precious"
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "restock", "record", "--minutes", "600", "--out"]
     process = subprocess.Popen([*command, str(tmp_path / "log.mcap")], stderr=subprocess.PIPE)

@@ -97,6 +97,7 @@ def test_headings_are_the_same_all_the_way_round() -> None:
     assert np.isfinite(lattice.times_s).all()
 
 
+@pytest.mark.long
 def test_where_a_rule_leaves_no_way_around_a_block_it_is_broken() -> None:
     """As plans do: behind a block in a one-way aisle a goal is reached against its heading."""
     broken = 0

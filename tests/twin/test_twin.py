@@ -103,6 +103,7 @@ def test_an_episode_is_the_same_in_any_place_and_company() -> None:
         np.testing.assert_array_equal(one[0], many[2])
 
 
+@pytest.mark.long
 def test_state_continues_bit_for_bit_through_a_file_and_in_a_fresh_environment(
     env: WarehouseVectorEnv, tmp_path: Path
 ) -> None:
