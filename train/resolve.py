@@ -56,8 +56,7 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
     """
     teacher = config.teacher
     if teacher.source is None:
-        soft = config.loss.munchausen > 0 and teacher.target == "filtered"
-        source = "operator" if profile.task.goal == "route" and not soft else "none"
+        source = "operator" if profile.task.goal == "route" else "none"
         teacher = msgspec.structs.replace(teacher, source=source)
     teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:

@@ -12,7 +12,7 @@ from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import NetworkConfig, TrainConfig
 from restock.train.dqn.fitted_q import FittedQConfig
-from restock.train.dqn.network import Network, make_network
+from restock.train.dqn.network import QNetwork, make_network
 from restock.train.run import checkpoint
 from restock.train.run.run import Run, panel_document
 
@@ -21,7 +21,7 @@ NETWORK = NetworkConfig()
 QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloning_updates=50)
 
 
-def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> Network:
+def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> QNetwork:
     """What `kept_run` keeps: random weights, seed 0."""
     generator = torch.Generator().manual_seed(0)
     return make_network(settings, task.observation_size, len(task.actions), generator)

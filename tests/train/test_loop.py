@@ -538,7 +538,7 @@ def test_terms_that_the_logs_cannot_serve_are_refused(
 def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
     settings = config(
         loss={"margin": 0.5, "conservative": 0.1},
-        network={"hidden": [16], "quantiles": 4, "ensemble": 2},
+        network={"hidden": [16], "dueling": True},
         schedule={**SMALL["schedule"], "env_steps": 800},
     )
     whole = run_to_end(tmp_path / "whole", settings)

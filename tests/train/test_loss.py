@@ -10,9 +10,6 @@ from restock.train.dqn.loss import (
     dqn_loss,
     huber,
     margin_penalty,
-    munchausen_target,
-    quantile_loss,
-    quantile_target,
     td_target,
 )
 
@@ -71,49 +68,6 @@ def test_conservative_penalty_by_hand() -> None:
     q = tensor([[0.0, 0.0], [1.0, 3.0]])
     # log 2 - 0 = 0.6931; log(e + e^3) - 3 = 0.1269
     assert float(conservative_penalty(q, tensor([0, 1]))) == pytest.approx(0.4100, abs=1e-4)
-
-
-def test_munchausen_by_hand() -> None:
-    # Equal values at s: log pi = log 1/2, times 0.5 is -0.3466; floored at -0.3. At s' they are
-    # equal too: sum pi (q - t log pi) = 2 + 0.5 * log 2 = 2.3466.
-    target = munchausen_target(
-        reward=tensor([1.0]),
-        discount=tensor([0.9]),
-        action=tensor([0]),
-        target_q=tensor([[3.0, 3.0]]),
-        next_target_q=tensor([[2.0, 2.0]]),
-        scale=0.9,
-        temperature=0.5,
-        floor=-0.3,
-    )
-    assert target.tolist() == pytest.approx([1 - 0.9 * 0.3 + 0.9 * 2.346574], abs=1e-5)
-
-
-def test_quantile_loss_by_hand() -> None:
-    # Quantiles 0 and 2 (levels 1/4, 3/4) against the one target 1: u = 1 and -1, huber 1/2 each;
-    # |1/4 - 0| / 2 + |3/4 - 1| / 2 = 0.25.
-    loss = quantile_loss(tensor([[[0.0, 2.0], [9.0, 9.0]]]), tensor([0]), tensor([[1.0]]))
-    assert loss.value.item() == pytest.approx(0.25)
-    assert loss.q.tolist() == [1.0]
-    assert loss.td.tolist() == [0.0]
-
-
-def test_quantiles_at_the_true_ones_have_no_gradient() -> None:
-    quantiles = tensor([[[0.0, 1.0]]], requires_grad=True)
-    quantile_loss(quantiles, tensor([0]), tensor([[0.0, 0.0, 1.0, 1.0]])).value.backward()
-    assert quantiles.grad is not None
-    assert quantiles.grad.abs().max().item() < 0.13  # huber's curvature, no more
-
-
-def test_quantile_target_takes_the_best_action_of_the_least_member() -> None:
-    first = tensor([[[0.0, 2.0], [5.0, 7.0]]])  # means 1 and 6
-    second = tensor([[[3.0, 5.0], [1.0, 3.0]]])  # means 4 and 2
-    reward, discount = tensor([1.0]), tensor([0.5])
-    # The least means are 1 and 2: action 1, of the second member.
-    target = quantile_target(reward, discount, [first, second])
-    assert target.tolist() == [[1.5, 2.5]]
-    chosen = quantile_target(reward, discount, [first, second], tensor([[9.0, 0.0]]))
-    assert chosen.tolist() == [[1.0, 2.0]]
 
 
 def test_margin_by_hand() -> None:

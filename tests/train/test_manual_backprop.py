@@ -83,10 +83,9 @@ def test_a_network_that_does_not_learn_is_evaluated_alone() -> None:
         backprop.backward(q)
 
 
-@pytest.mark.parametrize("options", [{"dueling": True}, {"quantiles": 4}])
-def test_other_networks_are_refused(options: dict[str, Any]) -> None:
+def test_a_dueling_network_is_refused() -> None:
     with pytest.raises(TypeError, match="plain"):
-        ManualBackprop(QNetwork(OBSERVATION, ACTIONS, **options))
+        ManualBackprop(QNetwork(OBSERVATION, ACTIONS, dueling=True))
 
 
 def problem() -> tuple[Tensor, Tensor, Tensor]:
@@ -145,7 +144,6 @@ def rows(seed: int) -> Tensor:
     [
         {},
         {"loss": {"double": False}},
-        {"loss": {"munchausen": 0.9}},
         {"loss": {"margin": 0.7}},
         {"optimizer": {"max_grad_norm": 0.05}},
         {"target": {"rule": "hard", "every": 3}},
@@ -180,7 +178,7 @@ def test_the_way_is_chosen_by_the_network_and_the_device() -> None:
         return update_path(parse_config({"network": network}, where="test").network, "cpu")
 
     assert of() == of(layer_norm=False, hidden=(8,)) == BY_HAND[-1]
-    assert of(dueling=True) == of(quantiles=8) == of(ensemble=2) == "autograd"
+    assert of(dueling=True) == "autograd"
     assert update_path(parse_config({}, where="test").network, "cuda") == "manual"
     assert learner(None).path == BY_HAND[-1]
 

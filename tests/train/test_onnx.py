@@ -23,19 +23,7 @@ runtime = pytest.importorskip("onnxruntime")
 TASK = load_profile("warehouse_amr").task
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"layer_norm": False},
-        {"dueling": True},
-        {"quantiles": 5},
-        {"quantiles": 5, "dueling": True},
-        {"ensemble": 3},
-        {"ensemble": 2, "quantiles": 4, "dueling": True},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("settings", [{}, {"layer_norm": False}, {"dueling": True}], ids=str)
 def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
     config = msgspec.convert({"hidden": [32, 24], **settings}, NetworkConfig)
     network = make_network(config, 11, 5, torch.Generator().manual_seed(3))

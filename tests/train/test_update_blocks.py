@@ -60,9 +60,6 @@ WAYS: dict[str, dict[str, Any]] = {
     "margin": {"loss": {"margin": 0.5, "margin_policies": ["operator"]}},
     "clipped": {"optimizer": {"learning_rate": 3e-3, "max_grad_norm": 0.1}},
     "dueling": {"network": {"hidden": [16], "dueling": True}, "loss": {"conservative": 0.5}},
-    "quantiles": {"network": {"hidden": [16], "quantiles": 4}, "loss": {"conservative": 0.5}},
-    "ensemble": {"network": {"hidden": [16], "ensemble": 2}, "loss": {"margin": 0.5}},
-    "munchausen": {"loss": {"munchausen": 0.9}},
     "teacher": {"teacher": {"source": "logs", "hidden": [16], "offline_updates": 20}},
 }
 

@@ -19,6 +19,7 @@ import pyarrow as pa
 from restock.arrays import F64
 from restock.errors import RunError
 from restock.train.comparison.comparability import Feed
+from restock.train.dqn.removed_settings import without_removed
 from restock.train.run.run import Run
 
 Treatment = Literal["algorithm", "target", "mixture", "practice", "data", "method"]
@@ -200,7 +201,7 @@ def _feed(table: pa.Table, cells: list[str]) -> Feed:
 
 def differences(first: Run, second: Run) -> list[Difference]:
     """The settings in which two runs differ, each with what kind of difference it is."""
-    a, b = dict(_flat(first.document)), dict(_flat(second.document))
+    a, b = _settings(first), _settings(second)
     if a.get("panel.id") is None or b.get("panel.id") is None:
         # One was fed no logs at all: that is one difference of the feed, not one of the store.
         for settings in (a, b):
@@ -217,6 +218,12 @@ def differences(first: Run, second: Run) -> list[Difference]:
         for name in dict.fromkeys([*a, *b])
         if a.get(name) != b.get(name)
     ]
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """What `config.json` says of a run, by dotted name."""
+    config = without_removed(run.document.get("config", {}))
+    return dict(_flat({**run.document, "config": config}))
 
 
 def kind_of(setting: str) -> Kind:

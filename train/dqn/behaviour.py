@@ -22,7 +22,7 @@ from restock.state import Stateful
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
 from restock.train.dqn.manual_backprop import UpdatePath, make_backprop
-from restock.train.dqn.network import Network, QNetwork, clone, make_network
+from restock.train.dqn.network import QNetwork, clone, make_network
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
 _SEED = 1 << 32  # apart from that of Q, which may be as large
@@ -69,7 +69,7 @@ class FilteredNetwork(nn.Module):
 
     ratio: Tensor
 
-    def __init__(self, values: Network, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
+    def __init__(self, values: QNetwork, behaviour: QNetwork, ratio: Tensor | None = None) -> None:
         super().__init__()
         self.values, self.behaviour = values, behaviour
         self.observation_size, self.actions = values.observation_size, values.actions
@@ -93,7 +93,7 @@ class ProposedNetwork(nn.Module):
             them in their last two entries; the one before says whether there is a proposal.
     """
 
-    def __init__(self, inner: Network | FilteredNetwork, actions: Tensor) -> None:
+    def __init__(self, inner: QNetwork | FilteredNetwork, actions: Tensor) -> None:
         super().__init__()
         self.inner = inner
         self.observation_size, self.actions = inner.observation_size, inner.actions
@@ -113,7 +113,7 @@ class ProposedNetwork(nn.Module):
         return q.masked_fill(followed & ~nearest, -torch.inf)
 
 
-PolicyNetwork = Network | FilteredNetwork | ProposedNetwork
+PolicyNetwork = QNetwork | FilteredNetwork | ProposedNetwork
 
 
 def make_behaviour(

@@ -20,6 +20,7 @@ from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.replay.mixture.schedules import Portion
 from restock.toml import Checked, read_toml, toml_value, typed
+from restock.train.dqn.removed_settings import refuse_removed, without_removed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
 from restock.train.twin.physics.perturbation import find_perturbation
@@ -38,14 +39,10 @@ class NetworkConfig(Checked, frozen=True):
     hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
     dueling: bool = False
-    quantiles: NonNegativeInt = 0  # per action, of the return (QR-DQN); 0: learn the mean
-    ensemble: Count = 1  # networks: acts by the mean, target is the least
 
     def check(self) -> None:
         if not self.hidden:
             raise ValueError("hidden must name the width of at least one layer, got []")
-        if self.quantiles == 1:
-            raise ValueError("quantiles must be 0 or above 1, got 1")
 
 
 class LossConfig(Checked, frozen=True):
@@ -57,9 +54,6 @@ class LossConfig(Checked, frozen=True):
     conservative_online: NonNegative = 0.0  # weight that it changes to, linearly, when online
     conservative_steps: Count = 20_000  # environment steps of that change
     calibrated: bool = False  # Cal-QL: bounds the CQL term by the logs' return-to-go
-    munchausen: Share = 0.0  # weight of the log-policy in the reward (0.9 in the paper); 0: off
-    munchausen_temperature: Positive = 0.03
-    munchausen_floor: Annotated[float, Meta(le=0)] = -1.0  # lower bound of log-policy * temperature
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
     margin_size: NonNegative = 0.8  # the margin: how much better their action must be
     margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin
@@ -266,13 +260,6 @@ class TrainConfig(Checked, frozen=True):
     record: RecordConfig = RecordConfig()
 
     def check(self) -> None:
-        if self.loss.munchausen and self.network.quantiles:
-            raise ValueError("loss.munchausen and network.quantiles cannot be combined: choose one")
-        if self.loss.munchausen and self.teacher.filters and self.teacher.target == "filtered":
-            raise ValueError(
-                'loss.munchausen averages over all actions, teacher.target = "filtered" leaves'
-                ' some out: choose one, or teacher.target = "all"'
-            )
         unknown = set(self.guard.conditions) - set(self.env.conditions)
         if unknown:
             raise ValueError(
@@ -317,8 +304,10 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """A typed config from plain values.
 
     Raises:
-        ConfigError: an unknown or renamed key, or a value out of range; names the key.
+        ConfigError: an unknown, renamed or removed key, or a value out of range; names the key.
     """
+    document = without_removed(document)
+    refuse_removed(document, where=where)
     remedy = "docs/train.md lists every key with its meaning"
     return typed(document, TrainConfig, where=where, remedy=remedy, renamed=RENAMED)
 

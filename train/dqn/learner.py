@@ -24,10 +24,6 @@ from restock.train.dqn.loss import (
     dqn_loss,
     margin_gradient,
     margin_penalty,
-    mean_loss,
-    munchausen_target,
-    quantile_loss,
-    quantile_target,
     td_target,
 )
 from restock.train.dqn.manual_backprop import (
@@ -37,7 +33,7 @@ from restock.train.dqn.manual_backprop import (
     update_path,
 )
 from restock.train.dqn.native_backprop import NativeBackprop, native_td_loss
-from restock.train.dqn.network import Network, clone, make_network
+from restock.train.dqn.network import QNetwork, clone, make_network
 from restock.train.dqn.target import Polyak, TargetUpdate
 
 _ByHand = ManualBackprop | NativeBackprop
@@ -86,7 +82,7 @@ class Learner(Stateful):
         """`path` None takes the fastest that the config allows; both agree but for rounding."""
         self.device = open_device(config.device)
         self.loss: LossConfig = config.loss
-        self.network: Network = make_network(
+        self.network: QNetwork = make_network(
             config.network,
             observation_size,
             actions,
@@ -209,36 +205,19 @@ class Learner(Stateful):
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
-        target = self._target(observation, next_observation, action, reward, discount)
+        target = self._target(self.target_network, next_observation, reward, discount)
         logged, share = terms.logged, terms.logged / len(rows)
-        losses, penalties = [], []
-        for member in self.network.members:
-            if member.quantiles:
-                spread = member.distribution(observation)
-                q = spread.mean(dim=2)
-                loss = quantile_loss(
-                    spread, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
-                )
-            else:
-                q = member(observation)
-                loss = dqn_loss(
-                    q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta
-                )
-            losses.append(loss)
-            if terms.has_conservative:
-                term = conservative_penalty(
-                    q[:logged], action[:logged], terms.return_to_go, terms.conservative
-                )
-                penalties.append(term * share)
-            if terms.expert is not None:
-                term = margin_penalty(
-                    q[:logged], action[:logged], terms.expert, self.loss.margin_size
-                )
-                penalties.append(self.loss.margin * term * share)
-        loss = mean_loss(losses)
+        q = self.network(observation)
+        loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta)
         value = loss.value
-        if penalties:
-            value = value + torch.stack(penalties).sum() / len(losses)
+        if terms.has_conservative:
+            term = conservative_penalty(
+                q[:logged], action[:logged], terms.return_to_go, terms.conservative
+            )
+            value = value + term * share
+        if terms.expert is not None:
+            term = margin_penalty(q[:logged], action[:logged], terms.expert, self.loss.margin_size)
+            value = value + self.loss.margin * term * share
         self.optimizer.gradient.zero_()
         value.backward()  # type: ignore[no-untyped-call]
         return loss
@@ -248,28 +227,21 @@ class Learner(Stateful):
         """Fill the gradient by hand: the plain network, with every term of the loss."""
         size, settings, logged = self.network.observation_size, self.loss, terms.logged
         observation, next_observation, action, reward, discount = unpack(rows, size)
-        target: Tensor | None = None
-        if settings.munchausen:
-            (q,) = online.forward(observation)
-            slow_q, slow_next_q = slow.forward(observation, next_observation)
-            target = self._munchausen(reward, discount, action, slow_q, slow_next_q)
-        else:
-            # Of Double DQN s and s' go through the online network together.
-            inputs = (observation, next_observation) if settings.double else (observation,)
-            q, *following = online.forward(*inputs)
-            next_q = following[0] if following else None
-            (slow_q,) = slow.forward(next_observation)
-            plausible = self._plausible(next_observation)
-            if self.path != "native":
-                target = td_target(reward, discount, slow_q, next_q, plausible)
+        # Of Double DQN s and s' go through the online network together.
+        inputs = (observation, next_observation) if settings.double else (observation,)
+        q, *following = online.forward(*inputs)
+        next_q = following[0] if following else None
+        (slow_q,) = slow.forward(next_observation)
+        plausible = self._plausible(next_observation)
         weight, delta = terms.weight, settings.huber_delta
-        if target is None:
+        if self.path == "native":
             loss, gradient = native_td_loss(
                 *(q, slow_q, next_q, plausible, rows[:, 2 * size :]),
                 weight=weight,
                 huber_delta=delta,
             )
         else:
+            target = td_target(reward, discount, slow_q, next_q, plausible)
             loss = dqn_loss(q, action, target, weight=weight, huber_delta=delta)
             gradient = dqn_gradient(loss.td, action, q.shape[1], weight=weight, huber_delta=delta)
         share = logged / len(rows)
@@ -287,50 +259,18 @@ class Learner(Stateful):
 
     @torch.no_grad()
     def _target(
-        self,
-        observation: Tensor,
-        next_observation: Tensor,
-        action: Tensor,
-        reward: Tensor,
-        discount: Tensor,
-        *,
-        slow: Network | None = None,
+        self, slow: QNetwork, next_observation: Tensor, reward: Tensor, discount: Tensor
     ) -> Tensor:
-        """What Q(s, a) should be: (B,), or its quantiles (B, N)."""
-        slow = slow or self.target_network
-        if self.loss.munchausen:
-            slow_q, slow_next_q = slow(observation), slow(next_observation)
-            return self._munchausen(reward, discount, action, slow_q, slow_next_q)
+        """What Q(s, a) should be, (B,), where `slow` evaluates the next action."""
         next_q = self.network(next_observation) if self.loss.double else None
         plausible = self._plausible(next_observation)
-        if self.network.quantiles:
-            return quantile_target(
-                reward,
-                discount,
-                [member.distribution(next_observation) for member in slow.members],
-                next_q,
-                plausible,
-            )
-        targets = [
-            td_target(reward, discount, member(next_observation), next_q, plausible)
-            for member in slow.members
-        ]
-        return targets[0] if len(targets) == 1 else torch.stack(targets).amin(dim=0)
+        return td_target(reward, discount, slow(next_observation), next_q, plausible)
 
     def _plausible(self, next_observation: Tensor) -> Tensor | None:
         """The actions (B, A) that the target's maximum may look at; None: all."""
         if self.behaviour is None or not self._filters_target:
             return None
         return self.behaviour.plausible(next_observation)
-
-    def _munchausen(self, *parts: Tensor) -> Tensor:
-        """`munchausen_target` of reward, discount, action and the target network at s and s'."""
-        return munchausen_target(
-            *parts,
-            scale=self.loss.munchausen,
-            temperature=self.loss.munchausen_temperature,
-            floor=self.loss.munchausen_floor,
-        )
 
     @property
     def is_finite(self) -> bool:
@@ -349,17 +289,10 @@ class Learner(Stateful):
         observation, next_observation, action, reward, discount = unpack(
             rows, self.network.observation_size
         )
-        target = self._target(
-            observation,
-            next_observation,
-            action,
-            reward,
-            discount,
-            slow=self.network if online else None,
-        )
+        slow = self.network if online else self.target_network
+        target = self._target(slow, next_observation, reward, discount)
         q: Tensor = self.network(observation)
-        value = target.mean(dim=1) if target.ndim == 2 else target
-        return dqn_loss(q, action, value).td, q, self.target_network(observation)
+        return dqn_loss(q, action, target).td, q, self.target_network(observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """The best action (N,) of each observation (N, D), among the plausible ones."""

@@ -10,7 +10,6 @@ terminated. A truncated episode bootstraps: its d is not 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,26 +45,10 @@ def td_target(
             (discrete BCQ, arXiv:1910.01708). None: all of them.
     """
     chooses = next_target_q if next_online_q is None else next_online_q
-    best = _best(chooses, plausible).unsqueeze(1)
-    return reward + discount * next_target_q.gather(1, best).squeeze(1)
-
-
-def _best(q: Tensor, plausible: Tensor | None) -> Tensor:
-    """The action (B,) of the highest of the values `q` (B, A) that are `plausible` (B, A)."""
     if plausible is not None:
-        q = q.masked_fill(~plausible, -torch.inf)
-    return q.argmax(dim=1)
-
-
-def mean_loss(losses: Sequence[Loss]) -> Loss:
-    """The mean over an ensemble's members."""
-    if len(losses) == 1:
-        return losses[0]
-    value, td, q = (
-        torch.stack([getattr(loss, name) for loss in losses]).mean(dim=0)
-        for name in ("value", "td", "q")
-    )
-    return Loss(value, td, q)
+        chooses = chooses.masked_fill(~plausible, -torch.inf)
+    best = chooses.argmax(dim=1, keepdim=True)
+    return reward + discount * next_target_q.gather(1, best).squeeze(1)
 
 
 def huber(error: Tensor, delta: float = 1.0) -> Tensor:
@@ -90,60 +73,6 @@ def dqn_loss(
     each = huber(td, huber_delta)
     value = each.mean() if weight is None else (each * weight).mean()
     return Loss(value, td.detach(), chosen.detach())
-
-
-def quantile_target(
-    reward: Tensor,
-    discount: Tensor,
-    next_quantiles: Sequence[Tensor],
-    next_online_q: Tensor | None = None,
-    plausible: Tensor | None = None,
-) -> Tensor:
-    """The quantiles that Q(s, a) should have, (B, N): those of the next state's best action.
-
-    `next_quantiles` are (B, A, N) of each member of an ensemble: the one with the least mean for
-    that action is taken. `next_online_q` and `plausible` select the action as in `td_target`.
-    """
-    means = torch.stack([quantiles.mean(dim=2) for quantiles in next_quantiles]).amin(dim=0)
-    best = _best(means if next_online_q is None else next_online_q, plausible)
-    count = next_quantiles[0].shape[2]
-    index = best[:, None, None].expand(-1, 1, count)
-    each = torch.stack([q.gather(1, index).squeeze(1) for q in next_quantiles])  # (K, B, N)
-    least = each.mean(dim=2).argmin(dim=0)
-    next_value = each[least, torch.arange(len(least), device=each.device)]
-    return reward.unsqueeze(1) + discount.unsqueeze(1) * next_value
-
-
-def munchausen_target(
-    reward: Tensor,
-    discount: Tensor,
-    action: Tensor,
-    target_q: Tensor,
-    next_target_q: Tensor,
-    *,
-    scale: float,
-    temperature: float,
-    floor: float,
-) -> Tensor:
-    """What Q(s, a) should be in Munchausen DQN, (B,) (arXiv:2007.14430, equation 1).
-
-    With pi = softmax(Q_target / temperature):
-
-        r + scale * clip(temperature * log pi(a|s), floor, 0)
-          + d * sum_a' pi(a'|s') * (Q_target(s', a') - temperature * log pi(a'|s'))
-
-    Args:
-        reward, discount, action: (B,) as in `td_target` and `dqn_loss`.
-        target_q, next_target_q: (B, A), the target network at s and at s'.
-        scale: alpha of the paper, 0.9 there.
-        temperature: tau of the paper, 0.03 there.
-        floor: l_0 of the paper, -1 there.
-    """
-    log_pi = (target_q / temperature).log_softmax(dim=1) * temperature
-    taken = log_pi.gather(1, action.unsqueeze(1)).squeeze(1).clamp(floor, 0.0)
-    next_log_pi = (next_target_q / temperature).log_softmax(dim=1)
-    soft = (next_log_pi.exp() * (next_target_q - temperature * next_log_pi)).sum(dim=1)
-    return reward + scale * taken + discount * soft
 
 
 def conservative_penalty(
@@ -172,32 +101,6 @@ def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> 
     others = torch.full_like(q, margin).scatter_(1, action.unsqueeze(1), 0.0)
     chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
     return (((q + others).amax(dim=1) - chosen) * expert).mean()
-
-
-def quantile_loss(
-    quantiles: Tensor,
-    action: Tensor,
-    target: Tensor,
-    *,
-    weight: Tensor | None = None,
-    huber_delta: float = 1.0,
-) -> Loss:
-    """QR-DQN's loss of `quantiles` (B, A, N) at `action` (B,) against target quantiles (B, M).
-
-    Each of the N quantiles, at tau_i = (i + 1/2) / N, pays |tau_i - 1{u < 0}| huber(u) / delta for
-    the difference u to every target quantile: the mean over M, the sum over N
-    (arXiv:1710.10044, equation 10).
-    """
-    count = quantiles.shape[2]
-    index = action[:, None, None].expand(-1, 1, count)
-    chosen = quantiles.gather(1, index).squeeze(1)  # (B, N)
-    apart = target.unsqueeze(1) - chosen.unsqueeze(2)  # (B, N, M)
-    level = (torch.arange(count, device=quantiles.device) + 0.5) / count
-    slope = (level[None, :, None] - (apart.detach() < 0).to(apart.dtype)).abs()
-    each = (slope * huber(apart, huber_delta) / huber_delta).mean(dim=2).sum(dim=1)
-    value = each.mean() if weight is None else (each * weight).mean()
-    q = chosen.detach().mean(dim=1)
-    return Loss(value, q - target.mean(dim=1), q)
 
 
 def dqn_gradient(

@@ -10,8 +10,8 @@ Per layer, with x the layer's input (B, I), z = x W^T + b and g the gradient tha
     dW = g^T x,  db = sum_i g_i,  g = g W       and the product
 
 `tests/train/test_manual_backprop.py` compares it with autograd in double precision. It does the
-plain network alone: dueling heads, quantiles and ensembles keep to autograd. Where the compiled
-update is (`native_backprop.py`), that does the same in its place.
+plain network alone: a dueling head keeps to autograd. Where the compiled update is
+(`native_backprop.py`), that does the same in its place.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from restock import native
 from restock.train.dqn.config import NetworkConfig
 from restock.train.dqn.native_backprop import NativeBackprop
-from restock.train.dqn.network import Network, QNetwork
+from restock.train.dqn.network import QNetwork
 from restock.train.dqn.products import affine, product, product_into
 
 UpdatePath = Literal["native", "manual", "autograd"]
@@ -36,7 +36,7 @@ def update_path(network: NetworkConfig, device: str, threads: int = 1) -> Update
     The compiled way computes on one thread of the CPU: a run that asks for more, or for another
     device, has PyTorch's operations.
     """
-    if network.dueling or network.quantiles or network.ensemble > 1:
+    if network.dueling:
         return "autograd"
     on_cpu = torch.device(device).type == "cpu"
     return "native" if on_cpu and threads == 1 and native.is_used() else "manual"
@@ -71,8 +71,8 @@ class ManualBackprop:
         TypeError: a network that it does not do.
     """
 
-    def __init__(self, network: Network) -> None:
-        if not isinstance(network, QNetwork) or network.value is not None or network.quantiles:
+    def __init__(self, network: QNetwork) -> None:
+        if network.value is not None:
             raise TypeError("manual backpropagation supports only a plain QNetwork")
         self._head = _Affine(network.advantage)
         self._layers: list[_Layer] = []
@@ -132,7 +132,7 @@ class ManualBackprop:
 
 
 def make_backprop(
-    path: UpdatePath, network: Network, values: Tensor, gradient: Tensor | None = None
+    path: UpdatePath, network: QNetwork, values: Tensor, gradient: Tensor | None = None
 ) -> ManualBackprop | NativeBackprop | None:
     """What differentiates `network`, whose parameters are in `values`; None: autograd does."""
     if path == "native":

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from restock.native import compiled
 from restock.train.dqn.loss import Loss
-from restock.train.dqn.network import Network, QNetwork
+from restock.train.dqn.network import QNetwork
 
 
 class NativeBackprop:
@@ -29,9 +29,14 @@ class NativeBackprop:
     """
 
     def __init__(
-        self, network: Network, values: Tensor, gradient: Tensor | None = None, *, wide: bool = True
+        self,
+        network: QNetwork,
+        values: Tensor,
+        gradient: Tensor | None = None,
+        *,
+        wide: bool = True,
     ) -> None:
-        if not isinstance(network, QNetwork) or network.value is not None or network.quantiles:
+        if network.value is not None:
             raise TypeError("the compiled update supports only a plain QNetwork")
         modules = list(network.body)
         widths = [module.out_features for module in modules if isinstance(module, nn.Linear)]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from restock.toml import Checked
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposedNetwork
-from restock.train.dqn.network import Network
+from restock.train.dqn.network import QNetwork
 
 
 class StartPolicy(Checked, frozen=True):
@@ -44,7 +44,7 @@ def start_network(
     inner = policy.inner if isinstance(policy, ProposedNetwork) else policy
     behaviour = inner.behaviour if isinstance(inner, FilteredNetwork) else None
     values = inner.values if isinstance(inner, FilteredNetwork) else inner
-    made: Network | FilteredNetwork = values
+    made: QNetwork | FilteredNetwork = values
     if start.ratio is not None:
         if behaviour is None:
             raise ValueError("a filter needs a behaviour network")

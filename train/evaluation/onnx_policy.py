@@ -73,8 +73,7 @@ def to_onnx(network: PolicyNetwork) -> Any:
     graph = _Graph(onnx)
     inner = network.inner if isinstance(network, ProposedNetwork) else network
     plain = inner.values if isinstance(inner, FilteredNetwork) else inner
-    each = [graph.values(member, f"m{index}") for index, member in enumerate(plain.members)]
-    values = graph.node("Mean" if len(each) > 1 else "Identity", each, "all_values")
+    values = graph.values(plain, "q")
     if isinstance(inner, FilteredNetwork):
         values = graph.filter(inner, values, "plausible_values")
     if isinstance(network, ProposedNetwork):
@@ -136,19 +135,13 @@ class _Graph:
                 )
             else:
                 now = self.node("Relu", [now], place)
-        spread = self.linear(network.advantage, now, f"{name}.advantage")
-        if network.quantiles:
-            shape = np.array([0, network.actions, network.quantiles])
-            sizes = self.constant(f"{name}.sizes", shape.astype(np.int64))
-            spread = self.node("Reshape", [spread, sizes], f"{name}.quantiles")
-            spread = self.mean(spread, 2, f"{name}.means", keep=False)
+        advantage = self.linear(network.advantage, now, f"{name}.advantage")
         if network.value is None:
-            return spread
+            return advantage
         value = self.linear(network.value, now, f"{name}.value")
-        if network.quantiles:
-            value = self.mean(value, 1, f"{name}.value_mean")
-        middle = self.mean(spread, 1, f"{name}.middle")
-        centred = self.node("Sub", [spread, middle], f"{name}.centred")
+        axes = self.constant(f"{name}.axes", np.array([1], np.int64))
+        middle = self.node("ReduceMean", [advantage, axes], f"{name}.middle", keepdims=1)
+        centred = self.node("Sub", [advantage, middle], f"{name}.centred")
         return self.node("Add", [value, centred], f"{name}.values")
 
     def filter(self, network: FilteredNetwork, values: str, output: str) -> str:
@@ -186,10 +179,6 @@ class _Graph:
         is_known = self.node("Greater", [said, zero], "proposed.known")
         followed = self.node("And", [is_known, any_allowed], "proposed.followed")
         return self.node("Where", [followed, kept, values], output)
-
-    def mean(self, inputs: str, axis: int, name: str, *, keep: bool = True) -> str:
-        axes = self.constant(f"{name}.axes", np.array([axis], np.int64))
-        return self.node("ReduceMean", [inputs, axes], name, keepdims=int(keep))
 
 
 class OnnxPolicy:

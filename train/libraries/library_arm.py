@@ -72,12 +72,10 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
     """
     config = load_config(None, settings)
     plain = NetworkConfig(hidden=config.network.hidden, layer_norm=False)
-    without_norm = msgspec.structs.replace(config.network, layer_norm=False)
     refused = [
         name
         for name, bad in (
-            ("network", without_norm != plain),
-            ("loss.munchausen", config.loss.munchausen > 0),
+            ("network.dueling", config.network.dueling),
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
             ("guard.margin", config.guard.margin is not None),
@@ -210,7 +208,6 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
     import torch
 
     network = make_network(config.network, task.observation_size, len(task.actions))
-    assert isinstance(network, QNetwork)  # an ensemble was refused
     layers = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
     with torch.no_grad():
         for layer, given in zip(layers, linears, strict=True):
