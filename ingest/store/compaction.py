@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from restock.errors import StoreError
 from restock.ingest.store.commits import ATTEMPTS, delta_columns, recording_columns
-from restock.ingest.store.data_files import merge, written_whole
+from restock.ingest.store.data_files import merge, parquet_options, written_whole
 from restock.ingest.store.lineage import Ingest, StoredFile, own_path
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.summary import VERSION, summarised
@@ -175,7 +175,8 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
     for one in gone:
         path = f"{RECORDINGS}/{own_path(one.recording_id, one.ingest_id)}"
         with written_whole(store.path, path):
-            store.path.write(_of(manifests, one), path)
+            kept = _of(manifests, one)
+            store.path.write(kept, path, **parquet_options(kept.schema))
 
 
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:

@@ -16,7 +16,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from restock.ingest.store.data_files import READ_ROWS, merge
 from restock.ingest.store.lineage import (
@@ -28,7 +27,7 @@ from restock.ingest.store.lineage import (
     held_by,
     stored_files,
 )
-from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location, open_parquet
 from restock.ingest.store.writer import StoreWriter
 
 OPERATION = "restock compact --drop-damaged"
@@ -96,7 +95,8 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
 
 
 def is_damaged(place: Location, path: str) -> bool:
-    """Whether a file of the store is missing, or is no whole Parquet file.
+    """Whether a file of the store is missing, is no whole Parquet file, or has a page that does
+    not match its checksum.
 
     Raises:
         StoreError: it cannot be read for another reason: permissions, the disk, the network.
@@ -104,7 +104,7 @@ def is_damaged(place: Location, path: str) -> bool:
     with damage_named(place, path):
         try:
             with place.reading(path) as source:
-                for _ in pq.ParquetFile(source).iter_batches(READ_ROWS):
+                for _ in open_parquet(source).iter_batches(READ_ROWS):
                     pass
         except (FileNotFoundError, pa.ArrowInvalid):
             return True

@@ -23,7 +23,7 @@ from restock.ingest.store.lineage import (
     damage_named,
     packed_ingests,
 )
-from restock.ingest.store.location import TRANSITIONS, Location
+from restock.ingest.store.location import TRANSITIONS, Location, open_parquet
 
 GROUP_ROWS = 65_536  # of a compacted file's row groups
 GROUP_BYTES = 64 << 20  # or where rows are large, as manifests are
@@ -47,9 +47,10 @@ def add_action(file: AddedFile, now_ms: int) -> AddAction:
 
 
 def parquet_options(schema: pa.Schema) -> dict[str, Any]:
-    """How the tables' columns are encoded."""
+    """How the tables' columns are encoded. Each page has a checksum: see `open_parquet`."""
     return {
         "compression": "zstd",
+        "write_page_checksum": True,
         "use_dictionary": [f.name for f in schema if pa.types.is_string(f.type)],
         "use_byte_stream_split": _float_columns(schema),
     }
@@ -147,7 +148,7 @@ def _parts(
     for file in files:
         path = f"{name}/{file.path}"
         with damage_named(place, path), place.reading(path) as source:
-            for batch in pq.ParquetFile(source).iter_batches(READ_ROWS):
+            for batch in open_parquet(source).iter_batches(READ_ROWS):
                 rows = pa.table(batch)
                 rows = rows.filter(pc.is_in(rows["ingest_id"], wanted))
                 yield conformed(rows, schema)

@@ -19,12 +19,11 @@ from typing import NamedTuple
 from urllib.parse import unquote
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.location import TRANSITIONS, Location
+from restock.ingest.store.location import TRANSITIONS, Location, open_parquet
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
@@ -93,7 +92,7 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
 def held_by(place: Location, name: str, path: str) -> StoredFile:
     """A file of a table that need not be active, with what it holds. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
-        rows = pq.ParquetFile(source).metadata.num_rows
+        rows = open_parquet(source).metadata.num_rows
     return StoredFile(path, rows, 0, 0, _named(path, rows) or _read(place, name, path))
 
 
@@ -164,7 +163,7 @@ def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
 def _read(place: Location, name: str, path: str) -> tuple[Ingest, ...]:
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
-        file = pq.ParquetFile(source)
+        file = open_parquet(source)
         if said := (file.schema_arrow.metadata or {}).get(INGESTS):
             return tuple(Ingest(*one) for one in json.loads(said))
         counts: Counter[tuple[str | None, str | None]] = Counter()

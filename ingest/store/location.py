@@ -230,11 +230,13 @@ class Location:
         """
         with self.reading(path) as file:
             if where is not None:
-                return pq.read_table(file, partitioning=None, filters=where)
-            whole = pq.ParquetFile(file)  # `read_table` imports Arrow's data sets
+                return pq.read_table(
+                    file, partitioning=None, filters=where, page_checksum_verification=True
+                )
+            whole = open_parquet(file)  # `read_table` imports Arrow's data sets
             names = whole.schema_arrow.names
             if shared := [name for name in repeated if name in names]:
-                whole = pq.ParquetFile(file, metadata=whole.metadata, read_dictionary=shared)
+                whole = open_parquet(file, metadata=whole.metadata, read_dictionary=shared)
             return whole.read([name for name in names if columns is None or name in columns])
 
     def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
@@ -247,7 +249,7 @@ class Location:
             return names[0] in columns or f"{names[0]}.{names[-1]}" in columns
 
         with self.reading(path) as file:
-            whole = pq.ParquetFile(file)
+            whole = open_parquet(file)
             leaves = [whole.schema.column(number).path for number in range(len(whole.schema))]
             read = [leaf for leaf in leaves if is_asked(leaf)]
             for group in range(whole.num_row_groups):
@@ -307,6 +309,12 @@ class Location:
             if isinstance(error, FileNotFoundError):
                 raise
             raise StoreError(first_line(error), where=self.text) from error
+
+
+def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
+    """A Parquet file, to be read with the checksums of its pages verified: bytes that changed are
+    an OSError. Files of an older Restock have none, and are read as they are."""
+    return pq.ParquetFile(source, page_checksum_verification=True, **options)
 
 
 def _region() -> str | None:

@@ -101,7 +101,9 @@ class StoreWriter(TableCommits):
         with (
             written_whole(self.path, f"{FRAMES}/{path}"),
             self.path.writing(f"{FRAMES}/{path}") as sink,
-            pq.ParquetWriter(sink, frame_schema(), compression="zstd") as writer,
+            pq.ParquetWriter(
+                sink, frame_schema(), compression="zstd", write_page_checksum=True
+            ) as writer,
         ):
             for batch in batches:
                 writer.write_batch(batch)

@@ -101,7 +101,9 @@ class StoredTable:
         from pyarrow import dataset
 
         parquet = dataset.ParquetFileFormat(
-            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(pre_buffer=True)
+            default_fragment_scan_options=dataset.ParquetFragmentScanOptions(
+                pre_buffer=True, page_checksum_verification=True
+            )
         )
         fragments = [
             parquet.make_fragment(f"{self.table}/{path}", self.place.files) for path in self.paths

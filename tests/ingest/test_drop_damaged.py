@@ -15,14 +15,15 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.store import compaction, lineage
+from restock.ingest.store import compaction, data_files, lineage
+from restock.ingest.store import writer as writer_module
 from restock.ingest.store.compaction import compact
 from restock.ingest.store.damaged_files import drop_damaged
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
-DAMAGES = ("cut", "missing", "a page")
+DAMAGES = ("cut", "missing", "a page", "numbers")
 
 
 def damage(place: Path | str, file: str, how: str) -> None:
@@ -35,6 +36,9 @@ def damage(place: Path | str, file: str, how: str) -> None:
         return
     if how == "cut":
         content = content[:1000]
+    elif how == "numbers":  # which decode as others: only the page's checksum tells
+        at = len(content) // 3
+        content = content[:at] + bytes(b ^ 0x55 for b in content[at : at + 40]) + content[at + 40 :]
     else:  # the footer is whole
         content = content[:8] + bytes(byte ^ 0x55 for byte in content[8:40]) + content[40:]
     with store.writing(file) as sink:
@@ -157,9 +161,46 @@ def test_memory_that_does_not_suffice_is_no_damage(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise pa.ArrowMemoryError("malloc of size 1 failed")
 
-    monkeypatch.setattr("restock.ingest.store.damaged_files.pq.ParquetFile", full)
+    monkeypatch.setattr("restock.ingest.store.damaged_files.open_parquet", full)
     with pytest.raises(MemoryError):
         drop_damaged(writer)
+
+
+def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
+    place = tmp_path / "s"
+    writer = StoreWriter(place)
+    writer.write_all([one(1), one(2)])
+    file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
+    damage(place, file, "numbers")
+    before, version = active(place, TRANSITIONS), writer.path.open_table(TRANSITIONS).version()
+    assert main(["compact", str(place)]) == 2
+    assert f"its file {file} cannot be read" in capsys.readouterr().err
+    assert active(place, TRANSITIONS) == before
+    assert writer.path.open_table(TRANSITIONS).version() == version
+    assert not [one for one in files_of(place) if "transitions/compacted" in one]
+    with pytest.raises(StoreError, match=f"{file} cannot be read"):
+        writer.rows(f"{1:016x}", f"{1:016x}-a")
+    done = drop_damaged(writer)
+    assert done.dropped == [file]
+    assert [one.recording_id for one in done.lost] == [f"{1:016x}"]
+    assert shown(place) == expected((2, "a", 0))
+
+
+def test_files_without_checksums_are_read_as_before(tmp_path, monkeypatch):
+    """Those of an older Restock."""
+    options = data_files.parquet_options
+    without = {"write_page_checksum": False}
+    for module in (data_files, writer_module, compaction):
+        monkeypatch.setattr(module, "parquet_options", lambda schema: options(schema) | without)
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    monkeypatch.undo()
+    assert drop_damaged(writer).dropped == []
+    compact(writer)
+    assert drop_damaged(writer).dropped == []
+    damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "numbers")
+    assert drop_damaged(writer).joined_again  # a compaction gave its file checksums
+    assert shown(tmp_path / "s") == expected((1, "a", 0), (2, "a", 0))
 
 
 def test_two_that_drop_the_same_file_drop_it_once(tmp_path, monkeypatch):
