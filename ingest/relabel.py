@@ -218,6 +218,7 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
         StoreError: there is none.
     """
     store = StoreWriter(path)
+    store.reach()
     if not len(store.live()):
         raise StoreError(
             "there is no store, or it is empty",

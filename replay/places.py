@@ -52,6 +52,7 @@ def open_place(
             _add_all(store.bare, beside)
             yield store.bare
         return
+    place.expect_both_tables()
     path = place.folder
     if version is not None:
         raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")

@@ -69,8 +69,9 @@ class TableCommits(StoreReader):
             raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
 
     def expect_store(self) -> None:
-        """Raises StoreError where there is no store."""
+        """Raises StoreError where there is no store, or not all of it."""
         self.expect_folder()
+        self.path.expect_both_tables()
         if not self.path.has_table(TRANSITIONS):
             there = self.path.folder is not None and self.path.folder.exists()
             raise StoreError(

@@ -135,6 +135,29 @@ class Location:
         with self.translate_errors():
             return bool(DeltaTable.is_deltatable(self.table(name), self.options))
 
+    def expect_both_tables(self) -> None:
+        """See that not one of the two tables is gone while the other is there.
+
+        A writer makes `recordings` first, and adds manifests when it has made both: a first ingest
+        that was killed leaves at most a `recordings` without files.
+
+        Raises:
+            StoreError: one is gone, or the place cannot be reached.
+        """
+        if self.has_table(TRANSITIONS):
+            gone, other = RECORDINGS, TRANSITIONS
+        elif self.has_table(RECORDINGS) and len(self.open_table(RECORDINGS).file_uris()):
+            gone, other = TRANSITIONS, RECORDINGS
+        else:
+            return
+        if not self.has_table(gone):  # looked for last: another writer may be making it
+            raise StoreError(
+                f"its table `{gone}` is missing, while `{other}` is there",
+                where=self.text,
+                remedy=f"restore {self.table(gone)} from a copy; where there is none, ingest the"
+                " recordings into a new store",
+            )
+
     def remedy_if_absent(self) -> str:
         """What to do where there is no store. Raises StoreError as `has_table` does."""
         path, version = split_version(self.text)

@@ -38,8 +38,11 @@ class StoreReader:
         self.path = Location.of(path)
 
     def reach(self) -> None:
-        """Check that the place can be reached. Raises StoreError where it cannot."""
-        self.path.has_table(TRANSITIONS)
+        """Check that the place can be reached, and what is there is no part of a store.
+
+        Raises StoreError where it is not so.
+        """
+        self.path.expect_both_tables()
 
     def live(self, recording_id: str | None = None, version: Version | None = None) -> pa.Table:
         """The manifest rows whose transitions are in the store (of one recording, or of all).

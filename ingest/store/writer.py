@@ -156,7 +156,7 @@ class StoreWriter(TableCommits):
             StoreError: they cannot be written.
         """
         self.expect_folder()
-        if not self._reached and self.path.folder is None:
+        if not self._reached:
             self.reach()  # Delta's library says of S3 what is wrong; Arrow's writer says less
             self._reached = True
         ids = manifest["recording_id"][0].as_py(), manifest["ingest_id"][0].as_py()

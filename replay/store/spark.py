@@ -130,6 +130,7 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
     """
     place = Location.of(store)
     if not is_store(place):
+        place.expect_both_tables()
         raise StoreError("no such store", where=str(place), remedy="`restock ingest` makes one")
     for name in (TRANSITIONS, RECORDINGS):
         address = (

@@ -356,6 +356,7 @@ def is_store(path: str | Path | Location) -> bool:
 def _expect(place: Location) -> None:
     if is_store(place):
         return
+    place.expect_both_tables()
     raise StoreError(
         "not a store" if place.folder is not None and place.folder.exists() else "no such store",
         where=str(place),

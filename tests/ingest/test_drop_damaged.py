@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.store import compaction, data_files, lineage
 from restock.ingest.store import writer as writer_module
+from restock.ingest.store.commits import recording_columns
 from restock.ingest.store.compaction import compact
 from restock.ingest.store.damaged_files import drop_damaged
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
@@ -277,3 +279,37 @@ def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
         assert "logs/2.mcap" not in said
     assert json.loads(out)["dropped"] == [file]
     assert shown(place) == expected((2, "b", 7))
+
+
+@pytest.mark.parametrize("gone", [TRANSITIONS, RECORDINGS])
+def test_a_store_without_one_of_its_tables_is_restored_and_not_made_again(tmp_path, capsys, gone):
+    place, log = tmp_path / "s", tmp_path / "log.mcap"
+    StoreWriter(place).write_all([one(1), one(2)])
+    log.touch()
+    shutil.rmtree(place / gone)
+    before = files_of(place)
+    for command in (
+        ["sql", str(place), "SELECT 1"],
+        ["audit", str(place)],
+        ["compact", str(place)],
+        ["ingest", str(log), "--store", str(place)],
+    ):
+        assert main(command) == 2
+        said = capsys.readouterr().err
+        assert f"`{gone}` is missing" in said
+        assert "from a copy" in said
+        assert "makes a store" not in said
+    with pytest.raises(StoreError, match=f"`{gone}` is missing"):
+        Store(place)
+    with pytest.raises(StoreError, match=f"`{gone}` is missing"):
+        StoreWriter(place).write(*one(3))
+    assert files_of(place) == before
+
+
+def test_a_first_ingest_that_was_killed_between_its_tables_goes_on(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.create(RECORDINGS, recording_columns())
+    with pytest.raises(StoreError, match="not a store"):
+        Store(tmp_path / "s")
+    StoreWriter(tmp_path / "s").write(*one(1))
+    assert shown(tmp_path / "s") == expected((1, "a", 0))
