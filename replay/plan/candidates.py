@@ -21,6 +21,7 @@ from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.rows_in_order import RowsInOrder
 from restock.replay.plan.strata import ResolvedStratum
+from restock.replay.store.damage import damage
 
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
@@ -97,6 +98,8 @@ def read_candidates(
             for batch in reader:
                 rows.add(batch)
     except duckdb.Error as error:
+        if damaged := damage(error):
+            raise damaged from error
         _blame(connection, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
     return rows.table()

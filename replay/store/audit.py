@@ -29,6 +29,7 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
+from restock.replay.store.damage import damage
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
@@ -236,6 +237,8 @@ def _run(
     try:
         columns, rows = interruptible(connection, run)
     except duckdb.Error as error:
+        if damaged := damage(error):
+            raise damaged from error
         if type(error) is duckdb.Error or isinstance(error, duckdb.OperationalError):
             raise StoreError(
                 f"is damaged or cannot be read: {first_line(error)}",

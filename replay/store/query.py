@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 
 import duckdb
 
-from restock.errors import QueryError
+from restock.errors import QueryError, StoreError
+from restock.replay.store.damage import damage
 from restock.replay.store.definitions import install_every, install_named
 
 T = TypeVar("T")
@@ -28,6 +29,7 @@ def query(
     """Run one query (the last of several statements).
 
     Raises:
+        StoreError: a file of the store is damaged or missing.
         QueryError: DuckDB refused it, it is no query, or it would write.
     """
     try:
@@ -55,7 +57,7 @@ def query(
         last = _counted(connection, statements[-1].query)
         relation = _named(connection, partial(connection.sql, last))
     except duckdb.Error as error:
-        raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
+        raise _translated(error, where) from error
     if relation is None:
         raise QueryError(
             "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
@@ -123,7 +125,7 @@ def fetch(
             count = len(rows) if len(rows) <= at_most else len(relation)
             return relation.columns, rows[:at_most], count
         except duckdb.Error as error:
-            raise QueryError(_message(error), where=where, remedy=_hint(error)) from error
+            raise _translated(error, where) from error
 
     return interruptible(connection, run)
 
@@ -166,6 +168,12 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
         except KeyboardInterrupt:
             connection.interrupt()
             raise
+
+
+def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
+    """DuckDB's error as one worth reading: of the query, or of a file that it could not read."""
+    said = QueryError(_message(error), where=where, remedy=_hint(error))
+    return damage(error, where=where) or said
 
 
 def _message(error: duckdb.Error) -> str:

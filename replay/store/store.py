@@ -29,6 +29,7 @@ from restock.ingest.task.conditions import Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import computed
+from restock.replay.store.damage import damage
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.query import query
 from restock.replay.store.shared_rows import SHARED, install_shared_rows
@@ -297,11 +298,8 @@ class Store:
         try:
             self._transitions.present(connection, schema=schema)
         except StoreError as error:
-            raise StoreError(
-                error.what,
-                where=error.where,
-                remedy="restore the file from a copy, or ingest its recording again with --force",
-            ) from error
+            cause = error.__cause__
+            raise (isinstance(cause, duckdb.Error) and damage(cause)) or error from error
 
     def _frames(self) -> StoredTable:
         """The frames of cameras that the manifests of its rows name."""

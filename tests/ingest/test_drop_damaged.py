@@ -15,7 +15,7 @@ from support.s3_server import files_of
 from support.stores import one, shown
 
 from restock.cli import main
-from restock.errors import StoreError
+from restock.errors import QueryError, StoreError
 from restock.ingest.store import compaction, data_files, lineage
 from restock.ingest.store import writer as writer_module
 from restock.ingest.store.commits import recording_columns
@@ -23,6 +23,7 @@ from restock.ingest.store.compaction import compact
 from restock.ingest.store.damaged_files import drop_damaged
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.query import fetch
 from restock.replay.store.store import Store
 
 DAMAGES = ("cut", "missing", "a page", "numbers")
@@ -313,3 +314,39 @@ def test_a_first_ingest_that_was_killed_between_its_tables_goes_on(tmp_path):
         Store(tmp_path / "s")
     StoreWriter(tmp_path / "s").write(*one(1))
     assert shown(tmp_path / "s") == expected((1, "a", 0))
+
+
+@pytest.mark.parametrize("how", ["cut", "missing"])
+@pytest.mark.parametrize("is_joined", [False, True])
+def test_verbs_that_need_a_damaged_file_of_rows_name_it_and_the_remedy(
+    tmp_path, capsys, how, is_joined
+):
+    place = tmp_path / "s"
+    writer = StoreWriter(place)
+    writer.write_all([one(1), one(2)])
+    if is_joined:
+        compact(writer)
+    file = active(place, TRANSITIONS)[0]
+    damage(place, file, how)
+    for command in (
+        ["sql", str(place), "SELECT sum(reward) FROM transitions"],
+        ["audit", str(place)],
+        ["mix", str(place), "--dry-run"],
+    ):
+        assert main(command) == 2
+        said = capsys.readouterr().err
+        assert f"its file {file} " in said
+        assert ("--drop-damaged" if is_joined else "--force") in said
+        assert "its SQL does not run" not in said
+
+
+def test_damage_of_which_duckdb_names_no_file_has_a_remedy_too(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    damage(tmp_path / "s", active(tmp_path / "s", TRANSITIONS)[0], "a page")
+    with Store(tmp_path / "s") as store:
+        for text in ("SELECT nothing FROM transitions", "FROM read_csv('no.csv')"):
+            with pytest.raises(QueryError):
+                store.sql(text)
+        with pytest.raises(StoreError, match="--drop-damaged"):
+            fetch(store.connection, "SELECT sum(transition_id) FROM transitions", where="s")

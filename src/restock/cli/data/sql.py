@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import QueryError
+from restock.errors import QueryError, StoreError
 from restock.interrupts import went_on_after_interrupt
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class SqlCommand:
                 went_on_after_interrupt()
                 text = ""
                 output.say("stopped")
-            except QueryError as error:
+            except (QueryError, StoreError) as error:
                 sys.stderr.write(f"{error}\n")
 
     def _export(self, out: Path) -> None:
