@@ -36,6 +36,7 @@ NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
 TOLERANCE_S = 0.1  # half a control period
+MOST_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
 
 
@@ -114,8 +115,9 @@ def align(
     do not say what time it is, and count from when they were received. So do images of cameras.
 
     Raises:
-        RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
-            cannot be mapped to it within `tolerance_s`.
+        RecordingError: the alignment clock is `header.stamp` and no topic has one, all log times
+            are the same while stamps go on, or log time cannot be mapped to the stamps within
+            `tolerance_s`.
     """
     report = ClockReport(clock.alignment)
     simulated = topics.get(CLOCK_TOPIC)
@@ -134,8 +136,9 @@ def align(
             remedy='set [clock] alignment = "log_time" in the profile',
         )
     reference = max(stamped, key=lambda name: (len(stamped[name]), name))
-    log_time_ns = topics[reference].log_time_ns
-    edges = jumps(log_time_ns, delay_ns(topics[reference]), round(clock.jump_s * NS))
+    if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > clock.jump_s * NS:
+        refuse_still_log_time(reference, stamped[reference])
+    edges = _edges(stamped[reference], round(clock.jump_s * NS))
     report.jumps = len(edges)
     drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
     segments = []
@@ -183,12 +186,24 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
 
     `steps = "command"`: one tick a command, but none closer than 3/4 of the period to the last.
     `steps = "rate"`: every period, from the first command to `end_ns`.
+
+    Raises:
+        RecordingError: a fixed rate gives more than MOST_TICKS, as a wrong time makes it do.
     """
     stamps = command.stamp_ns
     if not len(stamps):
         return np.zeros(0, np.int64), 0
     period_ns = round(period_s * NS)
     if clock.steps == "rate":
+        if (span_ns := end_ns - int(stamps[0])) > MOST_TICKS * period_ns:
+            raise RecordingError(
+                f"from its first command ({int(stamps[0]) / NS:.0f} s since 1970) to its last "
+                f"message ({end_ns / NS:.0f} s) are {span_ns / 86_400 / NS:,.0f} days, so a tick "
+                f"every {period_s:g} s would be {span_ns // period_ns:,} steps: some of its times "
+                "are wrong",
+                remedy="write the file again with the right log times, or set [clock] steps = "
+                '"command" in the profile',
+            )
         return np.arange(stamps[0], max(end_ns, int(stamps[0])) + 1, period_ns), 0
     kept, last = [], None
     for stamp in stamps.tolist():
@@ -196,6 +211,29 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
             kept.append(stamp)
             last = stamp
     return np.array(kept, np.int64), len(stamps) - len(kept)
+
+
+def refuse_still_log_time(topic: str, columns: TopicColumns) -> None:
+    """Refuse a topic of several messages whose log times are all the same.
+
+    Raises:
+        RecordingError: they are; says what to do.
+    """
+    log = columns.log_time_ns
+    if len(log) > 1 and log.max() == log.min():
+        raise RecordingError(
+            f"all {len(log):,} messages on {topic} have the same log time "
+            f"({int(log[0]) / NS:g} s since 1970), so nothing says when they were received",
+            remedy="record it again, or write the file again with the times at which its "
+            "messages were received",
+        )
+
+
+def _edges(columns: TopicColumns, jump_ns: int) -> Ints:
+    """The log times (K,) at which segments begin, ascending; each segment has a message of the
+    topic. Messages of one log time cannot be told apart by it, so they share a segment."""
+    edges = np.unique(jumps(columns.log_time_ns, delay_ns(columns), jump_ns))
+    return np.asarray(edges[edges > columns.log_time_ns.min()], np.int64)
 
 
 def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
@@ -340,5 +378,6 @@ __all__ = [
     "Samples",
     "align",
     "clock_drifts",
+    "refuse_still_log_time",
     "ticks_of",
 ]

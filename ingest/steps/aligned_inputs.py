@@ -30,6 +30,7 @@ from restock.ingest.steps.align import (
     LatestMessages,
     Samples,
     align,
+    refuse_still_log_time,
     ticks_of,
 )
 from restock.ingest.steps.frames import Edges, Placement, Tree, plain
@@ -199,7 +200,8 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
-            cannot be mapped to it; or no transform leads to the pose.
+            cannot be mapped to it; its log times do not go on, or say that it took years; or no
+            transform leads to the pose.
     """
     inputs = InputColumns(profile, topics)
     edges = transforms_of(profile, inputs)
@@ -208,6 +210,8 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     ages += [(camera.topic, camera.max_age_s) for camera in profile.cameras.values()]
     latched = {topic for topic, age in ages if age is None}
     latched -= {topic for topic, age in ages if age is not None}
+    if profile.clock.alignment == "log_time":
+        refuse_still_log_time(profile.inputs.command.topic, topics[profile.inputs.command.topic])
     segments, report = align(
         {**topics, **edges.topics},
         profile.clock,

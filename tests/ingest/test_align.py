@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.driven_robot import START_NS, columns
+from support.driven_robot import START_NS, Drive, columns, typed_topics, write_topics
 
+from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.pipeline import ingest
+from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, Samples, align, ticks_of
 
@@ -134,3 +142,51 @@ def test_the_offset_between_clocks_does_not_matter(offset_ns):
     expected, _ = align({"/odom": base, "/cmd": command}, Clock())
     for name in shifted:
         assert np.array_equal(segments[0].topics[name].stamp_ns, expected[0].topics[name].stamp_ns)
+
+
+# -- log times that do not go on ------------------------------------------------------------------
+
+
+def logged_at(drive: Drive, log_time_ns: Callable[[int, int], int]) -> dict[str, Any]:
+    """A drive's typed topics with other log times: `log_time_ns(time, place in the topic)`."""
+    found = {}
+    for name, (kind, topic) in typed_topics(drive).items():
+        times = enumerate(topic.log_time_ns.tolist())
+        log = np.array([log_time_ns(time, place) for place, time in times], np.int64)
+        found[name] = kind, TopicColumns(log, log, topic.fields)
+    return found
+
+
+def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
+    topics = logged_at(Drive(20.0), lambda time, place: 0 if place % 40 == 1 else time)
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    assert main(["ingest", str(bag), "--dry-run", "--json"]) == 3
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert row["transitions"] > 80
+    assert any(loss.startswith("/odom: left out, as their stamps") for loss in row["losses"])
+    assert any("the alignment clock was set" in note for note in row["notes"])
+    for steps in ("command", "rate"):
+        for alignment in ("header.stamp", "log_time"):
+            clock = Clock(alignment=alignment, steps=steps)
+            profile = msgspec.structs.replace(load_profile("warehouse_amr"), clock=clock)
+            if (steps, alignment) != ("rate", "log_time"):
+                assert ingest(bag, profile, store=None).manifest["transitions"] > 80
+                continue
+            with pytest.raises(RecordingError, match=r"19,676 days, .* some of its times are wro"):
+                ingest(bag, profile, store=None)
+    out = tmp_path / "new.toml"
+    assert main(["profile", "new", str(bag), "--out", str(out)]) in (0, 3)
+    assert out.exists()
+
+
+@pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
+def test_log_times_that_are_all_the_same_are_refused_by_name(alignment, tmp_path, capsys):
+    topics = logged_at(Drive(20.0), lambda time, place: 0)
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    profile = msgspec.structs.replace(
+        load_profile("warehouse_amr"), clock=Clock(alignment=alignment)
+    )
+    with pytest.raises(RecordingError, match=r"bag: all [\d,]+ messages on /\w+ have the same log"):
+        ingest(bag, profile, store=None)
+    assert main(["profile", "new", str(bag), "--out", str(tmp_path / "new.toml")]) == 3
+    assert "have the same log time" in capsys.readouterr().err

@@ -25,6 +25,7 @@ WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
 MOVES = 0.25  # of what was commanded: less is standing
 STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
 LONGEST_S = 60.0
+LONGEST_GAP_S = 3600.0  # between two commands; longer: their log times are wrong
 SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
 NEARLY = 0.8  # of the fastest command counts as it
 LEAST_SAMPLES = 10
@@ -54,7 +55,11 @@ def command_hold(
     ends = np.append(time_s[1:], at[-1])
     on, stopped, stood, went = [], [], 0, 0
     for begin, end, speed, turn in zip(time_s, ends, speed_mps, yaw_rate_radps, strict=True):
-        if end - begin < LEAST_GAP_S or at[0] > begin or at[-1] < end - within:
+        if (
+            not LEAST_GAP_S <= end - begin <= LONGEST_GAP_S
+            or at[0] > begin
+            or at[-1] < end - within
+        ):
             continue
         if speed == 0 and turn == 0:
             settled = min(begin + 1.0, end)  # it brakes first
