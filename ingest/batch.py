@@ -26,7 +26,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
 
-from restock.errors import RecordingError, RestockError
+from restock.errors import TRACEBACK, RecordingError, RestockError, print_traceback
 
 if TYPE_CHECKING:
     from restock.ingest.containers.storage import Watch
@@ -72,13 +72,14 @@ class IngestJob:
         except MemoryError:
             return out_of_memory(path)
         except Exception as error:  # noqa: BLE001  (a defect costs its recording, not all of them)
+            print_traceback(error)
             at = traceback.extract_tb(error.__traceback__)[-1]
             return RecordingError(
                 f"a bug in Restock: {type(error).__name__}: {error}"
                 f" ({Path(at.filename).name}, line {at.lineno})",
                 where=str(path),
-                remedy="please report it; this recording was not added to the store, the others "
-                "were",
+                remedy=f"please report it ({TRACEBACK}=1 shows the traceback); this recording was "
+                "not added to the store, the others were",
             )
 
 

@@ -6,7 +6,10 @@ Python they are ordinary exceptions, all below `RestockError`.
 
 from __future__ import annotations
 
+import os
 from enum import IntEnum
+
+TRACEBACK = "RESTOCK_TRACEBACK"  # of the environment: print tracebacks
 
 
 def visible(text: str, keep: str = "") -> str:
@@ -23,6 +26,14 @@ def visible(text: str, keep: str = "") -> str:
         else letter.encode("unicode_escape").decode("ascii")
         for letter in text
     )
+
+
+def print_traceback(error: Exception) -> None:
+    """The traceback of an error that becomes a message, on stderr where the environment asks."""
+    if os.environ.get(TRACEBACK):
+        import traceback  # slow to import
+
+        traceback.print_exception(error)
 
 
 class ExitCode(IntEnum):

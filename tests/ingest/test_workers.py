@@ -63,6 +63,13 @@ class _Broken(IngestJob):
         return super().prepare(path)
 
 
+class _Defect(IngestJob):
+    """A job that meets a defect of Restock's: it has no profile."""
+
+    def prepare(self, *args):
+        return IngestJob(None, None).prepare(*args)
+
+
 def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
     job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
     paths = sorted(bags.iterdir())
@@ -109,6 +116,21 @@ def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatc
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}
+
+
+def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
+    arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
+    monkeypatch.setattr("restock.ingest.batch.IngestJob", _Defect)
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "drive1: a bug in Restock: AttributeError" in said
+    assert "RESTOCK_TRACEBACK=1 shows the traceback" in said
+    assert "Traceback" not in said
+    monkeypatch.setenv("RESTOCK_TRACEBACK", "1")
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "Traceback (most recent call last)" in said
+    assert "in prepare" in said
 
 
 def command(bags: Path, store: Path, *more: str) -> list[str]:

@@ -7,15 +7,13 @@ traceback as well, for those who develop Restock.
 
 from __future__ import annotations
 
-import os
 import traceback
 from collections.abc import Sequence
 
 from restock.cli import command_of
-from restock.errors import RestockError, StoreError
+from restock.errors import TRACEBACK, RestockError, StoreError, print_traceback
 from restock.files import first_line
 
-TRACEBACK = "RESTOCK_TRACEBACK"
 _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = f"{_CHECK}; `restock compact STORE --drop-damaged --dry-run` looks for one in a store"
 # package of an exception -> what to do
@@ -32,8 +30,7 @@ _REMEDIES = {
 
 def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     """Any exception as one of ours; prints its traceback where the environment asks for it."""
-    if os.environ.get(TRACEBACK):
-        traceback.print_exception(error)
+    print_traceback(error)
     where = f"restock {' '.join(args)}"
     if full := _out_of_memory(error):
         return RestockError(
@@ -101,4 +98,4 @@ def _at(error: Exception) -> str:
     return lines[-1] if lines else ""
 
 
-__all__ = ["TRACEBACK", "as_restock_error"]
+__all__ = ["as_restock_error"]
