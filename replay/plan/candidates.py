@@ -21,7 +21,7 @@ from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.rows_in_order import RowsInOrder
 from restock.replay.plan.strata import ResolvedStratum
-from restock.replay.store.damage import damage
+from restock.replay.store.parquet_views import damage
 
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),

@@ -29,8 +29,8 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
-from restock.replay.store.damage import damage
 from restock.replay.store.definitions import install_named, is_empty, rows_held
+from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
 from restock.words import between

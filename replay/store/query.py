@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import duckdb
 
 from restock.errors import QueryError, StoreError
-from restock.replay.store.damage import damage
 from restock.replay.store.definitions import install_every, install_named
+from restock.replay.store.parquet_views import damage
 
 T = TypeVar("T")
 

@@ -29,8 +29,8 @@ from restock.ingest.task.conditions import Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.replay.store.computed import computed
-from restock.replay.store.damage import damage
 from restock.replay.store.definitions import Definitions, install_common
+from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import query
 from restock.replay.store.shared_rows import SHARED, install_shared_rows
 from restock.replay.store.stored_tables import StoredTable, manifest_tables, register
