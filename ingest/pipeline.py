@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, RecordingError
+from restock.errors import ConfigError, RecordingError, visible
 from restock.ingest.camera.frame_rows import KeptFrames, frame_rows, kept_frames
 from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
@@ -209,7 +209,7 @@ class _Ingest:
                 remedy="choose another --profile, or correct its maximum ages; see docs/ingest.md",
             )
         provenance = Provenance(
-            self.recording.recording_id, self.ingest_id, self.path, software_version()
+            self.recording.recording_id, self.ingest_id, visible(self.path), software_version()
         )
         watch("rows and labels, ticks", 0, ticks)
         table, rows = recording_table(

@@ -8,6 +8,7 @@ queries are bounded, and only plain tables are read.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import shutil
 import sqlite3
@@ -332,7 +333,7 @@ def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
 
 def _connection(path: Path, immutable: str) -> sqlite3.Connection:
     mode = "ro" if immutable else "rw"
-    uri = f"file:{quote(str(path.absolute()))}?mode={mode}{immutable}"
+    uri = f"file:{quote(os.fsencode(path.absolute()))}?mode={mode}{immutable}"
     return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 

@@ -121,7 +121,11 @@ COVERAGE: tuple[Column, ...] = (
 )
 PROVENANCE: tuple[Column, ...] = (
     Column("ingest_id", pa.string(), "the ingest that wrote this row; joins `recordings`"),
-    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column(
+        "source_file",
+        pa.string(),
+        "path of the recording as given, odd characters escaped",
+    ),
     Column(
         "profile_hash", pa.string(), "hash of the profile with which it was ingested, 12 hex digits"
     ),
@@ -195,7 +199,7 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
     Column("recording_id", pa.string(), "hash of the recording's content, 16 hex digits"),
     Column("ingest_id", pa.string(), "id of this ingest; joins `transitions`"),
     Column("ingested_at", pa.timestamp("us", "UTC"), "when it was ingested"),
-    Column("source_file", pa.string(), "path of the recording as it was given"),
+    Column("source_file", pa.string(), "path of the recording as given, odd characters escaped"),
     Column("format", pa.string(), "container: mcap, rosbag2-sqlite3, rosbag2-mcap, …"),
     Column("integrity", pa.string(), "checksums: verified, unverified or damaged"),
     Column("duration_s", pa.float64(), "time from its first message to its last, by log time"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import resource
 import sqlite3
 import struct
@@ -17,6 +18,8 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 from support.bag_samples import write_bag, write_mcap
+from support.driven_robot import Drive
+from support.driven_robot import write_bag as write_drive
 
 from restock.cli import main
 from restock.errors import RecordingError, visible
@@ -25,6 +28,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.definitions import message_type
 from restock.ingest.decoding.field_paths import CannotDecode
 from restock.ingest.decoding.messages import Channel
+from restock.replay.store.store import Store
 
 # -- sqlite: programs in place of tables ----------------------------------------------------------
 
@@ -405,6 +409,35 @@ def test_no_control_character_of_a_file_reaches_the_terminal(
     assert any(
         line.startswith(r" /t\x1b[2J\x07\n/other\u202e") for line in printed.out.splitlines()
     )
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("name", [b"bad\xff", b"a\x1b[2J\nb\xe2\x80\xaec", b"[red]caf\xc3\xa9 [b]"])
+def test_any_name_of_a_file_is_ingested_and_escaped(
+    name: bytes, storage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_drive(Drive(4.0, truth="nominal"), tmp_path / "run", storage=storage)
+    (file,) = bag.glob("run.*")
+    odd = tmp_path / os.fsdecode(name)
+    odd.mkdir()
+    given = str(file.rename(odd / f"{odd.name}{file.suffix}"))
+    store, profile = str(tmp_path / "store"), str(tmp_path / "new.toml")
+    assert main(["ingest", given, "--store", store]) == 0
+    assert main(["ingest", given, "--store", store]) == 0  # it is there already
+    assert main(["sql", store, "SELECT source_file FROM recordings"]) == 0
+    assert main(["profile", "new", given, "--out", profile]) in (0, 3)
+    assert main(["profile", "check", profile, given]) in (0, 2)
+    printed = capsys.readouterr()
+    for text in (printed.out, printed.err, Path(profile).read_text(encoding="utf-8")):
+        assert all(letter.isprintable() or letter == "\n" for letter in text)
+    with Store(store) as opened:
+        recordings = opened.sql("FROM recordings").to_arrow_table().to_pylist()
+        (steps,) = opened.sql("SELECT DISTINCT source_file FROM transitions").fetchall()
+    assert steps == (visible(given),) == (recordings[0]["source_file"],)
+    assert visible(given) in printed.out
+    assert main(["ingest", given, "--dry-run", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert row["path"] == given
 
 
 def test_visible_text_stays_as_it_is() -> None:

@@ -65,8 +65,8 @@ def stderr() -> Console:
 
 
 def say(message: str) -> None:
-    """One line of progress, to stderr: as it is, for it may hold a path or a command."""
-    stderr().print(message, markup=False, emoji=False, soft_wrap=True)
+    """One line of progress, to stderr: no markup, for it may hold a path or a command."""
+    stderr().print(visible(message, keep="\n"), markup=False, emoji=False, soft_wrap=True)
 
 
 def plain(value: Any) -> Any:
@@ -254,7 +254,7 @@ class Advance:
         """So much more of the whole is done; the part at hand is over."""
         if self._bar is None or self._task is None:
             return
-        self._bar.update(self._task, advance=amount, note=note)
+        self._bar.update(self._task, advance=amount, note=cell(visible(note)))
         self._end_part()
 
     def part(self, doing: str, done: float, whole: float) -> None:
@@ -302,4 +302,4 @@ def progress(description: str, total: float | None) -> Iterator[Advance]:
         redirect_stdout=sys.stdout.isatty(),  # in a file it is data, whatever stderr shows
     )
     with bar:
-        yield Advance(bar, bar.add_task(description, total=total, note=""))
+        yield Advance(bar, bar.add_task(cell(visible(description)), total=total, note=""))

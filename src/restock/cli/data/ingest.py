@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RecordingError, RestockError
+from restock.errors import ConfigError, ExitCode, RecordingError, RestockError, visible
 from restock.words import counted
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def show(outcome: IngestResult) -> None:
     row = outcome.manifest
     console = output.stdout()
     console.print(
-        f"{outcome.path}  {row['format']}  {row['duration_s']:.1f} s  "
+        f"{visible(outcome.path)}  {row['format']}  {row['duration_s']:.1f} s  "
         f"recording {row['recording_id']}",
         markup=False,
         soft_wrap=True,
@@ -204,7 +204,7 @@ def show(outcome: IngestResult) -> None:
             markup=False,
             soft_wrap=True,
         )
-        console.print("\n".join(outcome.notes), markup=False, soft_wrap=True)
+        console.print("\n".join(map(visible, outcome.notes)), markup=False, soft_wrap=True)
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
@@ -292,9 +292,9 @@ def show(outcome: IngestResult) -> None:
     for item in row["stand_ins"]:
         console.print(f"no {item['input']}: {item['instead']}", markup=False)
     for note in outcome.notes:
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(visible(note), markup=False, soft_wrap=True)
     for loss in outcome.lost_messages:
-        console.print(f"lost: {loss}", markup=False, soft_wrap=True)
+        console.print(visible(f"lost: {loss}"), markup=False, soft_wrap=True)
     console.print()
 
 

@@ -130,7 +130,7 @@ class ProfileCommand:
             of = len(chosen) + len(unread)
             output.say(
                 f"read the {len(chosen)} largest of {of:,} recordings of that kind of robot; "
-                f"not read: {names_of(unread)}"
+                f"not read: {visible(names_of(unread))}"
             )
         if self.out is not None:
             write_text(self.out, toml)
@@ -158,13 +158,14 @@ class ProfileCommand:
         elif self.out is None:
             sys.stdout.write(toml)
         for each in proposal.advice:
-            output.say(str(each))
+            output.say(visible(str(each)))
         for loss in losses:
             output.say(f"lost: {loss}")
         for problem in proposal.problems:
-            sys.stderr.write(f"restock: {', '.join(self.paths)}: cannot be used yet: {problem}\n")
+            names = visible(", ".join(self.paths))
+            sys.stderr.write(f"restock: {names}: cannot be used yet: {problem}\n")
         if self.out is not None and not proposal.problems:
-            checking = shlex.join(["profile", "check", str(self.out), str(chosen[0])])
+            checking = visible(shlex.join(["profile", "check", str(self.out), str(chosen[0])]))
             output.say(f"next: restock {checking}")
         return ExitCode.LOSSY if proposal.problems or losses or unreadable else ExitCode.OK
 
@@ -256,7 +257,7 @@ class ProfileCommand:
         for line in () if self.json else advice:
             sys.stdout.write(f"try: {line}\n")
         for problem in problems:
-            sys.stderr.write(f"restock: {self.paths[1]}: {problem}\n")
+            sys.stderr.write(f"restock: {visible(self.paths[1])}: {problem}\n")
         return code
 
     def _advice(
