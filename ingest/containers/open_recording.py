@@ -56,6 +56,17 @@ def open_recording(
     return _Opening(path, distro, salvage, watch or unwatched).open()
 
 
+def refuse_no_recording(path: Path) -> None:
+    """Refuse what is no recording by its files' names and first bytes, which are quick to read.
+
+    Raises:
+        RecordingError: it is none; one that is damaged further on is not refused.
+    """
+    opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
+    for file in opening.files():
+        discover.kind_of(file)
+
+
 def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
     """The name of a type store with a folder's .msg and .idl files on top: `humble+/the/folder`.
 
@@ -91,14 +102,19 @@ class _Opening:
                 clean()
             raise
 
-    def _open(self) -> Recording:
-        metadata = BagMetadata()
+    def files(self) -> list[Path]:
+        """Its storage files."""
+        return self._files()[0]
+
+    def _files(self) -> tuple[list[Path], BagMetadata]:
         if self.path.is_dir():
-            files, metadata = self._bag()
-        elif self.path.exists():
-            files = [self.path]
-        else:
+            return self._bag()
+        if not self.path.exists():
             raise RecordingError("no such file or folder", where=str(self.path))
+        return [self.path], BagMetadata()
+
+    def _open(self) -> Recording:
+        files, metadata = self._files()
         for file in files:
             self._open_file(file)
         self._refuse_serialisation(metadata)
@@ -228,4 +244,5 @@ __all__ = [
     "TopicInfo",
     "open_recording",
     "recordings_in",
+    "refuse_no_recording",
 ]

@@ -182,14 +182,17 @@ def test_recordings_in_other_frames_get_floors_of_their_own(tmp_path: Path) -> N
     assert way._further_floors(Ended("floor", "", "planned")) == ()
 
 
-def test_no_recording_stops_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_a_recording_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "empty").mkdir()
-    code, document = start(capsys, str(tmp_path / "empty"), "--out", str(tmp_path / "out"))
-    assert code == 3
-    assert document["stages"][0]["errors"] == [
-        f"{tmp_path / 'empty'}: no recording in this folder;"
-        " recordings end in .mcap, .db3, .bag or are rosbag2 folders"
-    ]
+    out = tmp_path / "out"
+    assert cli.main(["start", str(tmp_path / "empty"), "--out", str(out), "--json"]) == 2
+    assert capsys.readouterr().err == (
+        f"restock: {tmp_path / 'empty'}: no recording in this folder\n"
+        "  recordings end in .mcap, .db3, .bag or are rosbag2 folders\n"
+    )
+    assert not out.exists()
 
 
 class Parked(Drive):

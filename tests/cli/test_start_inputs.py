@@ -193,6 +193,30 @@ def test_what_cannot_be_used_is_refused_before_anything_is_written(
     assert not Path("out").exists()
 
 
+def test_what_is_no_recording_is_refused_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("text.mcap").write_text("text\n")
+    Path("bags").mkdir()
+    Path("bags", "empty.mcap").touch()
+    Path("bare").mkdir()
+    Path("bare", "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n")
+    for paths, said in {
+        ("nothing",): "restock: nothing: no such file or folder\n  give a file, a bag's folder, or",
+        ("text.mcap",): "restock: text.mcap: not a recording: neither an MCAP,",
+        ("bags",): "restock: bags/empty.mcap: an empty file",
+        ("bare",): "restock: bare: a bag without its storage files",
+        ("nothing", "text.mcap"): "restock: nothing: no such file or folder\nrestock: text.mcap:",
+    }.items():
+        assert cli.main(["start", *paths, "--out", "out"]) == 2
+        printed = capsys.readouterr()
+        assert printed.err.startswith(said)
+        assert "\n  " in printed.err
+        assert printed.out == ""
+        assert not Path("out").exists()
+
+
 @pytest.mark.long
 def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on_with(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]

@@ -86,6 +86,8 @@ class StartCommand:
         if not 0 < self.minutes < math.inf:
             raise ConfigError(f"must be a number above 0, got {self.minutes:g}", where="--minutes")
         self._check()
+        if not self.dry_run:
+            self._expect_a_recording()
         console = stderr() if self.json else stdout()
 
         def say(line: str) -> None:
@@ -118,6 +120,34 @@ class StartCommand:
             say(f"   {escape(remedy)}")
         sys.stdout.flush()
         return int(ExitCode.LOSSY)
+
+    def _expect_a_recording(self) -> None:
+        """That any of the paths is a recording, or a folder of some, by its first bytes.
+
+        Raises:
+            RecordingError: none is; what is wrong with the other paths is printed before.
+        """
+        from restock.ingest.containers.open_recording import recordings_in, refuse_no_recording
+
+        errors: list[RecordingError] = []
+        for name in self.paths:
+            try:
+                found = recordings_in(name)
+            except RecordingError as error:
+                errors.append(error)
+                continue
+            for path in found:
+                try:
+                    refuse_no_recording(path)
+                except RecordingError as error:
+                    errors.append(error)
+                else:
+                    return
+        for other in errors[:-1]:
+            sys.stderr.write(f"restock: {other}\n")
+        last = errors[-1]
+        known = "give a file, a bag's folder, or a folder of bags"
+        raise RecordingError(last.what, where=last.where, remedy=last.remedy or known)
 
     def _check(self) -> None:
         """That what is given beside the recordings can be used: said before anything is written.
