@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from restock.ingest.profile.profile import load_profile as load_profile
     from restock.ingest.propose.propose import propose_profile as propose_profile
     from restock.ingest.relabel import relabel_store as relabel_store
+    from restock.ingest.remove import remove_recordings as remove_recordings
     from restock.ingest.store.writer import StoreWriter as StoreWriter
 else:
     __getattr__, __dir__, __all__ = lazy(
@@ -41,6 +42,7 @@ else:
             "restock.ingest.profile.profile": ["Profile", "load_profile"],
             "restock.ingest.propose.propose": ["propose_profile"],
             "restock.ingest.relabel": ["relabel_store"],
+            "restock.ingest.remove": ["remove_recordings"],
             "restock.ingest.live.observer": ["LiveObserver"],
             "restock.ingest.store.writer": ["StoreWriter"],
         },

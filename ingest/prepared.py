@@ -152,7 +152,10 @@ def _finished(
             return error
     notes = list(one.result.notes)
     if repeats is not None:
-        notes.append(f"{repeats}; the audit `repeated_steps` fails until one of them is removed")
+        notes.append(
+            f"{repeats}; the audit `repeated_steps` fails until one of them is removed: `restock"
+            f" remove {store.path} {staged.recording_id}` takes this one out"
+        )
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 
 

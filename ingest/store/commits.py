@@ -22,7 +22,7 @@ from deltalake.transaction import AddAction, RemoveAction
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.data_files import AddedFile, add_action, rewrite
-from restock.ingest.store.lineage import active_files, own_path, stored_files
+from restock.ingest.store.lineage import StoredFile, active_files, own_path, stored_files
 from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
@@ -115,31 +115,71 @@ class TableCommits(StoreReader):
             actions: list[AddAction | RemoveAction] = [add_action(f, now_ms) for f in added]
             turns = []
             if name == TRANSITIONS:
-                replaced.clear()
                 self.discard_uncommitted(name, rewritten)  # of an attempt before
+                replaced[:] = _held(active, recordings)
                 rewritten.clear()
-                for file in active:
-                    gone = [one for one in file.ingests if one.recording_id in recordings]
-                    if not gone:
-                        continue
-                    replaced.extend(own_path(one.recording_id, one.ingest_id) for one in gone)
-                    actions.append(RemoveAction(file.path, True, now_ms))
-                    kept = [one for one in file.ingests if one.recording_id not in recordings]
-                    if kept:
-                        rewritten.append(rewrite(self.path, file, kept))
-                        actions.append(add_action(rewritten[-1], now_ms))
+                actions += self._without(active, recordings, rewritten, now_ms)
                 # Two first ingests of one recording add without removing, which is no conflict by
                 # itself: the transaction id makes it one.
-                turns = [
-                    Transaction(app, (table.transaction_version(app) or 0) + 1)
-                    for app in (f"restock/{recording}" for recording in recordings)
-                ]
+                turns = _turns(table, recordings)
             self.transact(table, actions, turns)
             table.update_incremental()
             return table.version()
 
         with self.discarded_on_failure(name, rewritten):
             return self.again_on_conflict(attempt), replaced
+
+    def take_out(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
+        """Take recordings (with the ingests that they are there as) out of `transitions`, all or
+        none of them; their manifests are left to the caller.
+
+        Returns the table's version that they were read from, and the newest, without them.
+
+        Raises:
+            StoreError: one was ingested again or removed in the meantime, or other writers were
+                faster too many times.
+        """
+        rewritten: list[AddedFile] = []
+        before: list[int] = []
+
+        def attempt() -> int:
+            table = self.path.open_table(TRANSITIONS)
+            active = stored_files(self.path, TRANSITIONS, table)
+            self.discard_uncommitted(TRANSITIONS, rewritten)  # of an attempt before
+            rewritten.clear()
+            if before and not _held(active, ingests):
+                return table.version()  # by the attempt before, whose answer was lost
+            self._still(ingests)
+            before[:] = [table.version()]
+            now_ms = time.time_ns() // 1_000_000
+            actions = self._without(active, ingests, rewritten, now_ms)
+            self.transact(table, actions, _turns(table, sorted(ingests)), operation)
+            table.update_incremental()
+            return table.version()
+
+        with self.discarded_on_failure(TRANSITIONS, rewritten):
+            version = self.again_on_conflict(attempt)
+        return before[0], version
+
+    def _without(
+        self,
+        active: Sequence[StoredFile],
+        recordings: Collection[str],
+        rewritten: list[AddedFile],
+        now_ms: int,
+    ) -> list[AddAction | RemoveAction]:
+        """What takes the rows of recordings out of `transitions`: their files, and of files that
+        hold others too, new ones without them, which are added to `rewritten`."""
+        actions: list[AddAction | RemoveAction] = []
+        for file in active:
+            kept = [one for one in file.ingests if one.recording_id not in recordings]
+            if len(kept) == len(file.ingests):
+                continue
+            actions.append(RemoveAction(file.path, True, now_ms))
+            if kept:
+                rewritten.append(rewrite(self.path, file, kept))
+                actions.append(add_action(rewritten[-1], now_ms))
+        return actions
 
     def replace_files(
         self, name: str, gone: Collection[str], made: Sequence[AddedFile], operation: str
@@ -234,9 +274,9 @@ class TableCommits(StoreReader):
         for recording, ingest in instead_of.items():
             if shown.get(recording) != ingest:
                 raise StoreError(
-                    f"recording {recording} was ingested again in the meantime",
+                    f"recording {recording} was ingested again or removed in the meantime",
                     where=str(self.path),
-                    remedy="try again; the store is in the state after that ingest",
+                    remedy="try again; the store is in the state after that",
                 )
 
     def again_on_conflict(self, work: Callable[[], T]) -> T:
@@ -258,6 +298,24 @@ class TableCommits(StoreReader):
             where=str(self.path),
             remedy="try again when they are done; the store is unchanged",
         )
+
+
+def _held(active: Sequence[StoredFile], recordings: Collection[str]) -> list[str]:
+    """Where the ingests of these recordings that the files hold have written their own."""
+    return [
+        own_path(one.recording_id, one.ingest_id)
+        for file in active
+        for one in file.ingests
+        if one.recording_id in recordings
+    ]
+
+
+def _turns(table: DeltaTable, recordings: Sequence[str]) -> list[Transaction]:
+    """Transaction ids that let one writer at a time change each of these recordings."""
+    return [
+        Transaction(app, (table.transaction_version(app) or 0) + 1)
+        for app in (f"restock/{recording}" for recording in recordings)
+    ]
 
 
 def recording_columns() -> pa.Schema:

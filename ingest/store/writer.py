@@ -202,6 +202,21 @@ class StoreWriter(TableCommits):
         self.remove(RECORDINGS, replaced)
         return version
 
+    def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
+        """Take recordings, by the ingests that they are there as (recording -> ingest), out of the
+        store in one commit. Their files stay for as long as those of replaced ones.
+
+        Returns the version of `transitions` that they were read from, and the newest, without
+        them.
+
+        Raises:
+            StoreError: one was ingested again or removed in the meantime, or other writers were
+                faster too many times. The store is as it was.
+        """
+        versions = self.take_out(ingests, operation)
+        self.remove(RECORDINGS, {own_path(*ids) for ids in ingests.items()})
+        return versions
+
     def fit(self, staged: Sequence[Staged]) -> None:
         """See that the tables are there, and have the columns of these recordings.
 
@@ -244,7 +259,7 @@ class StoreWriter(TableCommits):
                     full=True,
                 )
             # It names removed files for as long as the log does, there or not.
-            stale = sorted(set(unneeded) & self.path.listing(name))
+            stale = sorted(set(unneeded) & self._written_before(name, retention_hours))
             deleted += [f"{name}/{file}" for file in stale]
         # Without commits of its own: cleaning changes no version of a table.
         self.path.delete(deleted)
@@ -252,10 +267,18 @@ class StoreWriter(TableCommits):
         self.path.delete(frames)
         return deleted + frames
 
+    def _written_before(self, name: str, retention_hours: int) -> set[str]:
+        """The files in a folder that are older than the window.
+
+        A manifest may be younger than its removal in the log: compaction writes it again where a
+        version within the window needs it.
+        """
+        before_s = time.time() - retention_hours * 3600
+        return {path for path, at_s in self.path.times(name).items() if at_s <= before_s}
+
     def _unnamed_frames(self, retention_hours: int) -> list[str]:
         """Files of frames older than the window that no manifest names, removed ones included."""
-        before_s = time.time() - retention_hours * 3600
-        found = {path for path, at_s in self.path.times(FRAMES).items() if at_s < before_s}
+        found = self._written_before(FRAMES, retention_hours)
         if not found:
             return []
         for path in self.path.listing(RECORDINGS):
@@ -277,7 +300,10 @@ class StoreWriter(TableCommits):
         return [
             file.path
             for file in stored_files(self.path, RECORDINGS, manifests)
-            if file.added_ms < before_ms and not shown & {one.ingest_id for one in file.ingests}
+            # A joined file was of recordings that were there: versions before need it still.
+            if file.own
+            and file.added_ms < before_ms
+            and not shown & {one.ingest_id for one in file.ingests}
         ]
 
     def _write(self, rows: pa.Table, path: str) -> int:

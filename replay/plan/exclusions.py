@@ -124,8 +124,8 @@ def repeats_of(
         raise MixtureError(
             f"all {int(repeated.sum())} rows outside the evaluation split repeat its steps:"
             " the same drive is in the store more than once",
-            remedy="remove the repeated recordings (the audit `repeated_steps` lists them), or "
-            "ingest more",
+            remedy="take the repeated recordings out with `restock remove STORE RECORDING` (the"
+            " audit `repeated_steps` lists them), or ingest more",
         )
     return repeated
 

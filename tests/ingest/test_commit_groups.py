@@ -96,7 +96,7 @@ def test_one_that_cannot_be_committed_costs_itself_alone(tmp_path):
     group.add(3, waiting(store, one(3)))
     group.commit()
     assert isinstance(group.results[2], StoreError)
-    assert "ingested again in the meantime" in str(group.results[2])
+    assert "ingested again or removed in the meantime" in str(group.results[2])
     kept = {"0000000000000001-a", "0000000000000002-a", "0000000000000003-a"}
     assert set(shown(tmp_path / "s")) == kept
 

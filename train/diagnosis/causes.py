@@ -401,7 +401,8 @@ KINDS = (
         "EPISODES_REPEATED",
         ("repeated episodes",),
         "{repeated_episodes.logs:.0%} of the rows belong to episodes that are stored twice",
-        "`restock audit` lists the recordings (repeated_steps): remove one of them",
+        "`restock audit` lists the recordings (repeated_steps): take one of them out with `restock"
+        " remove STORE RECORDING`",
     ),
 )
 

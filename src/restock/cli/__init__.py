@@ -27,6 +27,7 @@ VERBS = {
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "label": "label a store again after its conditions changed, without the recordings",
     "compact": "join a store's many small files into a few large ones",
+    "remove": "take recordings out of a store; its earlier versions keep them for 7 days",
     "sql": "query a store (or a run) in SQL",
     "coverage": "how much of each condition a store holds, and what is missing, on one page",
     "audit": "check that the coverage is good enough: exit 1 if not",
@@ -54,9 +55,10 @@ VERBS = {
 # folder -> the verbs whose modules it holds
 FOLDERS = {
     "data": (
-        *("info", "profile", "ingest", "label", "compact", "sql", "audit"),
+        *("info", "profile", "ingest", "label", "sql", "audit"),
         *("drift", "diff", "gaps", "mix", "export"),
     ),
+    "upkeep": ("compact", "remove"),
     "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "schema"),
     "pages": ("coverage", "report"),
     "twin": ("record", "twin"),

@@ -50,7 +50,7 @@ class CompactCommand:
         from restock.ingest.store.writer import StoreWriter
 
         store = StoreWriter(self.store)
-        _expect_store(store)
+        expect_store(store)
         if self.drop_damaged:
             return self._drop_damaged(store)
         done = compact(store, dry_run=self.dry_run)
@@ -107,7 +107,7 @@ class CompactCommand:
         return ExitCode.LOSSY if done.dropped else ExitCode.OK
 
 
-def _expect_store(store: StoreWriter) -> None:
+def expect_store(store: StoreWriter) -> None:
     """Raises StoreError where the place is another of Restock's."""
     folder = store.path.folder
     if folder is None or store.path.has_table("transitions"):
