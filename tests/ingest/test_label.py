@@ -123,7 +123,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
         return found
 
     writer.rows = rows_and_a_rival  # type: ignore[method-assign]
-    with pytest.raises(StoreError, match="ingested again in the meantime"):
+    with pytest.raises(StoreError, match="ingested again or removed in the meantime"):
         relabel_store(writer, conditions_of)
     assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
 
