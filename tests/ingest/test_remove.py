@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -14,8 +16,10 @@ from support.stores import one, shown
 
 from restock.cli import main
 from restock.errors import StoreError
+from restock.ingest.correct import RecordingCorrections, correct_store
 from restock.ingest.remove import RemovedRecording, remove_recordings
 from restock.ingest.store.compaction import compact
+from restock.ingest.store.corrections import Correction
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
@@ -236,3 +240,30 @@ def test_what_names_no_recording_exits_2(tmp_path, capsys):
     assert "names no recording" in capsys.readouterr().err
     assert main(["remove", str(tmp_path / "none"), name_of(1)]) == 2
     assert len(shown(place)) == 3
+
+
+def test_corrected_labels_of_a_removed_recording_are_in_no_ones_way(tmp_path, capsys):
+    writer = three(tmp_path / "s")
+    (first, second, _) = writer.live().sort_by("recording_id").to_pylist()
+    stamps = [int(one(n)[1]["stamp_ns"][0].as_py()) for n in (1, 2)]
+    now = dt.datetime.now(dt.UTC)
+    given = {
+        row["recording_id"]: RecordingCorrections(
+            row["ingest_id"], [Correction("wheel_slip", True, 0, at_ns, at_ns + 10**9, now)]
+        )
+        for row, at_ns in zip((first, second), stamps, strict=True)
+    }
+    correct_store(writer, given)
+    assert main(["remove", str(tmp_path / "s"), name_of(2)]) == 0
+    assert "does not bring back 1 correction of labels" in capsys.readouterr().err
+    with pytest.raises(StoreError, match="was ingested again or removed"):
+        correct_store(writer, given)
+    with Store(tmp_path / "s") as store:
+        said = store.sql("SELECT recording_id, len(corrections) FROM recordings ORDER BY 1")
+        assert said.fetchall() == [(name_of(1), 1), (name_of(3), 0)]
+    (now_there,) = writer.live(name_of(1)).to_pylist()
+    again = replace(given[name_of(1)], ingest_id=now_there["ingest_id"])
+    assert len(correct_store(writer, {name_of(1): again})[0]) == 1
+    assert set(shown(tmp_path / "s").values()) == {len(one(n)[1]) for n in (1, 3)}
+    writer.write(*one(2, "c"))
+    assert writer.live(name_of(2))["corrections"].to_pylist() in ([[]], [None])

@@ -94,18 +94,19 @@ class RemoveCommand:
         if done.version is None:
             return [f"{self.store}: would remove {what}, {rows} ({left})"]
         lines = [f"{self.store}: removed {what}, {rows} ({left}); store version {done.version}"]
+        it = "it" if len(done.recordings) == 1 else "them"
         store = shlex.quote(self.store)
         paths = [shlex.quote(one.source_file) for one in done.recordings[:SHOWN]]
         paths += ["…"] * (len(done.recordings) > SHOWN)
-        lines.append(f"to get it back: restock ingest {' '.join(paths)} --store {store}")
+        lines.append(f"to get {it} back: restock ingest {' '.join(paths)} --store {store}")
         if corrections := sum(one.corrections for one in done.recordings):
             what = f"{counted(corrections, 'correction')} of labels"
             lines.append(f"that does not bring back {what}, which were kept in the store alone")
         tags = sorted({f"{k}={v}" for one in done.recordings for k, v in one.tags.items()})
         if tags:
-            lines.append(f"tags that came from --tag must be given again; it had {', '.join(tags)}")
+            lines.append(f"give tags that came from --tag again; there were {', '.join(tags)}")
         lines.append(
-            f"version {done.version_before} still has it, for {RETENTION_HOURS // 24} days:"
+            f"version {done.version_before} still has {it}, for {RETENTION_HOURS // 24} days:"
             f' restock sql {store} --version {done.version_before} "FROM recordings"'
         )
         return lines
