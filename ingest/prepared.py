@@ -7,6 +7,7 @@ those of GROUP_S seconds together, or as soon as MOST wait.
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -154,7 +155,7 @@ def _finished(
     if repeats is not None:
         notes.append(
             f"{repeats}; the audit `repeated_steps` fails until one of them is removed: `restock"
-            f" remove {store.path} {staged.recording_id}` takes this one out"
+            f" remove {shlex.quote(str(store.path))} {staged.recording_id}` takes this one out"
         )
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 

@@ -103,8 +103,8 @@ class RemoveCommand:
             what = f"{counted(corrections, 'correction')} of labels"
             lines.append(f"that does not bring back {what}, which were kept in the store alone")
         tags = sorted({f"{k}={v}" for one in done.recordings for k, v in one.tags.items()})
-        if tags:
-            lines.append(f"give tags that came from --tag again; there were {', '.join(tags)}")
+        had = f" (tags were {', '.join(tags)})" if tags else ""
+        lines.append(f"give the options from before again, such as --profile or --tag{had}")
         lines.append(
             f"version {done.version_before} still has {it}, for {RETENTION_HOURS // 24} days:"
             f' restock sql {store} --version {done.version_before} "FROM recordings"'
