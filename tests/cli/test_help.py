@@ -36,6 +36,16 @@ def test_prose_is_wrapped_and_parted_by_single_empty_lines(
         assert ["", ""] not in [lines[at : at + 2] for at in range(len(lines))]
 
 
+def test_a_window_of_one_column_has_an_end() -> None:
+    command = [sys.executable, "-m", "restock", "compact", "--help"]
+    done = subprocess.run(
+        command, env=os.environ | {"COLUMNS": "1"}, capture_output=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    boxes = [line for line in done.stdout.decode().splitlines() if line[0:1] in "╭│╰" and line]
+    assert {len(line) for line in boxes} == {20}
+
+
 def test_a_paragraph_has_none_of_the_line_breaks_of_the_source(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

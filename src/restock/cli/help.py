@@ -14,6 +14,7 @@ from contextlib import contextmanager, redirect_stdout
 import tyro
 
 LEAST = 80  # columns that prose may take above narrower boxes, where the window has them
+NARROWEST = 20  # columns: in a few, tyro lays its boxes out without end
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -36,6 +37,8 @@ class _Held(io.TextIOWrapper):
 @contextmanager
 def printed(*, help_asked: bool) -> Iterator[None]:
     """While tyro parses a command line: how it prints its help, or its complaint."""
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
         tyro._experimental_options["ansi_codes"] = False
     if not help_asked:
