@@ -43,7 +43,7 @@ def test_a_window_of_one_column_has_an_end() -> None:
     )
     assert done.returncode == 0
     boxes = [line for line in done.stdout.decode().splitlines() if line[0:1] in "╭│╰" and line]
-    assert {len(line) for line in boxes} == {20}
+    assert {len(line) for line in boxes} == {30}
 
 
 def test_a_paragraph_has_none_of_the_line_breaks_of_the_source(

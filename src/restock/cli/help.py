@@ -14,7 +14,7 @@ from contextlib import contextmanager, redirect_stdout
 import tyro
 
 LEAST = 80  # columns that prose may take above narrower boxes, where the window has them
-NARROWEST = 20  # columns: in a few, tyro lays its boxes out without end
+NARROWEST = 30  # columns: in a few, tyro lays its boxes out without end
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
