@@ -24,8 +24,8 @@ from restock.ingest.prepared import IngestResult
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.relabel import relabel_store
 from restock.ingest.steps.steps import steps_of
-from restock.ingest.store.commits import delta_columns
-from restock.ingest.store.location import TRANSITIONS
+from restock.ingest.store.commits import delta_columns, recording_columns
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import told, unseen
@@ -219,6 +219,7 @@ def test_a_store_of_an_older_restock_takes_them(drives, tmp_path):
     writer = StoreWriter(tmp_path / "store")
     schema = delta_columns(transition_schema(BLIND.task.observation_size))
     strict = [f.with_nullable(f.nullable and f.name not in LIDAR_SIGNALS) for f in schema]
+    writer.create(RECORDINGS, recording_columns())
     writer.create(TRANSITIONS, pa.schema(strict))
     ingest(drives / "blind", BLIND, store=writer)
     fields = writer.path.open_table(TRANSITIONS).schema().fields
