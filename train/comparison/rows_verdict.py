@@ -15,6 +15,7 @@ from restock.errors import RestockError
 from restock.train.comparison.diagnose import Diagnosis
 from restock.train.comparison.windows import Cause
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_before_training
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
@@ -35,6 +36,7 @@ def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
     ((path, run),) = fed.items()
     env = run.document["config"].get("env", {})
     try:
+        run_panel(run.document)
         given = find_perturbation(env.get("perturbation", "nominal"), where="env.perturbation")
         twin = given.base if isinstance(given, Schedule) else given
         profile = profile_of_run(run)

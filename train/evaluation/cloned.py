@@ -20,9 +20,10 @@ from restock.errors import ConfigError, PanelError, StoreError
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_probabilities
 from restock.train.dqn.network import QNetwork
-from restock.train.evaluation.off_policy.dataset import MODEL_ROWS, held_out_rows, run_panel
+from restock.train.evaluation.off_policy.dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
 from restock.train.run.clone_quality import CloneQuality, keep_clone
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run
 
 CLONED = "cloned"

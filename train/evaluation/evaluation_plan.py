@@ -15,9 +15,9 @@ from restock.toml import read_toml, typed
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.cloned import CLONED, cloned_panel, is_cloned, load_cloned
 from restock.train.evaluation.logged_ways import EVERY, HELD_OUT, LoggedMissions, logged_missions
-from restock.train.evaluation.off_policy.dataset import run_panel
 from restock.train.evaluation.policies import load_agent, load_policy
 from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_evaluations import WAYS
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run

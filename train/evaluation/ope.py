@@ -36,10 +36,10 @@ from restock.train.evaluation.off_policy.dataset import (
     OpeDataset,
     OpeSteps,
     load_ope_dataset,
-    run_panel,
 )
 from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes, estimate
 from restock.train.evaluation.policies import load_agent
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import TABLES

@@ -9,7 +9,6 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from pathlib import Path
 from typing import Any, Literal
 
 import duckdb
@@ -306,12 +305,6 @@ def _halves(store: Store, ids: Ints) -> tuple[Ints, Ints]:
     return rows[evaluation], rows[~evaluation]
 
 
-def run_panel(document: dict[str, Any]) -> Panel | None:
-    """The panel that a run learnt from, by its `config.json`; None where it had none."""
-    panel = document.get("panel")
-    return None if panel is None else Panel.open(Path(panel["path"]))
-
-
 __all__ = [
     "Measure",
     "OpeDataset",
@@ -320,5 +313,4 @@ __all__ = [
     "held_out_rows",
     "load_ope_dataset",
     "panel_store",
-    "run_panel",
 ]

@@ -17,6 +17,7 @@ from restock.replay.store.store import Store
 from restock.report.look.blocks import Rows, words
 from restock.report.look.queries import ask, rows_of, statements
 from restock.train.run.clone_quality import CloneQuality, read_clones
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import measures
 from restock.train.run.run import Run
@@ -178,9 +179,12 @@ def _add_panel(facts: Facts) -> None:
         facts.missing.append("The run had no panel: it learned from fresh experience alone.")
         return
     try:
-        facts.panel = Panel.open(where)
-        with Store(facts.panel.header.store) as store:
-            _add_floor(facts, facts.panel, store)
+        facts.panel = held = (
+            run_panel(facts.config) if isinstance(panel, dict) else Panel.open(where)
+        )
+        assert held is not None
+        with Store(held.header.store) as store:
+            _add_floor(facts, held, store)
             facts.recordings = _store_rows(store, "recordings")
             facts.logged = _store_rows(store, "logged")
             facts.labels = _store_rows(store, "labels")
