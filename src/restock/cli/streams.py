@@ -7,7 +7,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
 from restock.errors import ConfigError
@@ -17,7 +17,8 @@ def substitute_what_cannot_be_shown() -> None:
     """A terminal or pipe that is not UTF-8 gets what it can show: no reason to stop a verb."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=SUBSTITUTED)
+            with suppress(OSError):  # a stream that became a pipe under Python's eyes
+                stream.reconfigure(errors=SUBSTITUTED)
 
 
 def _substituted(error: UnicodeError) -> tuple[str, int]:
