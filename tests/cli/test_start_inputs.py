@@ -193,6 +193,15 @@ def test_what_cannot_be_used_is_refused_before_anything_is_written(
     assert not Path("out").exists()
 
 
+def test_a_file_of_any_name_may_lie_beside_the_recordings(
+    tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (damaged.parent / os.fsdecode(b"odd\xff.txt")).write_text("not UTF-8")
+    code, document = start(capsys, str(damaged.parent), "--out", str(tmp_path / "out"))
+    assert code == 3  # for the recording that is cut
+    assert document["stages"][0]["status"] == "failed"
+
+
 def test_what_is_no_recording_is_refused_and_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

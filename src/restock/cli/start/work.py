@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import shutil
 import sys
 import time
@@ -165,7 +166,7 @@ class Work:
     def _stamp(self, stage: Stage) -> str:
         """What decides its result: the command, the user's files, and all stages before it."""
         parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
-        return hashlib.blake2b("\n".join(parts).encode(), digest_size=12).hexdigest()
+        return hashlib.blake2b(os.fsencode("\n".join(parts)), digest_size=12).hexdigest()
 
     def _clear(self, stage: Stage) -> None:
         """Remove what an earlier call made of the stage; a run, which took long, is put aside."""
