@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import write_bags
 
 from restock.replay.store.store import Store
 
@@ -19,10 +19,7 @@ FULL_DISK = Path("/dev/full")
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("bags")
-    for number in range(3):
-        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
-    return folder
+    return write_bags(tmp_path_factory.mktemp("bags"), 3)
 
 
 def ingested(bags: Path, store: Path, stdout: IO[bytes]) -> subprocess.CompletedProcess[str]:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import write_bags
 from support.paths import ROOT
 
 from restock.cli import main
@@ -25,8 +25,7 @@ pytestmark = pytest.mark.long
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bags")
-    for number in range(3):
-        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
+    write_bags(folder, 3)
     (folder / "cut.mcap").write_bytes(b"")
     return folder
 

@@ -159,17 +159,24 @@ def test_a_prefix_of_several_names_them(tmp_path):
     assert all(f"{name_of(n)} (logs/{n}.mcap)" in str(error.value) for n in (1, 2, 3))
 
 
-@pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
-def test_another_writer_may_be_faster(tmp_path, monkeypatch, joined):
-    writer = three(tmp_path / "s", joined=joined)
+def overtake(
+    monkeypatch: pytest.MonkeyPatch, place: Path, *recordings: tuple[pa.Table, pa.Table]
+) -> None:
+    """Another writer writes these just before the next commit of any writer."""
     transact = StoreWriter.transact
 
     def overtaken(self, *args, **given):
         monkeypatch.setattr(StoreWriter, "transact", transact)
-        StoreWriter(tmp_path / "s").write_all([one(1, "b"), one(4)])
+        StoreWriter(place).write_all(recordings)
         transact(self, *args, **given)
 
     monkeypatch.setattr(StoreWriter, "transact", overtaken)
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
+def test_another_writer_may_be_faster(tmp_path, monkeypatch, joined):
+    writer = three(tmp_path / "s", joined=joined)
+    overtake(monkeypatch, tmp_path / "s", one(1, "b"), one(4))
     remove_recordings(writer, [name_of(2)])
     assert shown(tmp_path / "s") == expected((1, "b"), (3, "a"), (4, "a"))
 
@@ -177,14 +184,7 @@ def test_another_writer_may_be_faster(tmp_path, monkeypatch, joined):
 @pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
 def test_what_another_writer_ingests_again_meanwhile_is_not_removed(tmp_path, monkeypatch, joined):
     writer = three(tmp_path / "s", joined=joined)
-    transact = StoreWriter.transact
-
-    def overtaken(self, *args, **given):
-        monkeypatch.setattr(StoreWriter, "transact", transact)
-        StoreWriter(tmp_path / "s").write(*one(2, "b"))
-        transact(self, *args, **given)
-
-    monkeypatch.setattr(StoreWriter, "transact", overtaken)
+    overtake(monkeypatch, tmp_path / "s", one(2, "b"))
     with pytest.raises(StoreError, match=f"{name_of(2)} was ingested again or removed in the mean"):
         remove_recordings(writer, [name_of(1), name_of(2)])
     assert shown(tmp_path / "s") == expected((1, "a"), (2, "b"), (3, "a"))

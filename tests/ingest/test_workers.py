@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from support.driven_robot import Drive, write_bag
+from support.driven_robot import write_bags
 from support.long import one_in
 
 from restock.cli import main
@@ -25,10 +25,7 @@ from restock.replay.store.store import Store, is_store
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of recordings."""
-    folder = tmp_path_factory.mktemp("bags")
-    for number in range(5):
-        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
-    return folder
+    return write_bags(tmp_path_factory.mktemp("bags"), 5)
 
 
 def _length(path: Path) -> int:

@@ -154,6 +154,13 @@ def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
     return write_topics(typed_topics(drive), folder, storage=storage)
 
 
+def write_bags(folder: Path, count: int) -> Path:
+    """A folder of this many recordings, `drive0` and so on: of 3 s, 4 s, …"""
+    for number in range(count):
+        write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
+    return folder
+
+
 def typed_topics(drive: Drive) -> dict[str, tuple[str, TopicColumns]]:
     """The drive's topics with the types of their messages, as `write_topics` takes them."""
     names = {
