@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -24,7 +25,7 @@ from restock.train.dqn.target import describe
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Logs
-from restock.train.feed.teacher import Teacher, open_teacher
+from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher
 from restock.train.finite import STOPPED
 from restock.train.logs_alone import NoTwin, without_twin
 from restock.train.loop import Notify, TrainResult
@@ -34,6 +35,7 @@ from restock.train.missions import (
     reference_success,
     ways_to_evaluate,
 )
+from restock.train.new_run import check_new_run
 from restock.train.resolve import mirrors, planned_draws, resolve_config, resolve_teacher
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
@@ -49,7 +51,7 @@ from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.physics.episode import KINDS
+from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import find_perturbation
 
 _EVALUATION_ENVS = 16
@@ -84,6 +86,21 @@ class Prepared:
             (self.path / STOPPED).unlink(missing_ok=True)
         if self.from_env_steps is not None:
             go_back(run.latest, self.from_env_steps)
+        try:
+            return self._session(run, env, teacher, episodes, layouts)
+        except BaseException:
+            if self.resumed is None:  # a run that never began is in nobody's way
+                shutil.rmtree(self.path, ignore_errors=True)
+            raise
+
+    def _session(
+        self,
+        run: Run,
+        env: Twin,
+        teacher: AskedTeacher | None,
+        episodes: list[EpisodeSpec] | None,
+        layouts: str,
+    ) -> Session:
         return open_session(
             run,
             self.config,
@@ -199,6 +216,7 @@ def prepare_new(
     drivers = None if panel is None else sorted(rows_by_policy(panel))
     refuse_nothing_to_learn(config.teacher, drivers)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
+    check_new_run(config, profile.task, panel)
     written = _document(config, profile, panel)
     if ring is not None:
         written["ring_capacity"] = ring

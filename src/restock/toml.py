@@ -233,10 +233,10 @@ def _range_in_words(bounds: Mapping[str, float]) -> str:
     low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
     if low is not None and high is not None:
         left, right = "[" if "ge" in bounds else "(", "]" if "le" in bounds else ")"
-        return f"in {left}{low:g}, {high:g}{right}"
+        return f"in {left}{low:.10g}, {high:.10g}{right}"
     if low is not None:
-        return f"{'at least' if 'ge' in bounds else 'above'} {low:g}"
-    return f"{'at most' if 'le' in bounds else 'below'} {high:g}"
+        return f"{'at least' if 'ge' in bounds else 'above'} {low:.10g}"
+    return f"{'at most' if 'le' in bounds else 'below'} {high:.10g}"
 
 
 def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:

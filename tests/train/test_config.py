@@ -12,7 +12,8 @@ import pytest
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, load_config, parse_config
-from restock.train.prepare import make_twin
+from restock.train.dqn.target import Hard, Polyak
+from restock.train.prepare import make_twin, prepare_new
 
 
 def test_the_config_refuses_unknown_keys_with_their_path() -> None:
@@ -43,11 +44,60 @@ def test_the_target_rule_is_written_with_its_name() -> None:
         ("evaluation.averaging=0", r"evaluation\.averaging must be in \(0, 1\], got 0"),
         ("jump_start.horizon_steps=0", r"jump_start\.horizon_steps must be at least 1, got 0"),
         ("target={rule='polyak', tau=2}", r"target\.tau must be in \(0, 1\], got 2"),
+        ("target.tau=2", r"target\.tau must be in \(0, 1\], got 2"),
+        ("seed=-1", r"seed must be in \[0, 2147483647\], got -1"),
+        ("evaluation.seed=-5", r"evaluation\.seed must be in \[0, 2147483647\], got -5"),
+        ("threads=0", r"threads must be in \[1, 1024\], got 0"),
+        (
+            "loss.n_step=1000000",
+            r"ring_capacity must be at least .* = 32,000,000 rows, got 100,000",
+        ),
+        ("env.num_envs=100000", r"ring_capacity must be at least .* = 300,000 rows, got 100,000"),
+        ("schedule.updates_per_env_step=1e9", r"must be in \(0, 1000\], got 1000000000"),
     ],
 )
 def test_a_value_out_of_range_is_named_with_its_range(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(None, [override])
+
+
+def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
+    assert load_config(None, ["target.tau=0.02"]).target == Polyak(tau=0.02)
+    hard = tmp_path / "hard.toml"
+    hard.write_text('target = {rule = "hard", every = 7}\n')
+    assert load_config(hard, ["target.every=9"]).target == Hard(every=9)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("replay.ring_capacity=99999999999", r"of them for replay\.ring_capacity; this machine"),
+        ("network.hidden=[9000000, 9000000]", r"of them for network\.hidden; this machine"),
+        ("practice.floor=0.1", r'practice\.floor: has no effect under the rule "natural"'),
+        ("env.missions_share=0.9", r"env\.missions_share: has no effect without missions"),
+        ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
+        ("loss.calibrated=true", r"apply to logged rows, but this run has no logs"),
+    ],
+)
+def test_what_a_run_could_not_do_is_refused_before_its_folder_is_made(
+    tmp_path: Path, override: str, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        prepare_new(tmp_path / "run", None, None, [override])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_cannot_be_opened_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    prepared = prepare_new(tmp_path / "run", None, None, ["env.num_envs=1"])
+    monkeypatch.setattr("restock.train.session.Learner", refuse)
+    with pytest.raises(MemoryError):
+        prepared.open()
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
 from restock.train.twin.physics.perturbation import find_perturbation
 
 RENAMED = {"guide": "jump_start"}  # keys of earlier versions
+DEFAULT_RULE = "polyak"  # of the target
 GIVEN = "given"  # the source of a teacher that Python code passed in
 
 Count = Annotated[int, Meta(ge=1)]
@@ -33,6 +34,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
+Seed = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 
 
 class NetworkConfig(Checked, frozen=True):
@@ -91,7 +93,7 @@ class ScheduleConfig(Checked, frozen=True):
     seconds: Positive | None = None  # stop after this training time, if earlier
     offline_updates: NonNegativeInt = 2_000  # updates on the panel alone, before any driving
     warmup_env_steps: NonNegativeInt = 2_000  # rollouts before the first online update
-    updates_per_env_step: Positive = 0.25
+    updates_per_env_step: Annotated[float, Meta(gt=0, le=1_000)] = 0.25
 
 
 class JumpStartConfig(Checked, frozen=True):
@@ -208,7 +210,7 @@ class PracticeConfig(Checked, frozen=True):
 class EvaluationConfig(Checked, frozen=True):
     every_env_steps: Count = 20_000
     episodes: Count = 10  # episodes per condition
-    seed: int = 90_000  # seed of the first fixed episode; not used in training
+    seed: Seed = 90_000  # seed of the first fixed episode; not used in training
     # Rate of the average of weights that is evaluated; 1: the last ones.
     averaging: Annotated[float, Meta(gt=0, le=1)] = 0.001
     layouts: str | None = None  # None: env.layouts (generated:train: its validation floors)
@@ -239,9 +241,9 @@ class RecordConfig(Checked, frozen=True):
 class TrainConfig(Checked, frozen=True):
     """All settings of a run, except the panel."""
 
-    seed: int = 0
+    seed: Seed = 0
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = 1  # threads of torch on the CPU
+    threads: Annotated[int, Meta(ge=1, le=1_024)] = 1  # threads of torch on the CPU
     profile: str = "warehouse_amr"  # the robot: its task, conditions and zones
     network: NetworkConfig = NetworkConfig()
     loss: LossConfig = LossConfig()
@@ -264,6 +266,12 @@ class TrainConfig(Checked, frozen=True):
         if unknown:
             raise ValueError(
                 f"guard.conditions: {', '.join(sorted(unknown))} is not among env.conditions"
+            )
+        capacity, waiting = self.replay.ring_capacity, self.env.num_envs * self.loss.n_step
+        if capacity != "auto" and capacity < waiting:
+            raise ValueError(
+                f"replay.ring_capacity must be at least env.num_envs x loss.n_step = {waiting:,}"
+                f" rows, got {capacity:,}"
             )
 
 
@@ -325,6 +333,8 @@ def _apply(document: dict[str, Any], override: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text  # a bare word is a string
     *sections, last = key.strip().split(".")
+    if sections == ["target"]:  # a setting of the default rule, unless a rule is named
+        document.setdefault("target", {"rule": DEFAULT_RULE})
     for section in sections:
         document = document.setdefault(section, {})
         if not isinstance(document, dict):

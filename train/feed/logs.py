@@ -165,12 +165,7 @@ class LogTerms:
             PanelError: Cal-QL without a return-to-go in the panel.
         """
         if logs is None:
-            if loss.margin or loss.calibrated:
-                raise ConfigError(
-                    "loss.margin and loss.calibrated apply to logged rows, but this run has no "
-                    "logs",
-                    remedy="give --panel, or leave them out",
-                )
+            _refuse_without_logs(loss)
             return cls(None, None)
         expert = to_go = None
         if loss.margin:
@@ -194,11 +189,35 @@ class LogTerms:
         )
 
 
+def check_terms(loss: LossConfig, panel: Panel | None) -> None:
+    """Refuse what `LogTerms.of` would, from the panel's columns alone."""
+    if panel is None:
+        _refuse_without_logs(loss)
+        return
+    if loss.margin:
+        policy = Coded.of(panel.meta["behaviour_policy"])
+        _refuse_unknown(loss, policy.names, [stratum.name for stratum in panel.strata])
+    if loss.calibrated:
+        _ = panel.return_to_go  # raises PanelError where it has none
+
+
+def _refuse_without_logs(loss: LossConfig) -> None:
+    if loss.margin or loss.calibrated:
+        raise ConfigError(
+            "loss.margin and loss.calibrated apply to logged rows, but this run has no logs",
+            remedy="give --panel, or leave them out",
+        )
+
+
+def _refuse_unknown(loss: LossConfig, policies: list[str], strata: list[str]) -> None:
+    _known("loss.margin_policies", loss.margin_policies, policies)
+    _known("loss.margin_strata", loss.margin_strata, strata)
+
+
 def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """The rows, (n,), of `margin_policies` in `margin_strata`."""
     policy = logs.behaviour_policy
-    _known("loss.margin_policies", loss.margin_policies, policy.names)
-    _known("loss.margin_strata", loss.margin_strata, logs.strata)
+    _refuse_unknown(loss, policy.names, logs.strata)
     chosen = np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])
     if loss.margin_strata:
         inside = np.zeros(len(chosen), np.bool_)
