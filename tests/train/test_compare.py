@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -213,3 +214,21 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     ):
         assert main(["compare", *words]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_runs_that_are_not_independent_seeds_are_refused(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(2))
+    second = arm(tmp_path, "b", range(2, 4), config__network__dueling=True)
+    copied = str(shutil.copytree(first[0], tmp_path / "copied"))
+    again = str(make_run(tmp_path / "again", document(1, created_ns=1)))
+    for words, said in (
+        ([*first, copied, "--against", *second], f"copied: is a copy of {first[0]}"),
+        ([*first, again, "--against", *second], f"again: has the seed of {first[1]}, 1"),
+        ([*first, "--against", first[1], again], f"again: has the seed of {first[1]}, 1"),
+        ([*first, "--against", copied], f"copied: is in both arms as a copy of {first[0]}"),
+        ([*first, "--against", first[1]], f"{first[1]}: is in both arms"),
+    ):
+        assert main(["compare", *words]) == 2
+        assert "".join(said.split()) in "".join(capsys.readouterr().err.split())
+    assert main(["compare", first[0], copied, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"]

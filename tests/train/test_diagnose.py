@@ -49,9 +49,10 @@ def make_run(
     lags: Sequence[float] | None = None,  # L of each window, in place of `lag`
     every: int = 500,  # updates of a window
     target: TargetRule = Polyak(),  # noqa: B008  (frozen)
+    seed: int = 0,
 ) -> Run:
     """A run whose evaluations show these figures, as training writes them."""
-    config = msgspec.to_builtins(TrainConfig(target=target))
+    config = msgspec.to_builtins(TrainConfig(target=target, seed=seed))
     run = Run.create(path, {"config": config, "panel": None})
     for window in range(1, windows + 1):
         clocks = {"env_steps": 1000 * window, "gradient_steps": every * window}
@@ -276,10 +277,23 @@ def test_without_fresh_rows_the_logged_ones_say_what_is_wanted(tmp_path: Path) -
 
 
 def test_most_seeds_must_agree(tmp_path: Path) -> None:
-    slow = [make_run(tmp_path / f"s{n}", lag=0.9) for n in range(2)]
-    well = [make_run(tmp_path / f"w{n}") for n in range(2)]
+    slow = [make_run(tmp_path / f"s{n}", lag=0.9, seed=n) for n in range(2)]
+    well = [make_run(tmp_path / f"w{n}", seed=n) for n in range(2, 4)]
     assert diagnose([*slow, well[0]]).cause == "TARGET"
     assert diagnose([*slow, *well]).cause == "UNDETERMINED"
+
+
+def test_runs_that_are_not_seeds_of_one_recipe_are_refused(tmp_path, capsys) -> None:
+    run = str(make_run(tmp_path / "r").path)
+    same_seed = str(make_run(tmp_path / "s", windows=3).path)
+    recipe = str(make_run(tmp_path / "t", target=Hard(1000), seed=1).path)
+    for other, said in (
+        (run, "is given twice"),
+        (same_seed, "is a copy of"),
+        (recipe, "in config.target"),
+    ):
+        assert main(["diagnose", run, other]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -352,7 +366,7 @@ def test_why_nothing_is_named_is_said(
 
 
 def test_runs_that_disagree_are_listed(tmp_path: Path) -> None:
-    found = diagnose([make_run(tmp_path / "w"), make_run(tmp_path / "s", lag=0.9)])
+    found = diagnose([make_run(tmp_path / "w"), make_run(tmp_path / "s", lag=0.9, seed=1)])
     assert found.experiment == (
         "train longer, or with more seeds: the runs do not agree (HEALTHY, TARGET)"
     )

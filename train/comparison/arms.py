@@ -111,24 +111,7 @@ class Arm:
                     remedy="it has made no update yet, or was written by an older Restock: train "
                     "it again",
                 )
-        seen: dict[Path, None] = {}
-        for run in self.runs:
-            if run.path.resolve() in seen:
-                raise RunError("is given twice", where=str(run.path))
-            seen[run.path.resolve()] = None
-            unlike = [
-                difference
-                for difference in differences(self.runs[0], run)
-                if difference.kind not in ("free", "software")
-            ]
-            if unlike:
-                raise RunError(
-                    f"differs from {self.runs[0].path} in {unlike[0].setting}"
-                    f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one arm "
-                    "may differ only in their seed",
-                    where=str(run.path),
-                    remedy="give the runs of one method, then --against and those of the other",
-                )
+        refuse_dependent(self.runs)
 
     @cached_property
     def totals(self) -> dict[str, float]:
@@ -163,6 +146,48 @@ class Arm:
                 runs = pa.array([number] * table.num_rows, pa.int64())
                 parts.append(table.append_column("run", runs))
         return pa.concat_tables(parts)
+
+
+def refuse_dependent(runs: Sequence[Run]) -> None:
+    """Runs of one method are independent seeds of it, or their spread is too small.
+
+    Raises:
+        RunError: two are one run (or copies of it) or have one seed, or their settings differ.
+    """
+    by_seed: dict[Any, Run] = {}
+    for run in runs:
+        unlike = [
+            difference
+            for difference in differences(runs[0], run)
+            if difference.kind not in ("free", "software")
+        ]
+        if unlike:
+            raise RunError(
+                f"differs from {runs[0].path} in {unlike[0].setting}"
+                f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one method "
+                "may differ only in their seed",
+                where=str(run.path),
+                remedy="give runs of one method; `restock compare` takes those of another one "
+                "after --against",
+            )
+        seed = run.document["config"].get("seed")
+        other = by_seed.setdefault(seed, run)
+        if other is run or seed is None:
+            continue
+        if other.path.resolve() == run.path.resolve():
+            raise RunError("is given twice", where=str(run.path), remedy="leave one of them out")
+        copied = same_run(other, run)
+        raise RunError(
+            f"is a copy of {other.path}" if copied else f"has the seed of {other.path}, {seed}",
+            where=str(run.path),
+            remedy="runs of one method count as independent seeds: leave one of them out"
+            + ("" if copied else ", or train it again with another --set seed=N"),
+        )
+
+
+def same_run(first: Run, second: Run) -> bool:
+    """Whether two directories hold one run: a copy has the same time of creation and settings."""
+    return first.document == second.document
 
 
 def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
@@ -245,4 +270,14 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
             yield prefix + key, value
 
 
-__all__ = ["ALLOWED", "Arm", "Difference", "Treatment", "differences", "feeds", "kind_of"]
+__all__ = [
+    "ALLOWED",
+    "Arm",
+    "Difference",
+    "Treatment",
+    "differences",
+    "feeds",
+    "kind_of",
+    "refuse_dependent",
+    "same_run",
+]

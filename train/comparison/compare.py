@@ -23,7 +23,15 @@ import pyarrow as pa
 from restock.arrays import F64
 from restock.errors import RunError
 from restock.stats import ConfidenceInterval, difference_of_arms, improvement_of_arms, iqm
-from restock.train.comparison.arms import ALLOWED, Arm, Difference, Treatment, differences, feeds
+from restock.train.comparison.arms import (
+    ALLOWED,
+    Arm,
+    Difference,
+    Treatment,
+    differences,
+    feeds,
+    same_run,
+)
 from restock.train.comparison.comparability import (
     Check,
     ComparabilityLimits,
@@ -88,9 +96,11 @@ def compare(
     The same runs on both sides are comparable by identity.
 
     Raises:
-        RunError: a run is missing, has no updates, or does not belong to its arm.
+        RunError: a run is missing, has no updates, or does not belong to its arm; two of an arm
+            are one run or have one seed; or only some of the runs are in both arms.
     """
     arms = Arm("first", first), Arm("second", second)
+    identical = _identical(*arms)
     rng = np.random.default_rng(seed)
     differing = [d for d in differences(arms[0].runs[0], arms[1].runs[0]) if d.kind != "free"]
     allowed = ALLOWED[treatment] | {"software"}
@@ -98,7 +108,6 @@ def compare(
     totals = [_total(name, *(arm.totals[name] for arm in arms)) for name in arms[0].totals]
     checks = check_feeds(*feeds(*arms), limits, rng)
     deciding = _deciding(treatment, totals, checks)
-    identical = _paths(arms[0]) == _paths(arms[1])
     verdict = "incomparable" if refused else worst([check.verdict for check in deciding])
     if identical:  # what was fed is the same by identity: there is nothing to estimate
         verdict = "comparable"
@@ -108,8 +117,18 @@ def compare(
     )
 
 
-def _paths(arm: Arm) -> set[Path]:
-    return {run.path.resolve() for run in arm.runs}
+def _identical(first: Arm, second: Arm) -> bool:
+    """Whether both arms are the same runs. Raises RunError where only some are in both."""
+    both = [(a, b) for a in first.runs for b in second.runs if same_run(a, b)]
+    if both and not len(both) == len(first.runs) == len(second.runs):
+        a, b = both[0]
+        copy = "" if a.path.resolve() == b.path.resolve() else f" as a copy of {a.path}"
+        raise RunError(
+            f"is in both arms{copy}: the arms then vary together",
+            where=str(b.path),
+            remedy="leave it out of one of them",
+        )
+    return bool(both)
 
 
 def _deciding(treatment: Treatment, totals: list[Check], checks: list[Check]) -> list[Check]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import msgspec
 
 from restock.train.comparison.action_coverage import action_symptoms
+from restock.train.comparison.arms import refuse_dependent
 from restock.train.comparison.windows import (
     Cause,
     DiagnosisLimits,
@@ -54,8 +55,10 @@ def diagnose(
     """Diagnose runs of one method, which differ in their seed.
 
     Raises:
-        RunError: a run has no evaluation after its updates.
+        RunError: a run has no evaluation after its updates; or two of them are one run, have one
+            seed or differ in more than it.
     """
+    refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
     figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
     verdicts = [_verdict(*its, limits) for its in zip(runs, windows, figures, strict=True)]
