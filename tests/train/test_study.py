@@ -127,6 +127,32 @@ def study_of_two_comparisons(tmp_path: Path) -> Path:
     return out
 
 
+def test_a_finished_study_may_be_moved_and_a_changed_one_says_what_is_different(
+    tmp_path: Path, capsys
+) -> None:
+    study, out = tmp_path / "s.toml", tmp_path / "o"
+    arms = "[[arms]]\nname = 'a'\nmixture = 'uniform'\n[[arms]]\nname = 'b'\npanel = 'p'\n"
+    text = f"store = 's'\nseeds = [0]\nsettings.loss.n_step = 1\n{arms}"
+    study.write_text(text)
+    plan = StudyPlan(load_study(study), tmp_path, out)
+    for job in plan.jobs:
+        job.path.mkdir(parents=True)
+        request = json.loads(plan.fingerprint(job))
+        request["panel"] = str(plan.panel(job.arm))  # as an earlier Restock wrote it
+        job.done.write_text(json.dumps(request))
+    moved = out.rename(tmp_path / "moved")
+    line = ["study", str(study), "--out", str(moved), "--dry-run", "--json"]
+    assert main(line) == 0
+    assert all(row["done"] for row in json.loads(capsys.readouterr().out))
+    study.write_text(text.replace("n_step = 1", "n_step = 3"))
+    assert main(line) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "then loss.n_step=1, now loss.n_step=3" in said
+    study.write_text(text.replace("'p'", "'q'"))
+    assert main(line) == 2
+    assert '/p", now panel = "q"' in " ".join(capsys.readouterr().err.split())
+
+
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
     out = study_of_two_comparisons(tmp_path)
     dueling = Difference("config.network.dueling", "algorithm", False, True)
@@ -268,6 +294,10 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
         (f"{TWO}[evaluation]\nepisodes = {{ slip = 3 }}", "episodes: there is no 'slip'"),
         (f"measures = ['auc']\n{TWO}", "measure 'auc' must be auc_WHAT or success_WHAT"),
         (f"rare = ['ice']\n{TWO}", "rare: there is no 'ice'"),
+        (f"{PRIMARY}\nrare = []\n{TWO}", "rare must be at least one condition"),
+        (f"seeds = [-1, 1]\n{TWO}", "seeds must be from 0 to 2147483647, got -1"),
+        (f"seeds = [2147483648]\n{TWO}", "seeds must be from 0 to 2147483647"),
+        (f"{TWO}[evaluation]\nseed = -1", "evaluation.seed must be from 0 to 2147483608"),
         (f"{PRIMARY.replace('b', 'c', 1)}\n{TWO}", "primary: 'c' is not one of the arms"),
         (
             f"primary = {{ arm = 'a', baseline = 'b', measure = 'auc_rare' }}\n{TWO}",

@@ -11,6 +11,15 @@ from restock.train.twin.env.interface import Policy
 
 REFERENCES = ("planner", "operator", "random")
 FIRST_SEED = 10_000
+LAST_SEED = 2**31 - 1  # every generator, of the twin and of the libraries, takes as much
+
+
+def wrong_seed(seed: int, count: int = 1) -> str | None:
+    """What is wrong with a seed, or with the first of `count` seeds in a row; None: nothing."""
+    if 0 <= seed <= LAST_SEED + 1 - count:
+        return None
+    last = f" ({count:,} seeds from there on)" if count > 1 else ""
+    return f"must be from 0 to {LAST_SEED + 1 - count}{last}, got {seed}"
 
 
 def reference(name: str, seed: int = 0) -> Policy:
@@ -35,4 +44,4 @@ def reference(name: str, seed: int = 0) -> Policy:
     )
 
 
-__all__ = ["FIRST_SEED", "REFERENCES", "reference"]
+__all__ = ["FIRST_SEED", "REFERENCES", "reference", "wrong_seed"]

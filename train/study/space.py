@@ -17,7 +17,12 @@ import msgspec
 from restock.errors import ConfigError
 from restock.toml import Checked, read_toml, typed
 from restock.train.dqn.config import TrainConfig, apply_overrides, as_overrides, parse_config
-from restock.train.study.study import StudyEvaluation, refuse_judging_by_the_choice
+from restock.train.evaluation.references import wrong_seed
+from restock.train.study.study import (
+    StudyEvaluation,
+    check_seeds,
+    refuse_judging_by_the_choice,
+)
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 MIXTURE = "mixture"  # the one key of a space that is no setting
@@ -78,10 +83,9 @@ class Search(Checked, frozen=True):
             raise ValueError("a mixture is given without a store")
         if MIXTURE in self.parameters and (self.panel is not None or self.mixture is not None):
             raise ValueError("space contains mixture: do not give mixture or panel as well")
-        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(
-                f"seeds must be at least one, without repetition; got {list(self.seeds)}"
-            )
+        check_seeds(self.seeds)
+        if wrong := wrong_seed(self.sampler_seed):
+            raise ValueError(f"sampler_seed {wrong}")
         if "seed" in self.settings or "seed" in self.parameters:
             raise ValueError("the search sets the seeds: settings and space must not set seed")
 

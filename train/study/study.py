@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RunError
+from restock.files import read_json
 from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
 from restock.train.dqn.config import (
@@ -20,6 +21,7 @@ from restock.train.dqn.config import (
     as_overrides,
     parse_config,
 )
+from restock.train.evaluation.references import wrong_seed
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
 from restock.train.study.power import PowerConfig
@@ -65,6 +67,8 @@ class StudyEvaluation(Checked, frozen=True):
             raise ValueError(
                 f"episodes: there is no {unknown[0]!r}; choose from {', '.join(KINDS)}"
             )
+        if wrong := wrong_seed(self.seed, max(self.of_kind.values(), default=1)):
+            raise ValueError(f"seed {wrong}")
 
     @property
     def of_kind(self) -> Mapping[str, int]:
@@ -88,6 +92,14 @@ class Primary(Checked, frozen=True):
     @property
     def named(self) -> tuple[str, str, str]:
         return self.arm, self.baseline, self.measure
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Raises ValueError where there are none, one is repeated, or is out of range."""
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise ValueError(f"seeds must be at least one, without repetition; got {list(seeds)}")
+    for wrong in filter(None, map(wrong_seed, seeds)):
+        raise ValueError(f"seeds {wrong}")
 
 
 @dataclass(frozen=True)
@@ -131,10 +143,7 @@ class Study(Checked, frozen=True):
                 f"arm {self.base.name!r} is the study's baseline: it cannot have a treatment or a "
                 "baseline"
             )
-        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
-            raise ValueError(
-                f"seeds must be at least one, without repetition; got {list(self.seeds)}"
-            )
+        check_seeds(self.seeds)
         if self.store is None and any(arm.mixture for arm in self.arms):
             raise ValueError("an arm gives a mixture, but the study has no store")
         if any(
@@ -147,6 +156,10 @@ class Study(Checked, frozen=True):
         measures = (*self.measures, *((self.primary.measure,) if self.primary else ()))
         for wrong in filter(None, map(unknown_measure, measures)):
             raise ValueError(wrong)
+        if not self.rare or len(set(self.rare)) != len(self.rare):
+            raise ValueError(
+                f"rare must be at least one condition, without repetition; got {list(self.rare)}"
+            )
         if unknown := [name for name in self.rare if name not in CELLS]:
             raise ValueError(f"rare: there is no {unknown[0]!r}; choose from {', '.join(CELLS)}")
         if self.primary is not None:
@@ -281,15 +294,49 @@ class StudyPlan:
 
     def fingerprint(self, job: StudyJob) -> str:
         """What a finished run was asked to be, as JSON: another request makes another run."""
-        panel = self.panel(job.arm)
+        return json.dumps(self._request(job), indent=1) + "\n"
+
+    def _request(self, job: StudyJob) -> dict[str, Any]:
+        """The panel by its name in the study: a study may be moved, or be run from elsewhere."""
+        own = None if job.arm.mixture is None else f"panels/{job.arm.name}"
         request = {
             "settings": self.settings(job.arm, job.seed),
-            "panel": str(panel) if panel is not None else None,
+            "panel": own if job.arm.panel is None else job.arm.panel,
             "evaluation": msgspec.to_builtins(self.study.evaluation),
         }
         if job.arm.library is not None:
             request |= {"library": job.arm.library, "arguments": job.arm.arguments}
-        return json.dumps(request, indent=1) + "\n"
+        return request
+
+    def refuse_changed(self) -> None:
+        """Raises RunError where a finished run was made as the study does not ask any more."""
+        for job in self.jobs:
+            if not job.done.exists():
+                continue
+            made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
+            asked = json.loads(self.fingerprint(job))
+            if made.get("panel") and asked["panel"]:  # an earlier Restock wrote the whole path
+                parts = Path(asked["panel"]).parts
+                if Path(made["panel"]).parts[-len(parts) :] == parts:
+                    made["panel"] = asked["panel"]
+            if made != asked:
+                raise RunError(
+                    "was made otherwise than the study now asks: then "
+                    f"{_only(made, asked)}, now {_only(asked, made)}",
+                    where=str(job.path),
+                    remedy="remove it, or give the study another --out",
+                )
+
+
+def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """What one request says and the other does not."""
+    told = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
+    told += [
+        f"{key} = {json.dumps(value)}"
+        for key, value in one.items()
+        if key != "settings" and other.get(key) != value
+    ]
+    return ", ".join(told) or "the default"
 
 
 __all__ = [
@@ -300,5 +347,6 @@ __all__ = [
     "StudyEvaluation",
     "StudyJob",
     "StudyPlan",
+    "check_seeds",
     "load_study",
 ]

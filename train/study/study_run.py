@@ -49,13 +49,7 @@ def run_study(
         if arm.library is not None:
             check_installed()
             resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
-    for job in plan.jobs:
-        if job.done.exists() and job.done.read_text(encoding="utf-8") != plan.fingerprint(job):
-            raise RunError(
-                "was made with other settings than those of the study now",
-                where=str(job.path),
-                remedy="remove it, or give the study another --out",
-            )
+    plan.refuse_changed()
     for arm in plan.study.arms:
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]

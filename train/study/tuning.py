@@ -181,7 +181,7 @@ def _ended(study: Any) -> int:
 
 def _sampler(optuna: Any, search: Search, number: int) -> Any:
     """By its number alone, so that a search that was interrupted draws as it would have."""
-    seed = search.sampler_seed * 1_000_003 + number
+    seed = (search.sampler_seed * 1_000_003 + number) % 2**32
     if search.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     return optuna.samplers.TPESampler(seed=seed, n_startup_trials=search.startup_trials)

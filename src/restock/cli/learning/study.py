@@ -107,6 +107,7 @@ class StudyCommand:
         if small := too_small(plan, power):
             say(small)
         if self.dry_run:
+            plan.refuse_changed()
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
                 for pair in plan.study.pairs
