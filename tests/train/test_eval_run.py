@@ -65,6 +65,39 @@ def test_a_floor_is_evaluated_on_the_kinds_that_fit_it(
     assert "has no room for episodes of nominal" in capsys.readouterr().err
 
 
+def test_what_was_recorded_is_shown_again_or_its_lack_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    line = ["eval", str(run), "--no-drive", "--json"]
+    assert main(line) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "has no recorded evaluation" in said
+    assert f"run `restock eval {run}`" in said
+    row = {"policy": "agent", "perturbation": "none", "condition": "nominal", "episode_seed": 3}
+    row |= {"block": "none", "success": True, "return": 1.0, "bumps": 0, "time_s": 9.0}
+    table = pa.Table.from_pylist([row], schema=EVAL_EPISODES)
+    write_table(table, run / "eval" / "episodes.parquet")
+    assert main(line) == 0
+    document = json.loads(capsys.readouterr().out)
+    (shown,) = document["results"]
+    assert (shown["policy"], shown["episodes"], shown["success"]) == ("agent", 1, 1.0)
+    assert document["recorded"].startswith("1 of 1 episodes")
+    assert main(line[:-1]) == 0
+    assert "1 of 1 episodes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31 - 20, 10**20])
+def test_seeds_that_no_generator_takes_are_refused(
+    seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    assert main(["eval", str(run), "--dry-run", "--seed", str(seed), "--episodes", "21"]) == 2
+    assert "must be from 0 to 2147483627 (21 seeds" in capsys.readouterr().err
+    assert main(["diagnose", "--before-training", str(run), "--seed", "-1"]) == 2
+    assert "must be from 0 to 2147483647, got -1" in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_evaluations_add_up_and_the_newest_floors_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import pyarrow as pa
 
+from restock.errors import RunError
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.evaluation.evaluation_plan import (
     CLEAN,
@@ -24,7 +25,7 @@ from restock.train.evaluation.evaluation_plan import (
 )
 from restock.train.evaluation.references import FIRST_SEED
 from restock.train.run.clone_quality import CloneQuality, read_clones
-from restock.train.run.kept_evaluations import LIMITED, add_evaluation
+from restock.train.run.kept_evaluations import LIMITED, add_evaluation, shown_evaluation
 from restock.train.run.measures import summary_rows
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
@@ -122,6 +123,22 @@ def drive_evaluation(
     table = episodes_table(results, plan, versions)
     added: list[dict[str, Any]] = add_evaluation(plan.run.path, table).to_pylist()
     return added
+
+
+def recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
+    """The episodes of a run's last evaluation, and in words which they are.
+
+    Raises:
+        RunError: nothing was driven, or the file is damaged.
+    """
+    table, text = shown_evaluation(run)
+    if not table.num_rows:
+        raise RunError(
+            "has no recorded evaluation",
+            where=str(run),
+            remedy=f"run `restock eval {run}` (without --no-drive)",
+        )
+    return table.to_pylist(), text
 
 
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:

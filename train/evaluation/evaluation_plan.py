@@ -16,7 +16,12 @@ from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.cloned import CLONED, cloned_panel, is_cloned, load_cloned
 from restock.train.evaluation.logged_ways import EVERY, HELD_OUT, LoggedMissions, logged_missions
 from restock.train.evaluation.policies import load_agent, load_policy
-from restock.train.evaluation.references import FIRST_SEED, REFERENCES, reference
+from restock.train.evaluation.references import (
+    FIRST_SEED,
+    REFERENCES,
+    reference,
+    wrong_seed,
+)
 from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_evaluations import WAYS
 from restock.train.run.run import Run
@@ -127,7 +132,7 @@ def plan_evaluation(
     Raises:
         RunError: no such run, or it kept no policy yet.
         ConfigError: a policy or perturbation that does not exist, floors without room for any
-            kind of episode, or no episodes.
+            kind of episode, no episodes, or a seed that generators do not take.
     """
     run = Run.open(path)
     config = parse_config(run.document["config"], where=str(path / "config.json"))
@@ -145,6 +150,8 @@ def plan_evaluation(
                 + (_PATHS if flag == "--policies" else ", FILE.toml"),
             )
     of_kind = episodes_of_kind(episodes)
+    if wrong := wrong_seed(first_seed, max(of_kind.values())):
+        raise ConfigError(wrong, where="--seed")
     layouts = layouts or layouts_of_split(config.env.layouts, "test")
     floors = open_floors(layouts)
     plan = EvaluationPlan(

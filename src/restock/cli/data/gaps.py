@@ -60,6 +60,8 @@ class GapsCommand:
     def run(self) -> None:
         """Find the gaps, plan what fills them, and print both."""
         from restock.cli import output
+        from restock.cli.command_line import refuse
+        from restock.errors import ConfigError
         from restock.ingest.store.version import given_version
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
@@ -69,6 +71,10 @@ class GapsCommand:
         from restock.replay.store.store import Store
         from restock.train.twin.physics.episode import KINDS
 
+        if self.min_rows < 0:
+            raise ConfigError(f"must be 0 or more, got {self.min_rows}", where="--min-rows")
+        if self.min_rows == 0:
+            refuse(self, ("by",), "has no effect without --min-rows", remedy="give --min-rows, too")
         mixture = load_mixture(self.mixture)
         thresholds = None if self.no_audits else load_thresholds(self.thresholds)
         if self.missions_out is not None and not self.force:

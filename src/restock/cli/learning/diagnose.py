@@ -57,6 +57,7 @@ class DiagnoseCommand:
     """Print the verdict, the evidence and every window as JSON."""
 
     def run(self) -> int:
+        from restock.cli.command_line import refuse
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
         from restock.train.comparison.confirm import confirm
@@ -66,6 +67,12 @@ class DiagnoseCommand:
 
         if self.before_training is not None:
             return self._before_training(self.before_training)
+        refuse(
+            self,
+            ("profile", "perturbation", "twin", "seed"),
+            "applies only to --before-training",
+            remedy="leave it out",
+        )
         if not self.runs:
             raise ConfigError(
                 "needs a run, or --before-training PANEL_OR_STORE", where="restock diagnose"
@@ -99,10 +106,12 @@ class DiagnoseCommand:
         return int(ExitCode.FAILED if failed else ExitCode.OK)
 
     def _before_training(self, path: Path) -> int:
+        from restock.cli.command_line import refuse
         from restock.cli.output import print_json
         from restock.errors import ConfigError, ExitCode
         from restock.ingest.profile.profile import load_profile
         from restock.train.diagnosis.before_training import diagnose_before_training
+        from restock.train.evaluation.references import wrong_seed
         from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.runs or self.confirm is not None:
@@ -110,6 +119,11 @@ class DiagnoseCommand:
                 "--before-training cannot be combined with a run or --confirm",
                 where="restock diagnose",
             )
+        refuse(
+            self, ("rows",), "has no effect with --before-training", remedy="leave out one of them"
+        )
+        if wrong := wrong_seed(self.seed):
+            raise ConfigError(wrong, where="--seed")
         diagnosis = diagnose_before_training(
             path,
             profile=None if self.profile is None else load_profile(self.profile),

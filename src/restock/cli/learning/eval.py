@@ -55,7 +55,7 @@ class EvalCommand:
     save_as_baseline: str | None = None
     """Save the evaluation as baselines/NAME.parquet (or as the .parquet file given)."""
     drive: bool = True
-    """Drive nothing: use the episodes in RUN/eval/episodes.parquet."""
+    """Drive nothing: use (or just show) the episodes in RUN/eval/episodes.parquet."""
     video: bool = False
     """For each condition, film the agent's worst failure and an episode in which it succeeded and
     another policy failed, from above, into RUN/eval/films. The episodes are driven again. `restock
@@ -96,20 +96,27 @@ class EvalCommand:
         return self._drive()
 
     def _drive(self) -> int:
+        from restock.cli.command_line import refuse
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation
+        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation, recorded
         from restock.train.evaluation.evaluation_plan import plan_evaluation, settings
         from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
         from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.measures import summary_rows
 
-        if self.check and self.baseline is None:
-            raise ConfigError(
+        if self.baseline is None:
+            refuse(
+                self,
+                ("check", "margin"),
                 "has no effect without --baseline",
-                where="--check",
                 remedy="name the run or the saved baseline to compare with",
             )
+        if not self.drive:
+            names = ("episodes", "perturbations", "seed", "limiter")
+            refuse(self, names, "has no effect with --no-drive", remedy="leave out one of them")
+        if not 0 <= self.margin <= 1:  # nothing is worse by more than 1, or by NaN
+            raise ConfigError(f"must be from 0 to 1, got {self.margin}", where="--margin")
         beside = self.baseline if self.baseline in _names(self.policies) else None
         baseline = None
         if self.baseline is not None and beside is None:
@@ -138,6 +145,9 @@ class EvalCommand:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
             document = {**settings(plan), "results": rows, "clones": clones}
+        elif self.baseline is None and self.save_as_baseline is None and not self.video:
+            shown, text = recorded(self.run_path)
+            document = {"results": summary_rows(shown), "recorded": text}
         if self.video:
             from restock.train.evaluation.film import film_evaluation
 
@@ -165,9 +175,9 @@ class EvalCommand:
 
         if (rows := document.get("results")) is not None:
             show_measures(rows)
-            for clone in document["clones"]:
+            for clone in document.get("clones", ()):
                 say(clone["text"])
-            say(f"added to {self.run_path / 'eval' / 'episodes.parquet'}")
+            say(document.get("recorded", f"added to {self.run_path / 'eval' / 'episodes.parquet'}"))
         for path in document.get("films", ()):
             say(f"filmed {path}")
         for why in document.get("not_filmed", ()):
