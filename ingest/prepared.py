@@ -109,28 +109,25 @@ def _refusal(
 
 
 def _commit(
-    store: StoreWriter, group: dict[int, Prepared]
+    store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
 ) -> dict[int, IngestResult | StoreError | RecordingError]:
-    """One commit of all, or where that fails, of each."""
+    """One commit of all, or where that fails, of each; `begun` where one with others failed."""
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
     if not several:
         return {}
-    begun = False
     try:
         store.fit(several)
         begun = True
         version = store.commit_staged(several)
     except StoreError as error:
         if len(group) > 1:
-            outcomes = [_commit(store, {place: one}) for place, one in group.items()]
+            outcomes = [_commit(store, {place: one}, begun=begun) for place, one in group.items()]
             return {place: outcome for one in outcomes for place, outcome in one.items()}
-        if not begun:
-            store.discard(several)
+        (store.take_back if begun else store.discard)(several)
         return dict.fromkeys(group, error)
     except BaseException:
-        if not begun:
-            store.discard(several)
+        (store.take_back if begun else store.discard)(several)
         raise
     later = [Ingest(one.recording_id, one.ingest_id, 0) for one in staged.values()]
     found: dict[int, IngestResult | StoreError | RecordingError] = {}

@@ -21,7 +21,7 @@ from deltalake.transaction import AddAction, RemoveAction
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.data_files import AddedFile, add_action, rewrite
+from restock.ingest.store.data_files import AddedFile, add_action, rewrite, unwritten
 from restock.ingest.store.lineage import StoredFile, active_files, own_path, stored_files
 from restock.ingest.store.location import TRANSITIONS
 from restock.ingest.store.reader import StoreReader
@@ -290,9 +290,7 @@ class TableCommits(StoreReader):
                 # Writers that collided wait for different times, and longer each time.
                 time.sleep(0.02 * 2 ** min(attempt, 6) * (1 + _JITTER.random()))
             except (DeltaError, OSError) as error:
-                raise StoreError(
-                    f"cannot be written: {first_line(error)}", where=str(self.path)
-                ) from error
+                raise unwritten(self.path, error) from error
         raise StoreError(
             f"other writers were faster {ATTEMPTS} times: {first_line(conflict)}",
             where=str(self.path),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -125,8 +126,24 @@ def written_whole(place: Location, path: str) -> Iterator[None]:
         with suppress(OSError, StoreError, DeltaError):
             place.delete([path])
         if isinstance(error, OSError):
-            raise StoreError(f"cannot be written: {first_line(error)}", where=str(place)) from error
+            raise unwritten(place, error) from error
         raise
+
+
+def unwritten(place: Location, error: OSError | DeltaError) -> StoreError:
+    """What is wrong where a store cannot be written, and what to do."""
+    said = str(error)
+    if re.search(r"No space left|Disk quota exceeded|os error (28|122)\b", said):
+        return StoreError(
+            "cannot be written: there is no space left on its disk",
+            where=str(place),
+            remedy="free some space, then run the same command again: what the store has is kept",
+        )
+    # Delta's library has the cause in its last line, behind an arrow.
+    causes = [line.rsplit("↳\x1b[0m ")[-1].strip() for line in said.splitlines() if "↳" in line]
+    return StoreError(
+        "cannot be written: " + ": ".join([first_line(error), *causes[-1:]]), where=str(place)
+    )
 
 
 def conformed(rows: pa.Table, schema: pa.Schema) -> pa.Table:

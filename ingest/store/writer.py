@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from deltalake.exceptions import DeltaError
 
 from restock.errors import StoreError
 from restock.ingest.store.commits import TableCommits, delta_columns, plain_lists, recording_columns
@@ -147,7 +148,11 @@ class StoreWriter(TableCommits):
         except BaseException:  # no commit has begun, so they are not needed
             self.discard(staged)
             raise
-        return self._commit_files(staged, instead_of or {})
+        try:
+            return self._commit_files(staged, instead_of or {})
+        except BaseException:
+            self.take_back(staged)
+            raise
 
     def stage(self, manifest: pa.Table, rows: pa.Table, *, instead_of: str | None = None) -> Staged:
         """Write the files of a recording, of which nothing shows before `commit_staged`.
@@ -186,8 +191,8 @@ class StoreWriter(TableCommits):
         Returns the version of `transitions` that has them.
 
         Raises:
-            StoreError: what one was to replace has changed, or other writers were faster too many
-                times. What is left is deleted when it is older than the window of `clean`.
+            StoreError: what one was to replace has changed, other writers were faster too many
+                times, or the tables cannot be written. `take_back` what is not to be tried again.
         """
         pa.default_memory_pool().release_unused()
         read = {one.recording_id: one.instead_of for one in staged if one.instead_of}
@@ -199,7 +204,8 @@ class StoreWriter(TableCommits):
     def _commit_files(self, staged: Sequence[Staged], instead_of: Mapping[str, str]) -> int:
         self.commit(RECORDINGS, [one.manifest for one in staged], instead_of)
         version, replaced = self.commit(TRANSITIONS, [one.rows for one in staged], instead_of)
-        self.remove(RECORDINGS, replaced)
+        with suppress(StoreError):  # the rows are there: what joins nothing, `clean` removes
+            self.remove(RECORDINGS, replaced)
         return version
 
     def remove_recordings(self, ingests: Mapping[str, str], operation: str) -> tuple[int, int]:
@@ -239,6 +245,23 @@ class StoreWriter(TableCommits):
                 (FRAMES, [one.rows for one in staged]),
             ):
                 self.path.delete(f"{name}/{file.path}" for file in files)
+
+    def take_back(self, staged: Sequence[Staged]) -> None:
+        """Delete the files of recordings whose commit failed or was interrupted, of those whose
+        rows are in no commit, as far as that is possible.
+
+        On S3 nothing is: a commit whose answer was lost may be there later. `clean` deletes what
+        is left when it is older than its window.
+        """
+        if self.path.folder is None:
+            return
+        with suppress(OSError, StoreError, DeltaError):
+            there = {one.ingest_id for one in self.shown()}
+            gone = [one for one in staged if one.ingest_id not in there]
+            # Rows first: on a full disk they give back the room to take the manifests out.
+            self.discard_uncommitted(TRANSITIONS, [one.rows for one in gone])
+            self.remove(RECORDINGS, {one.manifest.path for one in gone})
+            self.discard(gone)
 
     def clean(self, retention_hours: int = RETENTION_HOURS) -> list[str]:
         """Delete files that no version within the retention window needs; returns their paths.

@@ -158,14 +158,19 @@ def register(
 
 
 def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
-    """The files of the manifests, those of an older version's rows included.
+    """The files of the manifests of these rows, those of an older version included.
 
     A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
     were before, by version or because the writer was between two commits, finds it by its name.
     """
-    active = stored_files(place, RECORDINGS, recordings)
+    wanted = {one.ingest_id: one for file in held for one in file.ingests}
+    active = [
+        file
+        for file in stored_files(place, RECORDINGS, recordings)
+        if any(one.ingest_id in wanted for one in file.ingests)
+    ]
     here = {one.ingest_id for file in active for one in file.ingests}
-    ingests = (one for file in held for one in file.ingests if one.ingest_id not in here)
+    ingests = (one for ingest_id, one in wanted.items() if ingest_id not in here)
     gone = sorted({own_path(one.recording_id, one.ingest_id) for one in ingests})
     infos = place.files.get_file_info([f"{RECORDINGS}/{path}" for path in gone])
     found = [path for path, info in zip(gone, infos, strict=True) if info.is_file]

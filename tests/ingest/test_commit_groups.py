@@ -13,6 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 from deltalake import DeltaTable
+from deltalake.transaction import AddAction
 from support.driven_robot import Drive, write_bag
 from support.paths import ROOT
 from support.stores import manifest, one, recording_transitions, shown
@@ -220,3 +221,64 @@ def test_a_killed_process_leaves_whole_groups_and_the_same_again_goes_on(tmp_pat
     }
     assert {name for name in files(place) if "_delta_log" not in name} == named
     assert len(named) == 6
+
+
+def on_a_full_disk(monkeypatch, name: str) -> None:
+    """Commits to one of the tables fail as Delta's library says it of a full disk."""
+    transact = StoreWriter.transact
+
+    def full(self, table, actions, *rest):
+        if table.table_uri.rstrip("/").endswith(name) and isinstance(actions[0], AddAction):
+            causes = ["Unable to copy data to file", "No space left on device (os error 28)"]
+            raise OSError("\n  \x1b[31m↳\x1b[0m ".join(["Generic LocalFileSystem error", *causes]))
+        return transact(self, table, actions, *rest)
+
+    monkeypatch.setattr(StoreWriter, "transact", full)
+
+
+@pytest.mark.parametrize("name", ["recordings", "transitions"])
+def test_a_commit_on_a_full_disk_leaves_no_file_and_the_same_again_goes_on(
+    tmp_path, monkeypatch, name
+):
+    store = StoreWriter(tmp_path / "s")
+    store.write(*one(1, "old"))
+    before, manifests = files(tmp_path / "s"), store.files("recordings")
+    with monkeypatch.context() as patched:
+        on_a_full_disk(patched, name)
+        group = CommitGroup(store, clock=lambda: 0.0)
+        for place in (1, 2, 3):  # the first replaces
+            group.add(place, waiting(store, one(place)))
+        group.commit()
+        assert len(group.results) == 3
+        for result in group.results.values():
+            assert isinstance(result, StoreError)
+            assert "there is no space left on its disk" in str(result)
+            assert "run the same command again" in str(result)
+        assert files(tmp_path / "s") == before
+        with pytest.raises(StoreError, match="no space left"):
+            store.write_all([one(1), one(2)])
+    assert files(tmp_path / "s") == before
+    assert store.files("recordings") == manifests
+    assert set(shown(tmp_path / "s")) == {f"{1:016x}-old"}
+    for place in (1, 2, 3):
+        group.add(place, waiting(store, one(place)))
+    group.commit()
+    assert set(shown(tmp_path / "s")) == {f"{number:016x}-a" for number in (1, 2, 3)}
+
+
+def test_a_commit_that_is_interrupted_between_the_tables_leaves_no_file(tmp_path, monkeypatch):
+    store = StoreWriter(tmp_path / "s")
+    store.write(*one(1))
+    before = files(tmp_path / "s")
+    commit = StoreWriter.commit
+
+    def interrupted(self, name, *rest):
+        if name == "transitions":
+            raise KeyboardInterrupt
+        return commit(self, name, *rest)
+
+    monkeypatch.setattr(StoreWriter, "commit", interrupted)
+    group = CommitGroup(store, clock=lambda: 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        group.add(2, waiting(store, one(2)))
+    assert files(tmp_path / "s") == before

@@ -15,6 +15,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
 BAGS = SHARED
@@ -117,6 +118,18 @@ def test_a_bad_recording_is_named_and_the_others_go_on(bag, tmp_path, run):
     assert code == 3
     assert {one["status"] for one in said["recordings"]} == {"written", "failed"}
     assert "bad.mcap" in err
+
+
+def test_a_recording_that_the_store_cannot_take_is_named(bag, tmp_path, run, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(StoreWriter, "transact", full)
+    code, said, err = run(bag, "--store", tmp_path / "s")
+    told = f"{bag}: was not added: {tmp_path / 's'}: cannot be written: there is no space left"
+    assert code == 2
+    assert told in err
+    assert told in said["recordings"][0]["error"]
 
 
 def test_two_workers_make_the_same_store_as_one(tmp_path, run):

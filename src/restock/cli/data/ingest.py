@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RecordingError, RestockError, visible
+from restock.errors import ConfigError, ExitCode, RecordingError, RestockError, StoreError, visible
 from restock.words import counted
 
 if TYPE_CHECKING:
@@ -103,8 +103,11 @@ class IngestCommand:
             ):
                 advance(1, path.name)
                 if isinstance(result, RestockError):
-                    failures.append({"path": str(path), "status": "failed", "error": str(result)})
-                    sys.stderr.write(f"restock: {result}\n")
+                    told = str(result)
+                    if isinstance(result, StoreError):  # which names the store alone
+                        told = f"{visible(str(path))}: was not added: {told}"
+                    failures.append({"path": str(path), "status": "failed", "error": told})
+                    sys.stderr.write(f"restock: {told}\n")
                     continue
                 lossy |= result.lossy
                 outcomes.append(as_json(result))
