@@ -40,6 +40,7 @@ from restock.train.resolve import mirrors, planned_draws, resolve_config, resolv
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
+from restock.train.run.run_lock import RunLock
 from restock.train.run.run_profile import (
     carries_profile,
     profile_document,
@@ -71,7 +72,11 @@ class Prepared:
     teacher: Any = None  # that Python code passed in
 
     def open(self) -> Session:
-        """Make the run directory (or take up the old one), the twin and the learner."""
+        """Make the run directory (or take up the old one), the twin and the learner.
+
+        Raises:
+            RunError: another process trains this run; or it cannot go on, and why.
+        """
         env = make_twin(self.config, self.profile, self.config.env.num_envs)
         teacher = open_teacher(
             self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
@@ -80,6 +85,22 @@ class Prepared:
             teacher.ask(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
         episodes = ways_to_evaluate(self.config, layouts, self.panel)
+        lock = RunLock(self.path)
+        try:
+            session = self._session(env, teacher, layouts, episodes)
+        except BaseException:
+            lock.release()
+            raise
+        session.lock = lock
+        return session
+
+    def _session(
+        self,
+        env: Twin,
+        teacher: AskedTeacher | None,
+        layouts: str,
+        episodes: list[EpisodeSpec] | None,
+    ) -> Session:
         run = self.resumed or Run.create(self.path, self.document)
         if self.resumed is not None:
             run.remove_leftovers()

@@ -42,6 +42,7 @@ from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
 from restock.train.run.events import Events, TensorBoard
 from restock.train.run.run import Run
+from restock.train.run.run_lock import RunLock
 from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -127,6 +128,7 @@ class Session(Stateful):
     jump_start: JumpStart | None
     practice: Practice
     imitation: Imitation | None  # what the behaviour network learns from
+    lock: RunLock | None = None  # held while this process writes the run
     blocks: UpdateBlocks | None = None  # makes updates, where the learner is not on the CPU
     progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
@@ -221,10 +223,12 @@ class Session(Stateful):
         save_agent(self.run, self.learner.policy, self.task, results, clocks, start)
 
     def close(self) -> None:
-        """Release the thread and the event files."""
+        """Release the thread, the event files and the run."""
         if self.executor is not None:
             self.executor.shutdown()
         self.events.close()
+        if self.lock is not None:
+            self.lock.release()
 
 
 def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:

@@ -29,6 +29,7 @@ from restock.train.describe import describe_run
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
+from restock.train.run.run_lock import RunLock
 
 TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),
@@ -144,6 +145,17 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
         assert torch.equal(value, parts["learner"]["network"][name]), name
     np.testing.assert_equal(whole["ring"], parts["ring"])
     assert whole["exploration"] == parts["exploration"]
+
+
+def test_a_run_that_is_being_trained_is_not_resumed(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {file: file.read_bytes() for file in trained.rglob("*.safetensors")}
+    lock = RunLock(trained)
+    assert main(["train", "--resume", str(trained), "--env-steps", "440"]) == 2
+    assert f"is being trained by process {os.getpid()}" in capsys.readouterr().err
+    lock.release()
+    assert {file: file.read_bytes() for file in trained.rglob("*.safetensors")} == before
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ progress.parquet …     the tables of `run_tables`, each replaced in one step a
 checkpoints/           latest.safetensors (all state) and best.safetensors (the policy kept)
 tensorboard/           the same curves as events; tracking.json: ids of other trackers
 eval/                  what `restock eval` measured
+.lock                  while a process trains it: which
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import pyarrow as pa
 
 from restock.errors import RunError
 from restock.files import read_json, read_table, remove_leftovers, write_table, write_text
+from restock.train.run.run_lock import LOCK
 from restock.train.run.run_tables import TABLES
 
 if TYPE_CHECKING:
@@ -203,7 +205,7 @@ class Run:
 
 def check_free(path: Path) -> None:
     """Raises RunError when there is something at `path` that a new run would overwrite."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
         raise RunError(
             "already exists",
             where=str(path),

@@ -1,0 +1,68 @@
+"""A run has one writer, whoever reads it, and a killed writer does not lock it for good."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from restock.errors import RunError
+from restock.train.run.run import Run, check_free
+from restock.train.run.run_lock import LOCK, RunLock
+
+HOLDS = "import pathlib, sys, time; from restock.train.run.run_lock import RunLock;"
+HOLDS += "lock = RunLock(pathlib.Path(sys.argv[1])); print(flush=True); time.sleep(600)"
+
+
+def test_a_second_writer_is_refused_until_the_first_is_killed(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    holder = subprocess.Popen([sys.executable, "-c", HOLDS, str(run)], stdout=subprocess.PIPE)
+    with holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        for _ in range(2):  # one that is refused changes nothing
+            with pytest.raises(RunError) as refused:
+                RunLock(run)
+            assert f"{run}: is being trained by process {holder.pid}\n" in str(refused.value)
+            assert f"`kill {holder.pid}`" in str(refused.value)
+        holder.kill()
+    assert (run / LOCK).exists()  # left by the killed one
+    check_free(run)
+    RunLock(run).release()
+    assert not (run / LOCK).exists()
+
+
+def test_a_new_run_is_locked_too_and_can_be_read(tmp_path: Path) -> None:
+    lock = RunLock(tmp_path)
+    Run.create(tmp_path, {})
+    assert Run.open(tmp_path).table("audit").num_rows == 0
+    with pytest.raises(RunError, match=f"is being trained by process {os.getpid()}"):
+        RunLock(tmp_path)
+    (tmp_path / LOCK).write_text("77 elsewhere")
+    with pytest.raises(RunError, match="by process 77 on elsewhere") as refused:
+        RunLock(tmp_path)
+    assert "`kill 77` there" in str(refused.value)
+    lock.release()
+    lock.release()
+    with_another = RunLock(tmp_path)
+    assert (tmp_path / LOCK).read_text() == f"{os.getpid()} {platform.node()}"
+    with_another.release()
+
+
+def test_a_file_system_without_locks_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    first, second = RunLock(tmp_path), RunLock(tmp_path)
+    first.release()
+    second.release()
+    assert not list(tmp_path.iterdir())
