@@ -87,40 +87,36 @@ class Prepared:
         episodes = ways_to_evaluate(self.config, layouts, self.panel)
         lock = RunLock(self.path)
         try:
-            session = self._session(env, teacher, layouts, episodes)
+            run = self._run()
+            try:
+                session = self._session(run, env, teacher, layouts, episodes)
+            except BaseException:
+                if self.resumed is None:  # a run that never began is in nobody's way
+                    shutil.rmtree(self.path, ignore_errors=True)
+                raise
         except BaseException:
             lock.release()
             raise
         session.lock = lock
         return session
 
-    def _session(
-        self,
-        env: Twin,
-        teacher: AskedTeacher | None,
-        layouts: str,
-        episodes: list[EpisodeSpec] | None,
-    ) -> Session:
-        run = self.resumed or Run.create(self.path, self.document)
-        if self.resumed is not None:
-            run.remove_leftovers()
-            (self.path / STOPPED).unlink(missing_ok=True)
+    def _run(self) -> Run:
+        """The new directory, or the old one as the checkpoint to go on from left it."""
+        if self.resumed is None:
+            return Run.create(self.path, self.document)
+        self.resumed.remove_leftovers()
+        (self.path / STOPPED).unlink(missing_ok=True)
         if self.from_env_steps is not None:
-            go_back(run.latest, self.from_env_steps)
-        try:
-            return self._session(run, env, teacher, episodes, layouts)
-        except BaseException:
-            if self.resumed is None:  # a run that never began is in nobody's way
-                shutil.rmtree(self.path, ignore_errors=True)
-            raise
+            go_back(self.resumed.latest, self.from_env_steps)
+        return self.resumed
 
     def _session(
         self,
         run: Run,
         env: Twin,
         teacher: AskedTeacher | None,
-        episodes: list[EpisodeSpec] | None,
         layouts: str,
+        episodes: list[EpisodeSpec] | None,
     ) -> Session:
         return open_session(
             run,

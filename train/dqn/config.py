@@ -34,7 +34,8 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegativeInt = Annotated[int, Meta(ge=0)]
-Seed = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+LAST_SEED = 2**31 - 1  # every generator, of the twin and of the libraries, takes as much
+Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 
 
 class NetworkConfig(Checked, frozen=True):

@@ -7,11 +7,11 @@ floor as they are, so it is what somebody who knew everything would reach; neith
 from __future__ import annotations
 
 from restock.errors import ConfigError
+from restock.train.dqn.config import LAST_SEED
 from restock.train.twin.env.interface import Policy
 
 REFERENCES = ("planner", "operator", "random")
 FIRST_SEED = 10_000
-LAST_SEED = 2**31 - 1  # every generator, of the twin and of the libraries, takes as much
 
 
 def wrong_seed(seed: int, count: int = 1) -> str | None:
