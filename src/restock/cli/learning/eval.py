@@ -139,8 +139,11 @@ class EvalCommand:
             for line in plan.warnings:
                 say(line)
             for kind, floors in plan.left_out.items():
-                some = floors if len(floors) <= 3 else [*floors[:2], f"{len(floors) - 2} others"]
-                say(f"left out: {kind}, as there is no room for it on {', '.join(some)}")
+                some = [f"'{floor}'" for floor in floors]
+                if len(some) > 3:
+                    some[2:] = [f"{len(some) - 2} others"]
+                which = f"floor{'s' if len(some) > 1 else ''} {', '.join(some)}"
+                say(f"left out: {kind}, as there is no room for it on the {which}")
             with progress("driving", plan.total) as advance:
                 rows = summary_rows(drive_evaluation(plan, advance))
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
