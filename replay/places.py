@@ -44,12 +44,15 @@ def open_place(
         version: of a store; the newest.
 
     Raises:
-        StoreError: there is nothing that can be queried, or no such version.
+        StoreError: there is nothing that can be queried, or no such version; or what is beside a
+            store has logged rows, all of them of recordings that the store does not hold.
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
         with Store(place, version=version, memory_limit=memory_limit) as store:
             _add_all(store.bare, beside)
+            for schema, path in (beside or {}).items():
+                _refuse_of_another_store(store, schema, path)
             yield store.bare
         return
     place.expect_both_tables()
@@ -75,6 +78,30 @@ def _add_all(
         connection.execute(f'CREATE SCHEMA "{schema}"')
         if not _add(connection, Path(path), schema):
             raise StoreError(f"not a {schema}", where=str(path))
+
+
+def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> None:
+    """By its recordings, whose ids are of their content: a store may have been moved or copied."""
+    fed = f"""
+        FROM information_schema.tables
+        SELECT table_name
+        WHERE table_schema = '{schema}' AND table_name IN ('rows', 'sampled_episodes')
+    """
+    for (table,) in store.bare.sql(fed).fetchall():
+        recordings = {
+            "rows": "recording_id FROM {schema}.rows",
+            "sampled_episodes": "split_part(episode, '/', 1) FROM {schema}.sampled_episodes"
+            " WHERE source = 'logs'",
+        }[table].format(schema=f'"{schema}"')
+        ids = {one for (one,) in store.bare.sql(f"SELECT DISTINCT {recordings}").fetchall() if one}
+        held = store.bare.sql("SELECT recording_id FROM stored_recordings").fetchall()
+        if ids and ids.isdisjoint(one for (one,) in held):
+            raise StoreError(
+                f"none of its logged rows are of a recording in {store.path}"
+                f" version {store.version}: this {schema} was made from another store",
+                where=str(path),
+                remedy=f"name the store that it was made from, or a {schema} of this store",
+            )
 
 
 def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -541,8 +542,10 @@ def test_strata_of_few_episodes_are_found_in_a_panel_and_in_a_run(
     with open_place(store_path, beside={"run": run}) as connection:  # from before there was one
         (older,) = run_audits(connection, [AUDITS[name]], chosen, beside=["run"])
     assert older.status == "skipped"
-    drawn = [("nominal", f"a/{index}", 10) for index in range(20)]
-    drawn += [("wheel_slip", "a/0", 500), ("wheel_slip", "a/1", 3), ("wheel_slip", "a/2", 3)]
+    own = recording_transitions(1)["recording_id"][0].as_py()
+    drawn = [("nominal", f"{own}/{index}", 10) for index in range(20)]
+    slipped = ((0, 500), (1, 3), (2, 3))
+    drawn += [("wheel_slip", f"{own}/{index}", count) for index, count in slipped]
     rows = [
         {"source": "logs", "stratum": stratum, "episode": episode, "drawn_rows": count}
         for stratum, episode, count in drawn
@@ -719,6 +722,28 @@ def test_the_verb_refuses_a_run_that_is_none_and_a_file_it_cannot_write(
     (tmp_path / "file").touch()
     assert cli.main(["audit", store, "--junit", str(tmp_path / "file" / "x.xml")]) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_panel_or_a_run_of_another_store_is_refused(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_store(tmp_path / "other", [recording_transitions(4)])
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    own = recording_transitions(1)["recording_id"][0].as_py()
+    rows = [{"source": "logs", "stratum": "a", "episode": f"{own}/0", "drawn_rows": 1}]
+    rows.append(rows[0] | {"source": "fresh", "episode": "7"})
+    pq.write_table(pa.Table.from_pylist(rows), run / "sampled_episodes.parquet")
+    for words in (["audit", "--panel", panels["time"]], ["audit", "--run", run]):
+        verb, flag, place = map(str, words)
+        assert cli.main([verb, str(other), flag, place]) == 2
+        said = " ".join(capsys.readouterr().err.split())
+        assert "none of its logged rows are of a recording in" in said
+        assert f"this {flag[2:]} was made from another store" in said
+    moved = shutil.copytree(store_path, tmp_path / "moved")
+    with open_place(moved, beside={"panel": panels["time"], "run": run}):
+        pass
 
 
 def test_junit_is_as_its_readers_expect() -> None:
