@@ -43,7 +43,7 @@ Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "
 
 
 class TrainingInterrupted(RestockError):
-    """Ctrl-C; a checkpoint was written."""
+    """Ctrl-C; there is a checkpoint to go on from."""
 
     exit_code = ExitCode.INTERRUPTED
 
@@ -70,7 +70,8 @@ def train(
     """Run a session to the end of its budget.
 
     Args:
-        stop: asked between steps; True ends the run with a checkpoint.
+        stop: asked between steps and while the policy is evaluated; True ends the run with a
+            checkpoint. An evaluation under way is abandoned, and made by the run that goes on.
         notify: told of every row of `progress`, every evaluation, and a teacher without opinions.
 
     Raises:
@@ -108,13 +109,14 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         if session.interval.updates:
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
-            _evaluate_off_policy(session)  # on held-out logs, before it drives
+            _evaluate_off_policy(session, stop)  # on held-out logs, before it drives
         if config.offline_start.choose:
-            _choose_start(session)
-        _evaluate(session, notify)
+            _choose_start(session, stop)
+        _evaluate(session, notify, stop)
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
+    _evaluate_if_due(session, notify, stop)  # where the run stopped while it did
     while progress.env_steps < schedule.env_steps and _time_left(session) and not progress.stopped:
         _interrupt(session, stop)
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
@@ -168,8 +170,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         session.run.append("practice", session.practice.advance(session.steps))
 
         # 6. Every so often: the fixed episodes, greedily; and a checkpoint.
-        if progress.env_steps - max(progress.evaluated_at, 0) >= config.evaluation.every_env_steps:
-            _evaluate(session, notify)
+        _evaluate_if_due(session, notify, stop)
         if (
             progress.env_steps - progress.checkpointed_at
             >= config.record.checkpoint_every_env_steps
@@ -182,7 +183,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
     if session.interval.updates or progress.env_steps > session.interval.env_steps_before:
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:
-        _evaluate(session, notify)
+        _evaluate(session, notify, stop)
     _note_silence(session, notify)
     _save(session)
     session.write_held()
@@ -375,9 +376,11 @@ def _note_silence(session: Session, notify: Notify) -> None:
     notify("teacher", {"asked": teacher.asked, "answered": 0})
 
 
-def _evaluate_off_policy(session: Session) -> None:
+def _evaluate_off_policy(session: Session, stop: Callable[[], bool]) -> None:
     """The policy as it is now, on held-out logs, into the table `off_policy`; none without any."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
+        return
+    if session.run.table("off_policy").num_rows:  # before the run stopped
         return
     config, learner = session.config, session.learner
     dataset = load_ope_dataset(session.logs.panel, session.task, seed=config.seed)
@@ -387,24 +390,34 @@ def _evaluate_off_policy(session: Session) -> None:
         discount=config.loss.discount,
         measures=measures_of(session.task, dataset),
         config=OpeConfig(seed=config.seed),
+        between=lambda: _interrupt(session, stop),
     )
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])
 
 
-def _choose_start(session: Session) -> None:
+def _choose_start(session: Session, stop: Callable[[], bool]) -> None:
     """Which policy drives first, by held-out logs, into the table `offline_start`."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
+        return
+    if session.run.table("offline_start").num_rows:  # before the run stopped
         return
     session.start, rows = choose_start(
         session.learner,
         session.task,
         load_ope_dataset(session.logs.panel, session.task, seed=session.config.seed),
         session.config,
+        between=lambda: _interrupt(session, stop),
     )
     session.run.append("offline_start", [{**session.steps, **row} for row in rows])
 
 
-def _evaluate(session: Session, notify: Notify) -> None:
+def _evaluate_if_due(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
+    progress, every = session.progress, session.config.evaluation.every_env_steps
+    if progress.env_steps - max(progress.evaluated_at, 0) >= every:
+        _evaluate(session, notify, stop)
+
+
+def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
     """The fixed episodes, greedily; the policy is kept if it is the best so far.
 
     Without a twin nothing drives: what is learnt by now is kept.
@@ -417,7 +430,9 @@ def _evaluate(session: Session, notify: Notify) -> None:
     config, progress, learner = session.config, session.progress, session.learner
     policy = GreedyPolicy(session.starting or learner.policy)
     discount = config.loss.discount
-    results = session.evaluation_buffer.drive(policy, session.fixed_episodes, discount)
+    results = session.evaluation_buffer.drive(
+        policy, session.fixed_episodes, discount, between=lambda: _interrupt(session, stop)
+    )
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
     progress.evaluated_at = progress.env_steps
@@ -461,6 +476,8 @@ def _time_left(session: Session) -> bool:
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
+    """Ends the run where `stop` says so. Also within what changes nothing of it until it is done:
+    the run that goes on does that again, from its beginning."""
     if stop():
         _save(session)
         session.write_held()

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 
 import restock.replay.plan.plan as plan
 from restock.cli import main
+from restock.cli.learning.train import _stop_on_interrupt
 from restock.errors import ExitCode
 from restock.interrupts import (
     ended_with_us,
@@ -101,6 +103,25 @@ def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
     assert code == ExitCode.INTERRUPTED
     assert capsys.readouterr().err.endswith("interrupted; nothing is left half-written\n")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("usual_ctrl_c")
+def test_a_training_says_at_once_that_it_stops_and_a_second_interrupt_ends_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with kill_as_interrupt(), _stop_on_interrupt() as stop:
+        assert not stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()
+        deadline, said = time.monotonic() + 60, ""
+        while not said and time.monotonic() < deadline:
+            said = capsys.readouterr().err
+        assert said.startswith("stopping: a checkpoint is written after")
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert was_interrupted()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")

@@ -22,7 +22,7 @@ from restock.ingest.task.conditions import Condition
 from restock.train import jump_start
 from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
-from restock.train.evaluation.evaluate import fixed_episodes
+from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.logs import Logs, LogTerms
@@ -111,7 +111,7 @@ def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_
     assert_same_run(undisturbed, run_to_end(tmp_path / "alone", config(env={"overlap": False})))
 
 
-@pytest.mark.parametrize("calls", one_in(3, [20, 61, 150, 333]))
+@pytest.mark.parametrize("calls", one_in(4, [20, 61, 150, 333]))
 def test_interrupted_and_resumed_is_bit_exact(
     undisturbed: Session, tmp_path: Path, calls: int
 ) -> None:
@@ -121,6 +121,35 @@ def test_interrupted_and_resumed_is_bit_exact(
     with pytest.raises(TrainingInterrupted, match="restock train --resume"):
         train(live, stop=lambda: next(asked, None) is None)
     live.close()
+
+    again = session(path, config(), resume=True)
+    train(again)
+    again.close()
+    assert_same_run(undisturbed, again)
+
+
+@pytest.mark.parametrize("evaluation", one_in(3, [2, 1, 3]))
+def test_an_evaluation_is_abandoned_and_made_by_the_resumed_run(
+    undisturbed: Session, tmp_path: Path, evaluation: int
+) -> None:
+    """After the logs, among online updates, and at the end."""
+    path = tmp_path / "a"
+    live = session(path, config())
+    steps = iter(range(4))
+    begun, drive = [], live.evaluation_buffer.drive
+
+    def driving(*args: Any, **kwargs: Any) -> list[EpisodeResult]:
+        begun.append(live.progress.env_steps)
+        return drive(*args, **kwargs)
+
+    live.evaluation_buffer.drive = driving  # type: ignore[method-assign]
+    with pytest.raises(TrainingInterrupted):
+        train(live, stop=lambda: len(begun) == evaluation and next(steps, None) is None)
+    live.close()
+    assert len(begun) == evaluation
+    assert live.progress.env_steps == begun[-1] == [0, 800, 1600][evaluation - 1]
+    evaluated = pq.read_table(path / "evaluations.parquet")["env_steps"].unique().to_pylist()
+    assert evaluated == begun[:-1]
 
     again = session(path, config(), resume=True)
     train(again)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +19,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import nearest_action
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
+from restock.train import loop
 from restock.train.dqn.behaviour import FilteredNetwork, ProposedNetwork
 from restock.train.dqn.config import OfflineStartConfig
 from restock.train.dqn.fitted_q import FittedQConfig
@@ -30,6 +32,9 @@ from restock.train.evaluation.offline_start import LEARNT, candidates, chosen_of
 from restock.train.evaluation.onnx_policy import to_onnx
 from restock.train.evaluation.ope import OpeConfig
 from restock.train.evaluation.policies import load_agent
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.prepare import prepare_new, prepare_resumed
+from restock.train.run import checkpoint
 from restock.train.run.run import Run
 
 TASK = load_profile("warehouse_amr").task
@@ -194,3 +199,50 @@ def test_a_run_begins_with_what_was_chosen_and_keeps_it_until_it_is_beaten(
     # Nothing that was learnt in ten updates drives better than what navigation proposes.
     assert chosen.startswith("proposed")
     assert isinstance(load_agent(Run.open(path)).network, ProposedNetwork)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("during", ["off_policy", "offline_start"])
+def test_a_choice_is_abandoned_and_made_by_the_resumed_run(
+    panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
+) -> None:
+    """So is the evaluation on held-out logs before it."""
+    for module in (offline_start, loop):
+        monkeypatch.setattr(module, "OpeConfig", partial(OpeConfig, model=QUICK))
+    settings = [
+        *("offline_start.choose=true", "offline_start.ratios=[0.5]", "evaluation.off_policy=true"),
+        *("teacher.source=logs", "teacher.offline_updates=3", "teacher.hidden=[8]"),
+        *("schedule.offline_updates=3", "schedule.env_steps=0", "env.conditions={nominal=1.0}"),
+        *("network.hidden=[8]", "evaluation.episodes=1", "env.num_envs=2"),
+        *("record.tensorboard=false", "replay.batch_size=8"),
+    ]
+
+    def outcome(path: Path) -> dict[str, Any]:
+        run = Run.open(path)
+        state = checkpoint.load(run.latest)
+        rows = {name: run.table(name).to_pylist() for name in ("off_policy", "offline_start")}
+        return {**rows, "start": state["start"], "tables": state["tables"]}
+
+    whole = prepare_new(tmp_path / "whole", panel.path, None, settings).open()
+    train(whole)
+    whole.close()
+    cut = prepare_new(tmp_path / "cut", panel.path, None, settings).open()
+    asked = iter(range(2))
+
+    def stop() -> bool:
+        begun = cut.learner.gradient_steps == 3
+        evaluated = bool(cut.run.table("off_policy").num_rows)
+        return begun and evaluated == (during == "offline_start") and next(asked, None) is None
+
+    with pytest.raises(TrainingInterrupted):
+        train(cut, stop=stop)
+    cut.close()
+    assert not cut.run.table("offline_start").num_rows
+    assert bool(cut.run.table("off_policy").num_rows) == (during == "offline_start")
+    again = prepare_resumed(tmp_path / "cut").open()
+    train(again)
+    again.close()
+    expected = outcome(tmp_path / "whole")
+    assert expected["off_policy"]
+    assert expected["offline_start"]
+    np.testing.assert_equal(outcome(tmp_path / "cut"), expected)

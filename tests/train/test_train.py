@@ -180,6 +180,7 @@ def test_ctrl_c_or_a_kill_writes_a_checkpoint_and_says_how_to_go_on(
     finally:
         process.kill()
     assert process.returncode == 130, complaint
+    assert "stopping: a checkpoint is written" in complaint
     assert "restock train --resume" in complaint
     assert "Traceback" not in complaint
     stopped = checkpoint.load(path / "checkpoints" / "latest.safetensors")["progress"]["env_steps"]

@@ -7,7 +7,7 @@ from Q_0 = 0: after K of them Q is the value of the next K steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,6 +70,7 @@ def fitted_q(
     bounds: tuple[float, float] | None = None,
     config: FittedQConfig = FittedQConfig(),
     seed: int = 0,
+    between: Callable[[], None] = lambda: None,
 ) -> QNetwork:
     """Fit the values of a policy.
 
@@ -79,6 +80,7 @@ def fitted_q(
         discount: of one step.
         bounds: between which every value is known to be.
         seed: of the network's beginning and of the batches.
+        between: called before every update; what it raises ends the fit.
     """
     actions = next_probability.shape[1]
     generator = torch.Generator().manual_seed(seed)
@@ -98,6 +100,7 @@ def fitted_q(
     before: QNetwork | None = None
     for _ in range(config.iterations):
         for _ in range(config.updates):
+            between()
             some = torch.randint(len(rows), (config.batch_size,), generator=generator)
             target = reward[some]
             if before is not None:
@@ -120,10 +123,12 @@ def cloned_behaviour(
     *,
     config: FittedQConfig = FittedQConfig(),
     seed: int = 0,
+    between: Callable[[], None] = lambda: None,
 ) -> QNetwork:
     """Behaviour cloning: a network whose softmax is the probability of each action in the logs.
 
     For logs that do not say with which probability they acted. Weights from it are estimates.
+    `between` is called before every update; what it raises ends the fit.
     """
     generator = torch.Generator().manual_seed(seed)
     network = QNetwork(
@@ -133,6 +138,7 @@ def cloned_behaviour(
     seen, taken = torch.from_numpy(observation), torch.from_numpy(action)
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
     for _ in range(config.cloning_updates):
+        between()
         some = torch.randint(len(taken), (config.batch_size,), generator=generator)
         _descend(optimizer, nn.functional.cross_entropy(network(seen[some]), taken[some]))
     return network

@@ -8,7 +8,7 @@ met when driving, and what its observations look like. `restock diagnose` reads 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,10 +48,22 @@ class EvaluationBuffer:
         self._collector = self._empty()
 
     def drive(
-        self, policy: Policy, specs: Sequence[EpisodeSpec], discount: float | None = None
+        self,
+        policy: Policy,
+        specs: Sequence[EpisodeSpec],
+        discount: float | None = None,
+        between: Callable[[], None] = lambda: None,
     ) -> list[EpisodeResult]:
-        """Drive every episode, in the order of `specs`; what was kept before is forgotten."""
+        """Drive every episode, in the order of `specs`; what was kept before is forgotten.
+
+        `between` is called before every step; what it raises ends the drive.
+        """
         self._collector = self._empty()
+
+        def step(observation: F32, action: Ints) -> Step:
+            between()
+            return self._step(observation, action)
+
         return run_episodes(
             self.env,
             policy,
@@ -60,7 +72,7 @@ class EvaluationBuffer:
             time_limit_steps=self._task.time_limit_steps,
             goal=self._task.goal != "none",
             discount=discount,
-            step=self._step,
+            step=step,
         )
 
     def _step(self, observation: F32, action: Ints) -> Step:

@@ -13,7 +13,7 @@ Episodes that met a condition count half, however few they are: logs are mostly 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,11 +62,17 @@ class Candidate:
 
 
 def choose_start(
-    learner: Learner, task: Task, dataset: OpeDataset, config: TrainConfig
+    learner: Learner,
+    task: Task,
+    dataset: OpeDataset,
+    config: TrainConfig,
+    between: Callable[[], None] = lambda: None,
 ) -> tuple[StartPolicy | None, list[dict[str, Any]]]:
     """What drives first (None: what was learnt, as it is), and what every candidate is worth.
 
     That is rows of the run's table `offline_start`: a candidate x all, nominal and rare episodes.
+    `between` is called before every update of its models; what it raises ends the choice, and
+    leaves the learner as it was.
 
     Raises:
         RunError: no episode is held out.
@@ -79,7 +85,7 @@ def choose_start(
     gamma = config.loss.discount if measure == "return" else 1.0
     training = dataset.training.measured(measure)
     evaluation = dataset.evaluation.measured(measure)
-    probability, estimated = behaviour_probability(dataset, policy.actions, ope)
+    probability, estimated = behaviour_probability(dataset, policy.actions, ope, between)
     if measure == "success":
         probability = probability[~dataset.evaluation.bumped_before]
     gate = EssGate(ope.ess_share, ope.ess_episodes)
@@ -92,6 +98,7 @@ def choose_start(
             bounds=None if measure == "return" else (0.0, 1.0),
             config=ope.model,
             seed=ope.seed,
+            between=between,
         )
         episodes = padded_episodes(
             candidate.network, q, evaluation, probability, gamma, ope.epsilon

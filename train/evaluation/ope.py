@@ -127,11 +127,15 @@ def evaluate_off_policy(
     measures: tuple[Measure, ...] = ("return", "success"),
     config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
     progress: Callable[[int], None] | None = None,
+    between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
-    """Rows of `off_policy`: measure x condition of the episode x estimator."""
+    """Rows of `off_policy`: measure x condition of the episode x estimator.
+
+    `between` is called before every update of its models; what it raises ends the evaluation.
+    """
     results: list[dict[str, Any]] = []
     gate = EssGate(config.ess_share, config.ess_episodes)
-    probability, estimated = behaviour_probability(dataset, network.actions, config)
+    probability, estimated = behaviour_probability(dataset, network.actions, config, between)
     for measure in measures:
         training = dataset.training.measured(measure)
         evaluation = dataset.evaluation.measured(measure)
@@ -143,6 +147,7 @@ def evaluate_off_policy(
             bounds=None if measure == "return" else (0.0, 1.0),
             config=config.model,
             seed=config.seed,
+            between=between,
         )
         kept = ~dataset.evaluation.bumped_before if measure == "success" else slice(None)
         episodes = padded_episodes(network, q, evaluation, probability[kept], gamma, config.epsilon)
@@ -218,7 +223,10 @@ def padded_episodes(
 
 
 def behaviour_probability(
-    dataset: OpeDataset, actions: int, config: OpeConfig
+    dataset: OpeDataset,
+    actions: int,
+    config: OpeConfig,
+    between: Callable[[], None] = lambda: None,
 ) -> tuple[F64, float]:
     """Of each logged action (N,), and the share of rows in which it had to be estimated.
 
@@ -230,7 +238,12 @@ def behaviour_probability(
     if unknown.any():
         rows = dataset.training.rows
         clone = cloned_behaviour(
-            rows.observation, rows.action, actions, config=config.model, seed=config.seed
+            rows.observation,
+            rows.action,
+            actions,
+            config=config.model,
+            seed=config.seed,
+            between=between,
         )
         cloned = cloned_probabilities(clone, steps.rows.observation[unknown])
         probability[unknown] = cloned[np.arange(len(cloned)), steps.rows.action[unknown]]

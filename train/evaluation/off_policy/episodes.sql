@@ -10,9 +10,9 @@ WITH whole AS (
     WHERE episode_id IN (SELECT episode_id FROM transitions JOIN wanted USING (transition_id))
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index),
            episode_so_far AS (episode ROWS BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW)
-), named AS (  -- an episode is of the condition that most of its labelled rows have
+), named AS (  -- an episode is of the condition that most of its labelled rows have, of equals the first
     SELECT episode_id,
-           coalesce(mode(condition) FILTER (condition <> 'nominal'), 'nominal') AS of_condition
+           coalesce(mode(condition ORDER BY step_index) FILTER (condition <> 'nominal'), 'nominal') AS of_condition
     FROM whole
     GROUP BY episode_id
 )

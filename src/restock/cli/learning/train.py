@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
     from restock.train.loop import TrainResult
     from restock.train.prepare import Prepared
 
+_STOPPING = (
+    "stopping: a checkpoint is written after the updates or the step under way; Ctrl-C again ends"
+    " at once, with the last checkpoint"
+)
+
 
 @dataclass
 class TrainCommand:
@@ -24,7 +30,8 @@ class TrainCommand:
 
     Writes a run directory: resolved config, metrics and replay audit as Parquet, checkpoints (the
     latest, and the best by greedy evaluation on fixed episodes) and TensorBoard events. Ctrl-C
-    writes a checkpoint and exits 130; `--resume RUN` continues exactly where it stopped.
+    writes a checkpoint and exits 130, a second Ctrl-C ends at once with the last checkpoint;
+    `--resume RUN` continues exactly where it stopped.
     docs/train.md explains the recipe and every key of the config.
     """
 
@@ -97,9 +104,10 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     """Train to the end; then flush the twin's episodes, where a store is given."""
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
+    from restock.interrupts import went_on_after_interrupt
     from restock.train.describe import describe_run
     from restock.train.flush_fresh import flush
-    from restock.train.loop import train
+    from restock.train.loop import TrainingInterrupted, train
 
     config = prepared.config
     session = prepared.open()
@@ -126,7 +134,20 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     advance(values["env_steps"] - seen, _progress_note(values))
                     seen = values["env_steps"]
 
-            outcome = train(session, stop=stop, notify=notify)
+            try:
+                outcome = train(session, stop=stop, notify=notify)
+            except KeyboardInterrupt:
+                went_on_after_interrupt()
+                path, kept = session.run.path, session.run.latest.exists()
+                raise TrainingInterrupted(
+                    "ended at once; what was learnt since its last checkpoint is lost"
+                    if kept
+                    else "ended at once, before its first checkpoint",
+                    where=str(path),
+                    remedy=f"continue with `restock train --resume {path}`"
+                    if kept
+                    else "remove it, and train again",
+                ) from None
         if store is None or (log := session.collector.log) is None:
             return outcome, None
         return outcome, flush(
@@ -137,21 +158,31 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
 
 
 @contextmanager
-def _stop_on_interrupt() -> Iterator[Any]:
+def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """The first Ctrl-C asks the loop to stop with a checkpoint, the second one stops at once."""
+    from restock.cli.output import say
+
+    # On a thread: a handler must not print while what it interrupts does.
+    told = Thread(target=say, args=(_STOPPING,))
     stopping = False
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal stopping
-        if stopping:
+        if not stopping:
+            stopping = True
+            told.start()
+        elif callable(before):
+            before(number, frame)
+        else:
             raise KeyboardInterrupt
-        stopping = True
 
     before = signal.signal(signal.SIGINT, ask)
     try:
         yield lambda: stopping
     finally:
         signal.signal(signal.SIGINT, before)
+        if stopping:
+            told.join()
 
 
 def _progress_note(values: dict[str, Any]) -> str:
