@@ -27,7 +27,7 @@ from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
-from restock.train.evaluation.policies import save_agent
+from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
@@ -173,9 +173,12 @@ class Session(Stateful):
         """Go on from the run's latest checkpoint.
 
         Raises:
-            RunError: no such checkpoint, or the logs' rows are not those that the run began with.
+            RunError: no such checkpoint, the policy that was kept is missing or damaged, or the
+                logs' rows are not those that the run began with.
         """
         state = self._latest()
+        if kept_one(state):
+            load_kept(self.run)
         before, now = state["probe"], self.probe
         if before is not None and now is not None and before["hash"] != now.hash:
             raise RunError(

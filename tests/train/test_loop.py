@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -24,11 +25,12 @@ from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
-from restock.train.evaluation.policies import GreedyPolicy
+from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.logs import Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import earlier, go_back
+from restock.train.run.run import Run
 from restock.train.session import Session
 
 
@@ -211,6 +213,26 @@ def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=rf"other logged rows: its probe is {probe[0]}") as refused:
         session(first.run.path, settings, logs=other, resume=True)
     assert "the panel that the run began with" in str(refused.value)
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut"])
+def test_a_run_is_neither_resumed_nor_evaluated_without_the_policy_that_it_kept(
+    undisturbed: Session, tmp_path: Path, damage: str
+) -> None:
+    path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
+    best = path / "checkpoints" / "best.safetensors"
+    content = best.read_bytes()
+    best.unlink()
+    if damage == "cut":
+        best.write_bytes(content[: len(content) // 2])
+    document = {"config": msgspec.to_builtins(config())}
+    run = Run(path, document)
+    for use in (lambda: session(path, config(), resume=True), lambda: load_agent(run)):
+        with pytest.raises(RunError, match=r"has kept a policy there|is damaged") as refused:
+            use()
+        assert refused.value.where == str(best)
+        assert "restore it from a copy" in str(refused.value.remedy)
+    assert pq.read_table(path / "progress.parquet").equals(undisturbed.run.table("progress"))
 
 
 def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:

@@ -67,16 +67,19 @@ def load_agent(run: Run) -> GreedyPolicy:
     """The policy that a run kept as its best, greedy.
 
     Raises:
-        RunError: none kept yet, a damaged one, or one of a task that the profile no longer is.
+        RunError: none kept yet, a missing or damaged one, or one of a task that the profile no
+            longer is.
     """
-    if not run.best.exists():
+    if not run.best.exists() and not (
+        run.latest.is_file() and kept_one(checkpoint.load(run.latest))
+    ):
         raise RunError(
             "has not kept a policy yet: it stopped before its first evaluation",
             where=str(run.path),
             remedy=f"continue it with `restock train --resume {run.path}`",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
-    state = checkpoint.load(run.best)
+    state = load_kept(run)
     task = profile_of_run(run).task
     if state["task_hash"] != task.hash:
         raise RunError(
@@ -91,6 +94,26 @@ def load_agent(run: Run) -> GreedyPolicy:
         made = msgspec.convert(start, StartPolicy)
         network = start_network(made, network, task.scaled_actions)
     return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
+
+
+def kept_one(state: Mapping[str, Any]) -> bool:
+    """Whether a run had kept a policy when this checkpoint of it was taken."""
+    return bool(state["progress"]["evaluated_at"] >= 0)
+
+
+def load_kept(run: Run) -> dict[str, Any]:
+    """What `save_agent` wrote, of a run that has kept a policy.
+
+    Raises:
+        RunError: its file is missing or damaged.
+    """
+    if not run.best.exists():
+        raise RunError(
+            "does not exist, but the run has kept a policy there",
+            where=str(run.best),
+            remedy="restore it from a copy, or train again",
+        )
+    return checkpoint.load(run.best)
 
 
 def save_agent(
@@ -117,4 +140,11 @@ def save_agent(
     checkpoint.save(run.best, state)
 
 
-__all__ = ["GreedyPolicy", "load_agent", "load_policy", "save_agent"]
+__all__ = [
+    "GreedyPolicy",
+    "kept_one",
+    "load_agent",
+    "load_kept",
+    "load_policy",
+    "save_agent",
+]
