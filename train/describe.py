@@ -1,4 +1,4 @@
-"""What a run is about to do, in words: `restock train` says it before anything is learnt."""
+"""What a run is about to do, or has not done, in words: `restock train` says it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.feed.cloned_rows import cloned
+from restock.train.loop import TrainResult, time_left
 from restock.train.prepare import Prepared, rows_by_policy
+from restock.train.session import Session
 from restock.train.twin.env.floor_report import sealed
 from restock.train.twin.floors.floors import open_floors
 
@@ -60,6 +62,37 @@ def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
         f"{config.schedule.offline_updates:,} offline updates draw first, and the rest is spread "
         f"over {config.schedule.env_steps:,} steps; log more, shorten the schedule, or raise "
         "max_replays_per_row)"
+    )
+
+
+def nothing_to_do(session: Session) -> str | None:
+    """Why a resumed run ends at once, and what to do; None where it goes on."""
+    progress, schedule = session.progress, session.config.schedule
+    if progress.evaluated_at != progress.env_steps:  # its last evaluation is still to be made
+        return None
+    if progress.stopped:
+        return f"the guard stopped it after {progress.env_steps:,} environment steps"
+    if not session.config.env.twin:
+        return "it learns from logs alone, and has made its updates"
+    if progress.env_steps >= schedule.env_steps:
+        return (
+            f"its budget of {schedule.env_steps:,} environment steps is used up;"
+            " give more with --env-steps N"
+        )
+    if not time_left(session):
+        return f"its budget of {schedule.seconds:g} s is used up; give more with --seconds S"
+    return None
+
+
+def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
+    """Why a run has learnt nothing; None where it has made an update."""
+    if outcome.gradient_steps:
+        return None
+    return (
+        f"no update was made in {outcome.env_steps:,} environment steps, so the policy is as random"
+        " as at the beginning; online updates begin after"
+        f" schedule.warmup_env_steps={config.schedule.warmup_env_steps:,}, once there are"
+        f" replay.batch_size={config.replay.batch_size:,} rows: give more --env-steps"
     )
 
 

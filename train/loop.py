@@ -100,7 +100,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     # 1. Offline, the logs alone: what their teacher finds plausible, then values.
     _clone_teacher(session, stop)
-    while (left := offline_updates - learner.gradient_steps) > 0 and _time_left(session):
+    while (left := offline_updates - learner.gradient_steps) > 0 and time_left(session):
         _interrupt(session, stop)
         _updates(
             session, min(left, 1 if session.blocks is None else _OFFLINE_BLOCK), "offline", notify
@@ -117,7 +117,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
     _evaluate_if_due(session, notify, stop)  # where the run stopped while it did
-    while progress.env_steps < schedule.env_steps and _time_left(session) and not progress.stopped:
+    while progress.env_steps < schedule.env_steps and time_left(session) and not progress.stopped:
         _interrupt(session, stop)
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
@@ -203,7 +203,7 @@ def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
     behaviour, imitation = session.learner.behaviour, session.imitation
     if behaviour is None or imitation is None or session.learner.gradient_steps:
         return
-    while behaviour.updates < imitation.offline_updates and _time_left(session):
+    while behaviour.updates < imitation.offline_updates and time_left(session):
         _interrupt(session, stop)
         behaviour.learn(imitation.draw_offline())
 
@@ -461,7 +461,7 @@ def _save(session: Session) -> None:
     session.save()
 
 
-def _time_left(session: Session) -> bool:
+def time_left(session: Session) -> bool:
     """Whether the time is not up.
 
     Whatever it is, a first interval of updates is made, so that there is something to keep and to

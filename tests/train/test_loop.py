@@ -21,6 +21,7 @@ from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train import jump_start
+from restock.train.describe import no_update, nothing_to_do
 from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
@@ -433,12 +434,39 @@ def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session)
     assert {row["episode_seed"] for row in rows} == {90_000, 90_001, 90_002}
 
 
-def test_warmup_collects_without_learning(tmp_path: Path) -> None:
-    live = run_to_end(
-        tmp_path / "a", config(schedule={"env_steps": 400, "warmup_env_steps": 400}), logs=None
-    )
+def test_warmup_collects_without_learning_and_a_run_of_nothing_else_says_so(
+    tmp_path: Path,
+) -> None:
+    settings = config(schedule={"env_steps": 400, "warmup_env_steps": 400})
+    live = session(tmp_path / "a", settings, logs=None)
+    said = no_update(train(live), settings)
+    live.close()
     assert live.learner.gradient_steps == 0
     assert len(live.ring) > 300
+    assert said is not None
+    assert said.startswith("no update was made in 400 environment steps")
+    assert "schedule.warmup_env_steps=400" in said
+
+
+def test_a_run_whose_budget_is_used_up_says_so_when_it_is_resumed(
+    undisturbed: Session, tmp_path: Path
+) -> None:
+    path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
+
+    def said(**schedule: Any) -> str:
+        live = session(path, config(schedule=schedule), resume=True)
+        live.close()
+        return nothing_to_do(live) or "goes on"
+
+    assert (
+        said() == "its budget of 1,600 environment steps is used up; give more with --env-steps N"
+    )
+    assert said(env_steps=2000) == "goes on"
+    used_up = said(env_steps=2000, seconds=1e-9)
+    assert used_up == "its budget of 1e-09 s is used up; give more with --seconds S"
+    undisturbed.progress.evaluated_at, before = 800, undisturbed.progress.evaluated_at
+    assert nothing_to_do(undisturbed) is None  # its last evaluation was abandoned
+    undisturbed.progress.evaluated_at = before
 
 
 def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:

@@ -123,7 +123,9 @@ def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
 
 
 @pytest.mark.long  # test_loop shows it on the corridor
-def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
+def test_resuming_in_the_twin_is_bit_exact(
+    tmp_path: Path, panel: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     base = ["train", "--panel", str(panel), *TINY]
     assert main([*base, "--out", str(tmp_path / "whole"), "--env-steps", "400"]) == 0
     assert main([*base, "--out", str(tmp_path / "parts"), "--env-steps", "240"]) == 0
@@ -137,7 +139,11 @@ def test_resuming_in_the_twin_is_bit_exact(tmp_path: Path, panel: Path) -> None:
     for file in kept:
         file.write_bytes(b"not of that process")
     # A run whose budget is raised goes on; only its closing evaluation at 240 is extra.
+    capsys.readouterr()
+    assert main(["train", "--resume", str(tmp_path / "parts")]) == 0
+    assert "nothing to do: its budget of 240 environment" in capsys.readouterr().err
     assert main(["train", "--resume", str(tmp_path / "parts"), "--env-steps", "400"]) == 0
+    assert "nothing to do" not in capsys.readouterr().err
     assert {file for file in path.rglob(".*") if file.is_file()} == set(kept)
     whole = checkpoint.load(tmp_path / "whole" / "checkpoints" / "latest.safetensors")
     parts = checkpoint.load(tmp_path / "parts" / "checkpoints" / "latest.safetensors")

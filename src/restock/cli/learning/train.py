@@ -105,13 +105,15 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
     from restock.interrupts import went_on_after_interrupt
-    from restock.train.describe import describe_run
+    from restock.train.describe import describe_run, nothing_to_do
     from restock.train.flush_fresh import flush
     from restock.train.loop import TrainingInterrupted, train
 
     config = prepared.config
     session = prepared.open()
     say(describe_run(prepared))
+    if prepared.resumed is not None and (why := nothing_to_do(session)) is not None:
+        say(f"nothing to do: {why}")
     if store is not None or (session.run.path / "fresh").is_dir():
         session.collector.keep(session.run.path / "fresh")
     try:
@@ -222,7 +224,10 @@ def _print(
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
+    from restock.train.describe import no_update
 
+    if (why := no_update(outcome, prepared.config)) is not None:
+        say(f"warning: {why}")
     path = str(prepared.path)
     if as_json:
         fresh = {"flushed": asdict(flushed)} if flushed is not None else {}
