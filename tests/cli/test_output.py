@@ -198,7 +198,7 @@ def test_what_an_option_says_is_one_paragraph(
     text = capsys.readouterr().out
     (line,) = (line for line in text.splitlines() if "--no-drive" in line)
     assert line.strip("│ ").endswith(
-        "Drive nothing: use the episodes in RUN/eval/episodes.parquet."
+        "Drive nothing: use (or just show) the episodes in RUN/eval/episodes.parquet."
     )
 
 
