@@ -147,7 +147,9 @@ def leave_out_of_strata(
         seen = sorted(set(table["condition"].to_numpy(zero_copy_only=False)[unlisted]))
         raise MixtureError(
             f"{int(unlisted.sum())} rows belong to no stratum (conditions: {', '.join(seen)})",
-            remedy='list a stratum for them, add [each_condition], or set unlisted = "drop"',
+            remedy="list a stratum for them, "
+            + ("add [each_condition], " if mixture.each_condition is None else "")
+            + 'or set unlisted = "drop"',
         )
     out.add("in no stratum", unlisted)
     for column, name in (("episode_id", "episode"), ("recording_id", "recording")):

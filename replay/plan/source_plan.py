@@ -157,9 +157,14 @@ def _refuse_below_natural(lines: Sequence[Stratum]) -> None:
     )
     raise MixtureError(
         f"its correction gives a stratum a smaller share than it has in the logs: {of_them}",
-        remedy='set unit = "episode" (whole episodes need no correction), or [correction] post ='
-        ' "density_ratio" (keeps the boost; a larger clip keeps more) or "none" (keeps all of it,'
-        ' and its bias); below_natural = "allow" mixes it as it is',
+        remedy='set unit = "episode" (whole episodes need no correction), or '
+        + (
+            "a larger [correction] clip (keeps more of the boost), or post ="
+            if all(line.correction == "density_ratio" for line in below)
+            else '[correction] post = "density_ratio" (keeps the boost; a larger clip keeps'
+            " more) or"
+        )
+        + ' "none" (keeps all of it, and its bias); below_natural = "allow" mixes it as it is',
     )
 
 

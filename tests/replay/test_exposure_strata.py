@@ -11,7 +11,7 @@ import pytest
 from support.stores import CONDITIONS, recording_transitions, write_store
 
 from restock.cli import main
-from restock.errors import ConfigError
+from restock.errors import ConfigError, MixtureError
 from restock.ingest.store.transitions import replaced
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
 from restock.replay.panel.build import build_panel, open_source
@@ -85,6 +85,14 @@ def test_a_stratum_of_the_exposure_keeps_what_went_well(tmp_path):
     assert success_in(outcome, "near_collision", rows) == 0
     assert success_in(exposure, "closing_traffic", rows) == 0.5
     assert success_in(outcome, "nominal", rows) == success_in(exposure, "nominal", rows) == 1
+
+
+def test_rows_without_an_exposure_are_not_told_to_add_what_is_there(tmp_path):
+    rows = planted(lambda number: NEAR[number])
+    store = store_of(replaced(rows, {"exposures": [[]] * len(rows)}), tmp_path / "store")
+    with pytest.raises(MixtureError, match="belong to no stratum") as refused:
+        planned(store, "[each_condition]\nkind = 'exposure'")
+    assert "each_condition" not in str(refused.value)
 
 
 def test_an_exposure_beside_a_condition_by_name_takes_its_rows_by_priority(tmp_path):

@@ -247,7 +247,13 @@ def test_the_command_shows_a_pair_without_an_interval(tmp_path, capsys) -> None:
     episodes: list[Episode] = [("planner", [1.0], "goal"), ("agent", [2.0], "goal")]
     place = str(store_of(tmp_path / "store", [*episodes, ("agent", [3.0], "bump")]))
     assert cli.main(["audit", place, "--reward"]) == 0
-    assert "undetermined" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "undetermined" in shown
+    assert "nan" not in shown
+    cli.main(["audit", place])
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines() if "few epi" in line]
+    assert lines
+    assert not any(line.endswith(",") for line in lines)
     assert cli.main(["audit", place, "--reward", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["order"][0]["more_return"] == [None, None]
 

@@ -21,7 +21,7 @@ from restock.replay.mixture.mixture import StratumRule, load_mixture, parse_mixt
 from restock.replay.mixture.shares import missing_rows, plan_shares
 from restock.replay.places import open_place
 from restock.replay.plan.plan import hours_of
-from restock.replay.plan.source_plan import below_natural
+from restock.replay.plan.source_plan import _refuse_below_natural, below_natural
 from restock.replay.plan.strata import (
     NO_STRATUM,
     ResolvedStratum,
@@ -51,6 +51,13 @@ def test_a_correction_that_takes_a_stratum_below_its_natural_share_is_refused(
         for share in (line.natural_share, line.wanted_share, line.share, line.effective_share):
             assert f"{share:.2%}" in str(refused.value)
     assert 'below_natural = "allow"' in str(refused.value)
+    assert '[correction] post = "density_ratio"' in str(refused.value)
+    with pytest.raises(MixtureError) as refused:  # what is in force is not advised
+        _refuse_below_natural(
+            [msgspec.structs.replace(b, correction="density_ratio") for b in below]
+        )
+    assert 'density_ratio" (keeps' not in str(refused.value)
+    assert "a larger [correction] clip" in str(refused.value)
 
 
 @pytest.mark.parametrize("post", ["none", "beta", "full", "clipped", "density_ratio"])

@@ -429,6 +429,14 @@ def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None
     assert changes <= sections[cause]
 
 
+def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
+    run = str(make_run(tmp_path / "r", lag=0.9).path)
+    assert main(["diagnose", run, "--confirm", run]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "already exists give --confirm another directory" in said
+    assert "--out" not in said
+
+
 def test_no_run_confirms_rows_that_alone_are_at_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,7 +15,7 @@ from restock.train.comparison.windows import Cause
 from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
-from restock.train.run.run import Run
+from restock.train.run.run import Run, check_free
 
 _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
@@ -33,8 +33,17 @@ def confirm(
     gone, False where it stayed, None where the new run does not say.
 
     Raises:
-        RunError: there is nothing to confirm, or no setting changes what is suspected.
+        RunError: something is at `out`, there is nothing to confirm, or no setting changes what
+            is suspected.
     """
+    try:
+        check_free(out)
+    except RunError as taken:
+        raise RunError(
+            taken.what,
+            where=taken.where,
+            remedy="give --confirm another directory, or remove this one",
+        ) from taken
     if rows_at_fault and diagnosis.cause in (*_NOTHING, "ACTION_COVERAGE"):
         raise RunError(
             f"is {diagnosis.cause} by its own figures, and only its rows are at fault: another run"

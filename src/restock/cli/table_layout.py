@@ -126,7 +126,7 @@ def cell(value: Any) -> str:
     if isinstance(value, int):
         return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
     if isinstance(value, list | tuple):
-        return ", ".join(cell(item) for item in value)
+        return ", ".join(map(cell, value)) if any(item is not None for item in value) else ""
     return visible(str(value), keep="\n\t").replace("[", r"\[")
 
 

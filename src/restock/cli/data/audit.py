@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -310,7 +311,10 @@ VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # of a pair o
 
 
 def _interval(value: float, ends: list[float]) -> str:
-    return f"{value:.2f} [{ends[0]:.2f}, {ends[1]:.2f}]"
+    from restock.stats import interval_text
+
+    low, high = (None if math.isnan(end) else end for end in ends)
+    return interval_text(value, low, high)
 
 
 def _summary(findings: list[Finding]) -> str:
