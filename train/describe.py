@@ -97,9 +97,13 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
 
 
 def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
-    drivers = ", ".join(teacher.policies)
-    rows = 0 if panel is None else sum(rows_by_policy(panel)[name] for name in teacher.policies)
-    cloned_rows = f"{rows:,} logged rows of {drivers}"
+    logged = {} if panel is None else rows_by_policy(panel)
+    there = [name for name in teacher.policies if logged.get(name)]
+    absent = [name for name in teacher.policies if name not in there]
+    rows = sum(logged[name] for name in there)
+    cloned_rows = f"{rows:,} logged rows of {', '.join(there or absent)}"
+    if there and absent:
+        cloned_rows += f" (none of {', '.join(absent)}: the panel has {', '.join(sorted(logged))})"
     if panel is not None and teacher.successes:
         others = int(cloned(panel, teacher).sum()) - rows
         cloned_rows += (

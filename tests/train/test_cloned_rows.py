@@ -121,6 +121,9 @@ def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -
     assert f"{alone.sum():,} logged rows of operator, and {others:,} rows of" in describe_run(
         prepared
     )
+    misspelt = [*logged, "teacher.policies=['operator', 'plannner']"]
+    said = describe_run(prepare_new(tmp_path / "run", panel.path, None, misspelt))
+    assert "rows of operator (none of plannner: the panel has operator, planner)" in said
     # 2,000 updates of the critic; as many again for each 5,000 rows.
     assert teacher.offline_updates == round(2000 * rows.sum() / 5000)
     fewer = prepare_new(

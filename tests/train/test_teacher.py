@@ -42,7 +42,7 @@ from restock.train.dqn.config import TeacherConfig, parse_config
 from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import td_target
-from restock.train.feed.imitation import Imitation
+from restock.train.feed.imitation import Imitation, refuse_nothing_to_learn
 from restock.train.feed.teacher import TeacherFailed, open_teacher
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new, prepare_resumed
@@ -482,6 +482,16 @@ def test_logs_without_a_row_to_clone_are_refused(
     settings = config(teacher={"source": "logs", "policies": ["teleop"]})
     with pytest.raises(ConfigError, match=f"clones the rows of teleop, but {message}"):
         session(tmp_path / "a", settings, **parts)
+
+
+def test_a_teacher_who_is_asked_may_lack_the_default_rows_and_no_others() -> None:
+    named = TeacherConfig(source="operator", policies=("opertor",))
+    with pytest.raises(ConfigError, match="clones the rows of opertor, but the logs have planner"):
+        refuse_nothing_to_learn(named, ["planner"])
+    for allowed in (TeacherConfig(source="operator"), msgspec.structs.replace(named, policies=())):
+        refuse_nothing_to_learn(allowed, ["planner"])
+    refuse_nothing_to_learn(named, None)
+    refuse_nothing_to_learn(msgspec.structs.replace(named, source="none"), ["planner"])
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ class Imitation(Stateful):
         mirror: of the task, where rows are mirrored.
 
     Raises:
-        ConfigError: the teacher is `logs`, and they have no row of its policies.
+        ConfigError: the logs have no row of the policies that are to be cloned.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("_rng",)
@@ -168,17 +168,23 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
 
 
 def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None) -> None:
-    """Raises ConfigError where the teacher is `logs`, and none of its policies is in them.
+    """Raises ConfigError where none of the teacher's policies is in the logs, and one must be.
+
+    One must where the teacher is `logs`; or where they were chosen: only the default ones, of a
+    teacher that is asked, may be absent.
 
     Args:
         logged: names of the logs' behaviour policies; None: there are no logs.
     """
-    if not config.filters or config.asks or set(config.policies) & set(logged or ()):
+    if not config.filters or set(config.policies) & set(logged or ()):
+        return
+    chosen = config.policies and config.policies != TeacherConfig().policies
+    if config.asks and (logged is None or not chosen):
         return
     have = "this run has no logs" if logged is None else f"the logs have {', '.join(logged)}"
     raise ConfigError(
-        f'teacher.source = "logs" clones the rows of {", ".join(config.policies) or "nobody"}'
-        f", but {have}",
+        f'teacher.source = "{config.source}" clones the rows of '
+        f"{', '.join(config.policies) or 'nobody'}, but {have}",
         where="teacher.policies",
         remedy="give a --panel with rows of those policies, or choose other policies",
     )
