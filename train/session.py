@@ -7,7 +7,7 @@ checkpoint, so a run that is resumed goes on exactly as it would have.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -47,6 +47,8 @@ from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.update_blocks import UpdateBlocks
+
+_MAY_CHANGE = ("schedule.env_steps", "schedule.seconds", "device")  # as `train --resume` may
 
 
 @dataclass
@@ -159,7 +161,8 @@ class Session(Stateful):
         self.run.flush()
         self.events.flush()
         tables = self.run.row_counts()
-        checkpoint.save(self.run.latest, {**self.state_dict(), "tables": tables})
+        extra = {"tables": tables, "config": self.run.document.get("config")}
+        checkpoint.save(self.run.latest, {**self.state_dict(), **extra})
 
     def write_held(self) -> None:
         """Write also what waits for its episodes' end; a run that goes on from here takes it back.
@@ -173,10 +176,11 @@ class Session(Stateful):
         """Go on from the run's latest checkpoint.
 
         Raises:
-            RunError: no such checkpoint, the policy that was kept is missing or damaged, or the
-                logs' rows are not those that the run began with.
+            RunError: no such checkpoint, the policy that was kept is missing or damaged, or
+                config.json or the logs' rows are not those that the run began with.
         """
         state = self._latest()
+        _refuse_edited(self.run, state.get("config"))
         if kept_one(state):
             load_kept(self.run)
         before, now = state["probe"], self.probe
@@ -232,6 +236,32 @@ class Session(Stateful):
         self.events.close()
         if self.lock is not None:
             self.lock.release()
+
+
+def _refuse_edited(run: Run, before: Mapping[str, Any] | None) -> None:
+    """Refuse a config.json that was edited since a checkpoint with the config `before`.
+
+    None: an earlier Restock did not keep it.
+    """
+    if before is None:
+        return
+    now = dict(_settings(run.document["config"]))
+    for key, value in _settings(before):
+        if key in now and now[key] != value and key not in _MAY_CHANGE:
+            raise RunError(
+                f"{key} is {now[key]}, but the run was trained with {value}",
+                where=str(run.path / "config.json"),
+                remedy="put it back, or train a new run with the other value",
+            )
+
+
+def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each key of a config by its path, as `--set` names it."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _settings(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:

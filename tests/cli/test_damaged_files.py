@@ -22,6 +22,8 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table, write_table
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
+from restock.train.comparison.diagnose import diagnose
+from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
 TINY = [
@@ -93,10 +95,20 @@ def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
     }
 
 
-def check(argv: list[str], named: Path, capsys: pytest.CaptureFixture[str]) -> int:
-    """Run a command: 0, or 2 with a message that names the place; 1 for a refused comparison."""
+def check(
+    argv: list[str],
+    named: Path,
+    capsys: pytest.CaptureFixture[str],
+    heard: list[str] | None = None,
+) -> int:
+    """Run a command: 0, or 2 with a message that names the place; 1 for a refused comparison.
+
+    What it says is put into `heard`.
+    """
     code = cli.main(argv)
     said = capsys.readouterr().err
+    if heard is not None:
+        heard.append(said)
     assert "Traceback" not in said, argv
     assert "an unexpected" not in said, (argv, said)
     if code:
@@ -166,6 +178,59 @@ def test_config_json_that_lacks_a_key_is_said(
         for verb in ("eval", "diagnose", "train", "export"):
             argv = run_verbs(run, root, tmp_path)[verb]
             assert check(argv, run / "config.json", capsys) == 2
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "before"),
+    [("optimizer.learning_rate", 0.5, "0.001"), ("network.hidden", [9], "[8]"), ("seed", 3, "0")],
+)
+def test_a_config_that_was_edited_is_not_resumed(
+    key: str,
+    value: object,
+    before: str,
+    root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = edited(root, tmp_path, {key: value, "schedule.env_steps": 41})
+    assert check(run_verbs(run, root, tmp_path)["train"], run, capsys, said := []) == 2
+    assert f"{run}/config.json: {key} is {value}, but the run was trained with {before}" in said[0]
+
+
+def test_a_network_that_was_edited_is_said_by_who_would_drive_it(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = edited(root, tmp_path, {"network.hidden": [9]})
+    assert check(run_verbs(run, root, tmp_path)["export"], run, capsys, said := []) == 2
+    assert "its policy is not of the network that config.json describes" in said[0]
+
+
+def test_a_table_that_is_missing_is_said_where_it_is_taken_as_empty(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(root / "run", run)
+    assert not Run.open(run).absent
+    damage(run / "audit.parquet", "missing")
+    assert cli.main(["report", str(run), "--card"]) == 0
+    assert "Missing tables, taken as empty: audit.parquet." in capsys.readouterr().out
+    shown = diagnose([Run.open(run)]).evidence[0]
+    assert shown.endswith("(how large it may be is unknown: no audited row has a reward)")
+
+
+def edited(root: Path, folder: Path, values: dict[str, object]) -> Path:
+    """The run with other values in its config.json."""
+    run = folder / "run"
+    shutil.copytree(root / "run", run)
+    document = json.loads((run / "config.json").read_text())
+    for key, value in values.items():
+        *tables, name = key.split(".")
+        table = document["config"]
+        for one_of in tables:
+            table = table[one_of]
+        table[name] = value
+    (run / "config.json").write_text(json.dumps(document))
+    return run
 
 
 def store_verbs(store: Path, out: Path) -> list[list[str]]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isinf
 
 import msgspec
 
@@ -154,10 +155,13 @@ def _explained(explained: float | None) -> str:
 
 def _evidence(window: Window, limits: DiagnosisLimits) -> list[str]:
     """What a window shows, for people."""
+    most = f"of at most {window.q_bound:.3g}"
+    if isinf(window.q_bound):
+        most = "(how large it may be is unknown: no audited row has a reward)"
     lines = [
         f"after {window.gradient_steps:,} updates: median G {window.gap_median:.2f},"
         f" L {window.lag:.3f}, S {window.clock:.2f},{_explained(window.explained)}"
-        f" max |Q| {window.q_abs_max:.3g} of at most {window.q_bound:.3g}"
+        f" max |Q| {window.q_abs_max:.3g} {most}"
     ]
     lines += [f"target: {reason}" for reason in window.target(limits)]
     for condition, reasons in window.bad(limits).items():

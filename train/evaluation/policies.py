@@ -12,6 +12,7 @@ import numpy as np
 
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
+from restock.files import first_line
 from restock.ingest.task.task import Task
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
 from restock.train.dqn.config import parse_config
@@ -89,7 +90,14 @@ def load_agent(run: Run) -> GreedyPolicy:
             remedy="train again: the meaning of observations or actions has changed",
         )
     network = make_policy(config, state["observation_size"], state["actions"])
-    network.load_state_dict(state["network"])
+    try:
+        network.load_state_dict(state["network"])
+    except RuntimeError as error:  # torch's of other shapes or names
+        raise RunError(
+            f"its policy is not of the network that config.json describes: {first_line(error)}",
+            where=str(run.best),
+            remedy="put the settings back that were changed in config.json: network, teacher",
+        ) from error
     if (start := state.get("start")) is not None:  # what the run began with is not beaten yet
         made = msgspec.convert(start, StartPolicy)
         network = start_network(made, network, task.scaled_actions)

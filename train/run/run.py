@@ -107,6 +107,12 @@ class Run:
     def best(self) -> Path:
         return self.path / "checkpoints" / "best.safetensors"
 
+    @property
+    def absent(self) -> list[str]:
+        """The files of tables that are not there: lost, or unknown to the Restock that wrote it."""
+        files = [f"{name}.parquet" for name in TABLES]
+        return [file for file in files if not (self.path / file).exists()]
+
     def append(self, table: str, rows: Rows) -> None:
         """Add rows to a table; `flush` writes them. Every column must be given.
 

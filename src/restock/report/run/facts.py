@@ -152,6 +152,11 @@ def gather(path: Path) -> Facts:
     facts.practice = run.table("practice").to_pylist()
     taught = run.table("teacher").to_pylist()
     facts.teacher = [row for row in taught if _clocks(row) == _clocks(taught[-1])]
+    if absent := run.absent:
+        facts.missing.append(
+            f"Missing tables, taken as empty: {', '.join(absent)}. Restore them from a copy, unless"
+            " an earlier Restock wrote the run."
+        )
     if not facts.cells and facts.twin:
         facts.missing.append("`restock eval` has not been run: success is of training only.")
     _add_panel(facts)
