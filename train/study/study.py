@@ -308,24 +308,25 @@ class StudyPlan:
             request |= {"library": job.arm.library, "arguments": job.arm.arguments}
         return request
 
-    def refuse_changed(self) -> None:
-        """Raises RunError where a finished run was made as the study does not ask any more."""
-        for job in self.jobs:
-            if not job.done.exists():
-                continue
-            made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
-            asked = json.loads(self.fingerprint(job))
-            if made.get("panel") and asked["panel"]:  # an earlier Restock wrote the whole path
-                parts = Path(asked["panel"]).parts
-                if Path(made["panel"]).parts[-len(parts) :] == parts:
-                    made["panel"] = asked["panel"]
-            if made != asked:
-                raise RunError(
-                    "was made otherwise than the study now asks: then "
-                    f"{_only(made, asked)}, now {_only(asked, made)}",
-                    where=str(job.path),
-                    remedy="remove it, or give the study another --out",
-                )
+
+def refuse_changed(plan: StudyPlan) -> None:
+    """Raises RunError where a finished run was made as the study does not ask any more."""
+    for job in plan.jobs:
+        if not job.done.exists():
+            continue
+        made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
+        asked = json.loads(plan.fingerprint(job))
+        if made.get("panel") and asked["panel"]:  # an earlier Restock wrote the whole path
+            parts = Path(asked["panel"]).parts
+            if Path(made["panel"]).parts[-len(parts) :] == parts:
+                made["panel"] = asked["panel"]
+        if made != asked:
+            raise RunError(
+                "was made otherwise than the study now asks: then "
+                f"{_only(made, asked)}, now {_only(asked, made)}",
+                where=str(job.path),
+                remedy="remove it, or give the study another --out",
+            )
 
 
 def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
@@ -349,4 +350,5 @@ __all__ = [
     "StudyPlan",
     "check_seeds",
     "load_study",
+    "refuse_changed",
 ]

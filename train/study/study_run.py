@@ -23,7 +23,14 @@ from restock.files import write_text
 from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
-from restock.train.study.study import ArmConfig, Pair, StudyEvaluation, StudyJob, StudyPlan
+from restock.train.study.study import (
+    ArmConfig,
+    Pair,
+    StudyEvaluation,
+    StudyJob,
+    StudyPlan,
+    refuse_changed,
+)
 
 Say = Callable[[str], None]
 Engine = Literal["processes", "ray"]
@@ -49,7 +56,7 @@ def run_study(
         if arm.library is not None:
             check_installed()
             resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
-    plan.refuse_changed()
+    refuse_changed(plan)
     for arm in plan.study.arms:
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]
