@@ -28,7 +28,13 @@ from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.version import Version, split_version, version_at
+from restock.ingest.store.version import (
+    Version,
+    name_damaged_entry,
+    refuse_empty_entry,
+    split_version,
+    version_at,
+)
 
 if TYPE_CHECKING:
     import pyarrow.compute as pc
@@ -180,6 +186,8 @@ class Location:
                 if isinstance(version, datetime):
                     version = version_at(table, version, where=self.text)
                 newest = table.version()
+                if self.folder is not None:
+                    refuse_empty_entry(self.folder / name, newest)
                 if version is None or version == newest:
                     return table
                 if not 0 <= version <= newest:
@@ -188,6 +196,8 @@ class Location:
                     )
                 return DeltaTable(self.table(name), version=version, storage_options=self.options)
         except (TableNotFoundError, DeltaError, ValueError) as error:
+            if self.folder is not None and (damaged := name_damaged_entry(self.folder / name)):
+                raise damaged from error
             raise StoreError(
                 f"its table `{name}` cannot be opened"
                 + (f" at version {version}" if version is not None else "")

@@ -31,6 +31,7 @@ _REFUSED = {
     "PARAMETER": "it contains a parameter",
     "POSITIONAL_REFERENCE": "it refers to a column by position: use its name",
 }
+_UNBALANCED = "its brackets do not match: a condition must be one expression over the steps"
 # Macros of DuckDB's own that compute from their arguments alone; the others look around.
 _MACROS = ("list_", "array_")
 _MORE_MACROS = {
@@ -70,10 +71,14 @@ def sandbox() -> duckdb.DuckDBPyConnection:
 def refusal(sql: str, timing: Literal["pre", "post"]) -> str | None:
     """Why this SQL may not be a condition's, or None. Whether it binds is DuckDB's to say."""
     with sandbox().cursor() as connection:
-        query = "SELECT json_serialize_sql(?::VARCHAR)"
-        text = connection.execute(query, [select_of(f"({sql}\n)")]).fetchall()[0][0]
+        query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
+        # What closes our bracket and opens another fits into one kind of them only.
+        both = [select_of(f"({sql}\n)"), select_of(f"[{sql}\n]")]
+        ((text, other),) = connection.execute(query, both).fetchall()
     try:
-        return _read(json.loads(text), timing)
+        return _read(json.loads(text), timing) or (
+            _UNBALANCED if json.loads(other)["error"] else None
+        )
     except RecursionError:
         return "it nests too deeply"
 
@@ -86,7 +91,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
     if len(statements) != 1 or node["type"] != "SELECT_NODE" or len(node["select_list"]) != 1:
         return "it is more than one expression"
     if not _plain_query(node):
-        return "its brackets do not match: a condition must be one expression over the steps"
+        return _UNBALANCED
     for part in _walk(node["select_list"][0]):
         if reason := _refuse(part, timing):
             return reason

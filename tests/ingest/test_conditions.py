@@ -314,6 +314,8 @@ REFUSED = {
     "true), (false": "more than one expression",
     "true) FROM steps WHERE (true": "syntax error",
     "true) UNION ALL SELECT (true": "more than one expression",
+    "false) OR (true": "its brackets do not match",
+    "clearance_m > 1) -- (": "syntax error",
     "true /*": "comment",
     "COLUMNS(*) > 1": "it contains *",
     "$1": "it contains a parameter",
@@ -344,6 +346,7 @@ def test_what_a_stranger_might_write_in_a_condition(sql, tmp_path, monkeypatch):
         "lag(clearance_m, 2) OVER episode > 1 AND list_max([clearance_m, 1.5]) > 1",
         "avg(clearance_m) FILTER (NOT bumped) OVER (episode ROWS 5 PRECEDING) > 1",
         "rank() OVER episode = 1 OR clearance_m BETWEEN 1 AND 2 OR nullif(clearance_m, 2) IS NULL",
+        "'](' <> ')[' AND clearance_m > 1 -- ((",
         "list_filter([clearance_m], lambda x: x > 1)[1] > 1",
     ],
 )
