@@ -19,8 +19,13 @@ T = TypeVar("T")
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
+_IN_MEMORY = {"CREATE", "DROP", "SET", "VARIABLE_SET"}  # of these, and they give no rows
 # A PIVOT whose columns are the data's is several statements to DuckDB; so is a COPY of one.
 _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
+
+
+class NoRows(QueryError):
+    """A statement that gives no rows stands where a query's rows are wanted; it was done."""
 
 
 def query(
@@ -31,6 +36,7 @@ def query(
     Raises:
         StoreError: a file of the store is damaged or missing.
         QueryError: DuckDB refused it, it is no query, or it would write.
+        NoRows: the last statement was done, and gives none.
     """
     try:
         statements = connection.extract_statements(text)
@@ -58,9 +64,11 @@ def query(
         relation = _named(connection, partial(connection.sql, last))
     except duckdb.Error as error:
         raise _translated(error, where) from error
-    if relation is None:
-        raise QueryError(
-            "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
+    if relation is None or statements[-1].type.name in _IN_MEMORY:
+        raise NoRows(
+            "the last statement gives no rows; what it changed is in memory, not in the store",
+            where=where,
+            remedy="end with a SELECT or FROM",
         )
     return relation
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from deltalake import DeltaTable
+from support.stores import one
 
 from restock.errors import StoreError
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from support.stores import one
 
 
 @pytest.fixture(scope="module")

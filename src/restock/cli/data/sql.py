@@ -116,6 +116,7 @@ class SqlCommand:
     def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
         """Questions one after the other: each ends with a semicolon, Ctrl-D ends it all."""
         from restock.cli import output
+        from restock.replay.store.query import NoRows
 
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  (gives the prompt a history)
@@ -133,6 +134,8 @@ class SqlCommand:
                 went_on_after_interrupt()
                 text = ""
                 output.say("stopped")
+            except NoRows:
+                output.say("done, in memory: it lasts until you quit")
             except (QueryError, StoreError) as error:
                 sys.stderr.write(f"{error}\n")
 
