@@ -37,6 +37,11 @@ def recordings_in(path: Path | str) -> list[Path]:
     Raises:
         RecordingError: no such path, or no recording in it.
     """
+    if not str(path).strip():  # to Path, the working directory
+        raise RecordingError(
+            "the path of a recording is empty",
+            remedy='is a variable of the shell not set? "." is the working directory',
+        )
     path = Path(path)
     if path.is_file():
         return [path]

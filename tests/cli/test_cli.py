@@ -191,3 +191,28 @@ def test_an_option_that_would_do_nothing_is_refused(
     assert cli.main(words) == 2
     *_, last = (word for word in words if word.startswith("--"))
     assert last in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["ingest", "", "--store", "s"],
+        ["info", ""],
+        ["start", "", "--out", "s"],
+        ["train", "--panel", "", "--out", "s"],
+        ["train", "--out="],
+        ["compare", "a", "", "--against", "b"],
+        ["report", ""],
+    ],
+    ids=" ".join,
+)
+def test_an_empty_path_is_not_the_working_directory(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(words) == 2
+    assert "variable of the shell not set" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

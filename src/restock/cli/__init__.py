@@ -131,7 +131,7 @@ def _dispatch(args: list[str]) -> int:
 
     import tyro
 
-    from restock.cli.command_line import prepared
+    from restock.cli.command_line import prepared, refuse_empty_paths
     from restock.cli.help import printed
 
     asked = bool({"-h", "--help"} & set(args))
@@ -148,6 +148,8 @@ def _dispatch(args: list[str]) -> int:
             )
     except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
+    if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in args):
+        refuse_empty_paths(parsed)
     with work_goes_on() if verb in PRINTS_ON_THE_WAY else nullcontext():
         code: int | None = parsed.run()
     return int(code or ExitCode.OK)

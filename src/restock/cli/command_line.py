@@ -10,6 +10,7 @@ import types
 import typing
 from collections.abc import Collection, Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -98,6 +99,24 @@ def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> No
             name = field.name.removesuffix("_dir").replace("_", "-")
             raise ConfigError(
                 why, where=f"--no-{name}" if field.default is True else f"--{name}", remedy=remedy
+            )
+
+
+def refuse_empty_paths(command: Any) -> None:
+    """Refuse paths that were given as an empty word: Python takes that for the working directory.
+
+    Raises:
+        ConfigError: there is one; names the option or the argument.
+    """
+    for field in dataclasses.fields(command):
+        value = getattr(command, field.name)
+        if dataclasses.is_dataclass(value):
+            refuse_empty_paths(value)
+        elif Path() in (value if isinstance(value, list | tuple) else (value,)):
+            raise ConfigError(
+                "the path is empty: is a variable of the shell not set?",
+                where=field.name.replace("_", "-"),
+                remedy='give a path; "." is the working directory',
             )
 
 
