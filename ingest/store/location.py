@@ -29,9 +29,10 @@ from deltalake.fs import DeltaStorageHandler
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.version import (
+    LOG,
     Version,
-    name_damaged_entry,
-    refuse_empty_entry,
+    expect_whole,
+    log_damage,
     split_version,
     version_at,
 )
@@ -186,24 +187,29 @@ class Location:
                 if isinstance(version, datetime):
                     version = version_at(table, version, where=self.text)
                 newest = table.version()
-                if self.folder is not None:
-                    refuse_empty_entry(self.folder / name, newest)
                 if version is None or version == newest:
+                    self._expect_whole(name, newest)
                     return table
                 if not 0 <= version <= newest:
                     raise StoreError(
                         f"has no version {version}: its newest is {newest}", where=self.text
                     )
+                self._expect_whole(name, version)
                 return DeltaTable(self.table(name), version=version, storage_options=self.options)
         except (TableNotFoundError, DeltaError, ValueError) as error:
-            if self.folder is not None and (damaged := name_damaged_entry(self.folder / name)):
-                raise damaged from error
+            if self.folder and (known := log_damage(self.folder / name / LOG, where=self.text)):
+                raise known from error
             raise StoreError(
                 f"its table `{name}` cannot be opened"
                 + (f" at version {version}" if version is not None else "")
                 + f": {first_line(error)}",
                 where=self.text,
             ) from error
+
+    def _expect_whole(self, name: str, version: int) -> None:
+        """See that a disk kept a table's commits whole, up to a version; S3 keeps all or none."""
+        if self.folder is not None:
+            expect_whole(self.folder / name / LOG, version, where=self.text)
 
     @cached_property
     def files(self) -> pa.fs.FileSystem:

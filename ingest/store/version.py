@@ -1,25 +1,28 @@
 """Which version of a store: a number, or the moment whose newest version it was.
 
-Every commit to a store makes a version of its transitions table, an entry of the table's log; older
-ones stay readable for as long as the files they need are kept (`RETENTION_HOURS` after they were
-replaced).
+Every commit to a store makes a version of its transitions table; older ones stay readable for as
+long as the files they need are kept (`RETENTION_HOURS` after they were replaced).
 """
 
 from __future__ import annotations
 
 import json
 import re
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
 from restock.errors import StoreError
+from restock.files import first_line
 
 Version = int | datetime
 _TIME = r"\d{4}-\d{2}-\d{2}(?:[T ][\d:.,]+(?:Z|[+-]\d{2}:?\d{2})?)?"
-_LOG = "_delta_log"
+LOG = "_delta_log"  # of a table, its folder
+_LOGGED = re.compile(r"(\d{20})\.(json|checkpoint\.parquet)")
+_SHORT = 1024  # bytes: what a commit of rows says of itself, without a file, is a third of it
 _AFTER_AT = re.compile(rf"(?P<path>.+)@(?P<version>\d+|{_TIME})")
 
 
@@ -78,49 +81,104 @@ def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
     return max(before)
 
 
-def refuse_empty_entry(table: Path, newest: int) -> None:
-    """See that no entry of a table's log up to a version is empty, as one may be after a power
-    failure: Delta's library takes it for a commit without files.
+def expect_whole(log: Path, version: int, *, where: str) -> None:
+    """See that the commits that a version is read from say what they changed.
+
+    Of one that is empty, or cut after what it says of itself, Delta's library says nothing: rows
+    would be missing.
 
     Raises:
-        StoreError: one is; names it.
+        StoreError: one of them does not.
     """
-    first = 0
-    with suppress(OSError, ValueError):  # what was before a checkpoint is in the checkpoint
-        first = json.loads((table / _LOG / "_last_checkpoint").read_text())["version"] + 1
-    for version in range(first, newest + 1):
-        with suppress(FileNotFoundError):
-            entry = _entry(table, version)
-            if entry.stat().st_size <= 2 and not entry.read_text().strip():
-                raise _damaged(entry, "is empty")
-
-
-def name_damaged_entry(table: Path) -> StoreError | None:
-    """Which entry of a table's log is damaged or missing; None where that is not what is wrong."""
-    entries = sorted((table / _LOG).glob("[0-9]" * 20 + ".json"))
-    for place, entry in enumerate(entries):
-        expected = int(entries[0].stem) + place
-        if int(entry.stem) != expected:
-            return _damaged(_entry(table, expected), "is missing")
+    for number in range(version, -1, -1):
+        file = log / f"{number:020}.json"
         try:
-            lines = [line for line in entry.read_text(encoding="utf-8").splitlines() if line]
-            whole = lines and all(isinstance(json.loads(line), dict) for line in lines)
-        except (OSError, ValueError):
-            whole = False
-        if not whole:
-            return _damaged(entry, "is empty" if not entry.stat().st_size else "is damaged")
+            if (log / f"{number:020}.checkpoint.parquet").exists():
+                return
+            short = file.stat().st_size < _SHORT
+            problem = _problem_of_commit(file) if short else None
+        except FileNotFoundError:  # of an older version: it is in a checkpoint of another kind
+            return
+        if problem:
+            raise _damaged(file, problem, where, newest=version)
+
+
+def log_damage(log: Path, *, where: str) -> StoreError | None:
+    """The newest file of a log that is missing or cannot be read, as an error that says what to do;
+    None where there is none."""
+    try:
+        found = [match for one in log.iterdir() if (match := _LOGGED.fullmatch(one.name))]
+        hinted = _hinted_checkpoint(log)
+    except OSError:
+        return None
+    there = {match[0] for match in found}
+    numbers = sorted({int(match[1]) for match in found}, reverse=True)
+    for place, number in enumerate(numbers):
+        commit, checkpoint = (f"{number:020}.{kind}" for kind in ("json", "checkpoint.parquet"))
+        if commit in there and (problem := _problem_of_commit(log / commit)):
+            return _damaged(log / commit, problem, where, newest=numbers[0])
+        if checkpoint in there or number == hinted:
+            if problem := _problem_of_checkpoint(log / checkpoint):
+                needless = all(f"{one:020}.json" in there for one in range(number + 1))
+                return _damaged(log / checkpoint, problem, where, needless=needless)
+        elif (numbers[place + 1] if place + 1 < len(numbers) else -1) != number - 1:
+            return _damaged(log / f"{number - 1:020}.json", "is missing", where)
     return None
 
 
-def _damaged(entry: Path, what: str) -> StoreError:
-    """The error for an entry of a log, and what to do."""
+def _hinted_checkpoint(log: Path) -> int | None:
+    """The version of the checkpoint that a reader looks for first."""
+    try:
+        return int(json.loads((log / "_last_checkpoint").read_bytes())["version"])
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _problem_of_commit(file: Path) -> str | None:
+    try:
+        actions = [json.loads(line) for line in file.read_bytes().splitlines() if line.strip()]
+    except (ValueError, RecursionError):
+        return "is damaged: it is not lines of JSON"
+    if not all(isinstance(action, dict) for action in actions):
+        return "is damaged: it is no commit of Delta"
+    if not actions:
+        return "is empty"
+    said = actions[0].get("commitInfo")
+    if len(actions) == 1 and isinstance(said, dict):
+        ours = str(said.get("operation_name", "")).startswith("restock")
+        # Others write commits that change nothing.
+        if ours or said.get("operation") in ("ADD COLUMN", "CREATE TABLE"):
+            return "is cut: it does not say what it changed"
+    return None
+
+
+def _problem_of_checkpoint(file: Path) -> str | None:
+    try:
+        for _ in pq.ParquetFile(file).iter_batches():
+            pass
+    except FileNotFoundError:
+        return "is missing"
+    except (OSError, pa.ArrowException) as error:
+        return f"cannot be read: {first_line(error)}"
+    return None
+
+
+def _damaged(
+    file: Path, problem: str, where: str, *, newest: int | None = None, needless: bool = False
+) -> StoreError:
+    """`newest` is the number of the last commit; a checkpoint is `needless` where all commits
+    before it are there."""
+    remedy = "where there is none, ingest the recordings into a new store"
+    if newest is not None and file.stem == f"{newest:020}":
+        remedy = (
+            "or delete it: the store is then as it was before this commit, which is the last; then"
+            " run again the command that made it"
+        )
+    elif needless:
+        remedy = "or delete it and _last_checkpoint beside it: the commits say the same"
+    table = file.parent.parent.name
     return StoreError(
-        f"this entry of the store's log {what}: which files belong to the store is not known",
-        where=str(entry),
-        remedy="restore it from a copy of the store; where there is none, ingest the recordings "
-        "into a new store",
+        f"its file {table}/{LOG}/{file.name} {problem}",
+        where=where,
+        remedy=f"restore it from a copy{'; ' if remedy.startswith('where') else ', '}{remedy}",
     )
-
-
-def _entry(table: Path, version: int) -> Path:
-    return table / _LOG / f"{version:020}.json"

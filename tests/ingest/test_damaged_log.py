@@ -1,4 +1,4 @@
-"""A damaged log of a store: the entry is named, and never are fewer rows shown."""
+"""A file of Delta's log that is damaged is named with what to do: rows never just go missing."""
 
 from __future__ import annotations
 
@@ -6,64 +6,102 @@ import shutil
 from pathlib import Path
 
 import pytest
-from deltalake import DeltaTable
-from support.stores import one
+from support.stores import one, shown
 
+from restock import cli
 from restock.errors import StoreError
-from restock.ingest.store.location import RECORDINGS, TRANSITIONS
+from restock.ingest.store import commits
 from restock.ingest.store.writer import StoreWriter
-from restock.replay.store.store import Store
+
+LAST = 4
+DAMAGES = {
+    "empty": lambda content: b"",
+    "blank": lambda content: b"\n\n",
+    "cut": lambda content: content[: len(content) // 2],
+    "cut after its first line": lambda content: content.splitlines(keepends=True)[0],
+    "other bytes": lambda content: bytes(len(content)),
+    "no commit": lambda content: b"[]\n",
+}
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("log") / "store"
-    writer = StoreWriter(path)
-    for number in range(1, 4):
-        writer.write(*one(number))
+    """Tables of five versions; `transitions` begins with a checkpoint of the third."""
+    place = tmp_path_factory.mktemp("whole") / "s"
+    writer = StoreWriter(place)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(commits, "CHECKPOINT_COMMITS", 3)
+        for number in range(1, LAST + 1):
+            writer.write(*one(number))
+    return place
+
+
+def damaged(whole: Path, place: Path, file: str, how: str) -> Path:
+    shutil.copytree(whole, place)
+    path = place / file
+    path.write_bytes(DAMAGES[how](path.read_bytes()))
     return path
 
 
-@pytest.fixture
-def store(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "store"))
-
-
-def _entry(store: Path, table: str, version: int) -> Path:
-    return store / table / "_delta_log" / f"{version:020}.json"
-
-
-@pytest.mark.parametrize("table", [TRANSITIONS, RECORDINGS])
-@pytest.mark.parametrize("version", [0, 2, 3])
 @pytest.mark.parametrize(
-    ("content", "what"),
+    ("table", "number", "how"),
     [
-        (b"", "is empty"),  # after a power failure
-        (b"\n", "is empty|is damaged"),
-        (b'{"add": {"path', "is damaged"),
-        (b"[]\n", "is damaged"),
-        (b"\xff\x00\xfe", "is damaged"),
+        *(("transitions", LAST, how) for how in DAMAGES),
+        *[("transitions", 3, "empty"), ("recordings", 3, "cut"), ("recordings", LAST, "empty")],
     ],
 )
-def test_a_damaged_entry_of_the_log_is_named(
-    store: Path, table: str, version: int, content: bytes, what: str
-) -> None:
-    entry = _entry(store, table, version)
-    entry.write_bytes(content)
-    with pytest.raises(StoreError, match=f"this entry of the store's log ({what})") as refused:
-        Store(store)
-    assert str(refused.value).startswith(str(entry))
-    assert "restore it from a copy" in str(refused.value)
+def test_a_damaged_commit_is_named(whole, tmp_path, table, number, how):
+    file = f"{table}/_delta_log/{number:020}.json"
+    path = damaged(whole, tmp_path / "s", file, how)
+    with pytest.raises(StoreError) as caught:
+        shown(tmp_path / "s")
+    assert f"{tmp_path / 's'}: its file {file} is " in str(caught.value)
+    if number < LAST:
+        assert "ingest the recordings into a new store" in str(caught.value)
+        return
+    assert "or delete it: the store is then as it was before this commit" in str(caught.value)
+    path.unlink()
+    assert len(shown(tmp_path / "s")) == (LAST if table == "recordings" else LAST - 1)
+    StoreWriter(tmp_path / "s").write(*one(number, "again"))
+    assert len(shown(tmp_path / "s")) == LAST
 
 
-def test_a_missing_entry_of_the_log_is_named(store: Path) -> None:
-    _entry(store, TRANSITIONS, 2).unlink()
-    with pytest.raises(StoreError, match=f"{2:020}.json: this entry of the store's log is missing"):
-        Store(store)
+@pytest.mark.parametrize("verb", [["check"], ["audit"], ["compact"]])
+def test_every_verb_names_it(whole, tmp_path, capsys, verb):
+    file = f"transitions/_delta_log/{LAST:020}.json"
+    damaged(whole, tmp_path / "s", file, "empty")
+    assert cli.main([*verb, str(tmp_path / "s")]) == 2
+    assert f"{file} is empty" in capsys.readouterr().err
 
 
-def test_an_empty_entry_before_a_checkpoint_is_not_needed(store: Path) -> None:
-    DeltaTable(store / TRANSITIONS).create_checkpoint()
-    _entry(store, TRANSITIONS, 1).write_bytes(b"")
-    with Store(store) as opened:
-        assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(3,)]
+def test_a_commit_that_is_missing_among_others_is_named(whole, tmp_path):
+    path = damaged(whole, tmp_path / "s", f"transitions/_delta_log/{3:020}.json", "empty")
+    path.unlink()
+    with pytest.raises(StoreError, match=rf"_delta_log/{3:020}.json is missing"):
+        shown(tmp_path / "s")
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "missing"])
+def test_a_damaged_checkpoint_is_named_and_can_do_without(whole, tmp_path, how):
+    log = tmp_path / "s" / "transitions" / "_delta_log"
+    file = log / f"{2:020}.checkpoint.parquet"
+    name = file.relative_to(tmp_path / "s").as_posix()
+    damaged(whole, tmp_path / "s", name, "empty" if how == "missing" else how)
+    if how == "missing":
+        file.unlink()
+    with pytest.raises(StoreError) as caught:
+        shown(tmp_path / "s")
+    assert f"its file {name} {'is missing' if how == 'missing' else 'cannot be read'}" in str(
+        caught.value
+    )
+    assert "delete it and _last_checkpoint beside it" in str(caught.value)
+    file.unlink(missing_ok=True)
+    (log / "_last_checkpoint").unlink()
+    assert len(shown(tmp_path / "s")) == LAST
+
+
+def test_a_commit_that_a_checkpoint_has_may_be_damaged_but_for_older_versions(whole, tmp_path):
+    damaged(whole, tmp_path / "s", f"transitions/_delta_log/{1:020}.json", "empty")
+    assert len(shown(tmp_path / "s")) == LAST
+    with pytest.raises(StoreError, match=rf"_delta_log/{1:020}.json is empty"):
+        StoreWriter(tmp_path / "s").path.open_table("transitions", 1)
