@@ -18,25 +18,26 @@ T = TypeVar("T")
 
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
-_ALLOWED = {"SELECT", "EXPLAIN", "CREATE", "DROP", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
-_IN_MEMORY = {"CREATE", "DROP", "SET", "VARIABLE_SET"}  # of these, and they give no rows
+_ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
+_WITHOUT_ROWS = {"CREATE", "SET", "VARIABLE_SET"}
+# ANALYZE runs what it explains.
+_GAP = r"(?:\s|--[^\n]*\n|/\*.*?\*/)*"
+_EXPLAIN = re.compile(
+    rf"{_GAP}EXPLAIN\b{_GAP}(?:ANALYZE\b)?{_GAP}(?:\([^()]*\))?", re.IGNORECASE | re.DOTALL
+)
 # A PIVOT whose columns are the data's is several statements to DuckDB; so is a COPY of one.
 _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 
 
-class NoRows(QueryError):
-    """A statement that gives no rows stands where a query's rows are wanted; it was done."""
-
-
 def query(
-    connection: duckdb.DuckDBPyConnection, text: str, *, where: str
+    connection: duckdb.DuckDBPyConnection, text: str, *, where: str, alone: bool = False
 ) -> duckdb.DuckDBPyRelation:
-    """Run one query (the last of several statements).
+    """Run one query (the last of several statements), which is `alone` where nothing is asked of
+    the connection after it: then what only creates or sets is a mistake.
 
     Raises:
         StoreError: a file of the store is damaged or missing.
         QueryError: DuckDB refused it, it is no query, or it would write.
-        NoRows: the last statement was done, and gives none.
     """
     try:
         statements = connection.extract_statements(text)
@@ -45,15 +46,24 @@ def query(
     if not statements:
         raise QueryError("the query is empty", where=where, remedy='try "FROM coverage"')
     for statement in statements:
-        if statement.type.name not in _ALLOWED and not _pivots(statement):
+        if not _reads(connection, statement):
             kind = statement.type.name
             if kind == "MULTI":
                 kind = statement.query.split(maxsplit=1)[0].upper()
+            elif kind == "EXPLAIN":
+                kind = "EXPLAIN of anything but a query"
             raise QueryError(
                 f"{kind} is refused: queries are read-only",
                 where=where,
                 remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
             )
+    if alone and statements[-1].type.name in _WITHOUT_ROWS:
+        raise QueryError(
+            "the last statement gives no rows",
+            where=where,
+            remedy="end with a SELECT or FROM: queries are read-only; what they create or set is"
+            " gone after them",
+        )
     install_named(connection, text)
     if any(_by_commas(connection, statement.query) for statement in statements):
         connection.execute("SET disabled_optimizers = ''")
@@ -64,13 +74,25 @@ def query(
         relation = _named(connection, partial(connection.sql, last))
     except duckdb.Error as error:
         raise _translated(error, where) from error
-    if relation is None or statements[-1].type.name in _IN_MEMORY:
-        raise NoRows(
-            "the last statement gives no rows; what it changed is in memory, not in the store",
-            where=where,
-            remedy="end with a SELECT or FROM",
+    if relation is None:
+        raise QueryError(
+            "the last statement gives no rows", where=where, remedy="end with a SELECT or FROM"
         )
     return relation
+
+
+def _reads(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> bool:
+    """Whether a statement leaves files and the store's views as they are."""
+    if statement.type.name != "EXPLAIN":
+        return statement.type.name in _ALLOWED or _pivots(statement)
+    explained = _EXPLAIN.sub("", statement.query, count=1)
+    try:
+        return all(
+            one.type.name == "SELECT" or _pivots(one)
+            for one in connection.extract_statements(explained)
+        )
+    except duckdb.Error:
+        return False
 
 
 def _pivots(statement: duckdb.Statement) -> bool:
@@ -114,7 +136,12 @@ def _counted(connection: duckdb.DuckDBPyConnection, text: str) -> str:
 
 
 def fetch(
-    connection: duckdb.DuckDBPyConnection, text: str, *, where: str, at_most: int | None = None
+    connection: duckdb.DuckDBPyConnection,
+    text: str,
+    *,
+    where: str,
+    at_most: int | None = None,
+    alone: bool = False,
 ) -> tuple[list[str], list[tuple[Any, ...]], int]:
     """Column names, rows (the first `at_most`), and how many there are; Ctrl-C stops it.
 
@@ -124,7 +151,7 @@ def fetch(
     """
 
     def run() -> tuple[list[str], list[tuple[Any, ...]], int]:
-        relation = query(connection, text, where=where)
+        relation = query(connection, text, where=where, alone=alone)
         try:
             if at_most is None:
                 rows = values(relation)

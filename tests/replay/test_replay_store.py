@@ -15,6 +15,7 @@ from support.paths import ROOT
 from support.stores import TASK, manifest, one, recording_transitions, write_store
 
 import restock
+from restock.cli import main
 from restock.errors import QueryError, StoreError
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
@@ -260,10 +261,36 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
         f"EXPORT DATABASE '{tmp_path}/out'",
         "INSTALL httpfs",
         f"COPY (PIVOT transitions ON condition) TO '{tmp_path}/out.csv'",
+        "DROP VIEW transitions",
+        "DROP VIEW IF EXISTS drops; FROM drops",
+        f"EXPLAIN ANALYZE COPY (SELECT 1) TO '{tmp_path}/out.csv'",
+        f"/* */ explain -- \n ANALYZE /* ( */ COPY (SELECT 1) TO '{tmp_path}/out.csv'; SELECT 1",
+        f"EXPLAIN (ANALYZE) COPY (SELECT 1) TO '{tmp_path}/out.csv'",
+        f"EXPLAIN (ANALYZE /* ) */) COPY (SELECT 1) TO '{tmp_path}/out.csv'",
+        "EXPLAIN ANALYZE CREATE TABLE x AS SELECT 1",
     ):
         with pytest.raises(QueryError, match="read-only"):
             store.sql(text)
     assert list(tmp_path.iterdir()) == []
+    for text in (
+        "FROM drops",
+        "-- (\nEXPLAIN (FORMAT json) SELECT 1",
+        "explain ANALYZE (SELECT 1)",
+    ):
+        assert store.sql(text).columns
+
+
+def test_what_gives_no_rows_is_refused_where_nothing_follows(store_path: Path, capsys) -> None:
+    for text in (
+        "CREATE TABLE mine AS SELECT 1",
+        "SET threads = 1",
+        "SELECT 1; SET VARIABLE x = 2",
+    ):
+        assert main(["sql", str(store_path), text]) == 2
+        said = capsys.readouterr()
+        assert not said.out
+        assert "the last statement gives no rows" in said.err
+    assert main(["sql", str(store_path), "CREATE MACRO more(x) AS x + 1; SELECT more(1) AS n"]) == 0
 
 
 def test_an_episode_of_two_conditions_that_held_as_long_is_of_the_first_by_name(

@@ -77,15 +77,21 @@ class SqlCommand:
                 self._prompt(connection)
             else:
                 text = sys.stdin.read() if self.query in (None, "-") else self.query
-                self._answer(connection, text or "")
+                self._answer(connection, text or "", alone=True)
 
-    def _answer(self, connection: duckdb.DuckDBPyConnection, text: str) -> None:
+    def _answer(
+        self, connection: duckdb.DuckDBPyConnection, text: str, *, alone: bool = False
+    ) -> None:
         from restock.cli import output
         from restock.replay.store.query import fetch
 
         terminal = sys.stdout.isatty() and not (self.json or self.csv)
         columns, values, count = fetch(
-            connection, text, where=str(self.path), at_most=SHOWN_ROWS if terminal else None
+            connection,
+            text,
+            where=str(self.path),
+            at_most=SHOWN_ROWS if terminal else None,
+            alone=alone,
         )
         rows = [dict(zip(columns, row, strict=True)) for row in values]
         if self.json:
@@ -116,7 +122,6 @@ class SqlCommand:
     def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
         """Questions one after the other: each ends with a semicolon, Ctrl-D ends it all."""
         from restock.cli import output
-        from restock.replay.store.query import NoRows
 
         with contextlib.suppress(ImportError):
             import readline  # noqa: F401  (gives the prompt a history)
@@ -134,8 +139,6 @@ class SqlCommand:
                 went_on_after_interrupt()
                 text = ""
                 output.say("stopped")
-            except NoRows:
-                output.say("done, in memory: it lasts until you quit")
             except (QueryError, StoreError) as error:
                 sys.stderr.write(f"{error}\n")
 
