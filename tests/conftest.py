@@ -9,8 +9,13 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from hypothesis import settings
 from support import s3_server as s3
 from support.stores import recording_transitions, write_store
+
+# Times are not asserted: on a loaded machine the first example of a property may take long.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a script: processes that the tests interrupt would inherit it.

@@ -114,7 +114,7 @@ class Maker:
         return int(self.rng.integers(info.min, info.max, dtype=self.dtype(base), endpoint=True))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150, suppress_health_check=list(HealthCheck))
 @given(
     text=definitions(),
     seed=st.integers(0, 2**32),
@@ -139,7 +139,7 @@ def test_any_definition_decodes_as_rosbags_does(
     agree(message, payloads)
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, suppress_health_check=list(HealthCheck))
 @given(
     text=definitions(ros1=True),
     seed=st.integers(0, 2**32),

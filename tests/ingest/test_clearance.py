@@ -35,7 +35,7 @@ def scans(beams: list[int], firsts: list[float], seed: int) -> dict[str, FieldCo
     }
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(st.sampled_from([0, 1, 9, 120]), st.sampled_from([-3.1, 0.0, np.nan])),

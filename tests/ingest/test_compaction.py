@@ -247,7 +247,7 @@ steps = st.lists(
 
 
 @pytest.mark.long  # each step has a test of its own above
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(steps)
 def test_whatever_comes_first_the_summaries_are_true(tmp_path_factory, steps):
     path = tmp_path_factory.mktemp("store") / "s"

@@ -218,7 +218,7 @@ def tables(draw: st.DrawFn) -> pa.Table:
     )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(tables(), st.data())
 def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
     """Steps after t are exchanged for others: the labels of the steps up to t stay."""
@@ -241,7 +241,7 @@ def test_a_pre_condition_does_not_change_when_the_future_does(table, data):
             assert np.array_equal(before, after), condition.name
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(tables(), tables())
 def test_episodes_do_not_see_each_other(first, second):
     index = first.column_names.index("episode_index")

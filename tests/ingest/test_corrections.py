@@ -207,7 +207,7 @@ def test_rows_of_an_older_store_have_no_probability_and_get_none() -> None:
 STRETCHES = st.lists(st.tuples(st.integers(0, 19), st.integers(0, 6), st.booleans()), max_size=5)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(STRETCHES, STRETCHES)
 def test_what_is_said_last_counts_and_nothing_is_said_twice(
     first: list[tuple[int, int, bool]], second: list[tuple[int, int, bool]]

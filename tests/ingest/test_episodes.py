@@ -162,7 +162,7 @@ def test_a_lone_tick_is_no_episode(alone):
     assert found.dropped == ({"a single step between two cuts": 2} if alone else {})
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(
     goals=st.lists(st.tuples(st.floats(0, 6), st.floats(1.5, 5), st.just(1.0)), max_size=4).map(
         sorted

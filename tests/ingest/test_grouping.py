@@ -84,7 +84,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     chunk_size=st.integers(500, 30_000),
     size=st.sampled_from([1, 5_000, 50_000]),
@@ -178,7 +178,7 @@ def test_rows_do_not_depend_on_which_episodes_come_together(
         assert np.array_equal(rows.labels[name], holds), name
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     parts=st.lists(st.lists(st.lists(st.integers(0, 9), max_size=4), max_size=5), max_size=6),
     expected=st.integers(0, 40),

@@ -227,7 +227,7 @@ PATHS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(PATHS, st.integers(0, 2**31), st.floats(0, 0.05))
 def test_every_mission_arrives_in_time_and_on_its_own_leg(moves, seed, noise) -> None:
     rng = np.random.default_rng(seed)

@@ -118,7 +118,7 @@ def texts(true: np.ndarray) -> list[str]:
     return ["slip" if one else "nominal" for one in true]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(episodes(), st.integers(0, 3))
 def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
     holds, true, episode, step = drawn
@@ -151,7 +151,7 @@ def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
     assert one.event_found == sum(near(run, holds) for run in truly)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(episodes(), st.randoms())
 def test_a_truth_that_is_its_own_label_scores_one_and_parts_add_up(drawn, chance):
     holds, true, episode, step = drawn

@@ -42,7 +42,7 @@ def one(
     return limit(of, np.array([command]), np.atleast_2d(clearance), np.array([before]))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
 def test_no_speed_grows_or_turns_round_and_none_is_beyond_the_robot(
     of: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
@@ -59,7 +59,7 @@ def test_no_speed_grows_or_turns_round_and_none_is_beyond_the_robot(
     assert found.intervened[0] == (allowed != proposed).any()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(limits, speeds, clearances, clearances, speeds)
 def test_more_room_never_means_less_speed(
     of: Limits, command: tuple[float, float], near: F64, more: F64, before: tuple[float, float]
@@ -69,7 +69,7 @@ def test_more_room_never_means_less_speed(
     assert (np.abs(roomy) >= np.abs(tight) - 1e-9).all()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
 def test_what_was_allowed_is_allowed_again(
     of: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
@@ -79,7 +79,7 @@ def test_what_was_allowed_is_allowed_again(
     np.testing.assert_allclose(again, once, atol=2e-6)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 6), st.data())
 def test_robots_do_not_see_each_other(count: int, data: st.DataObject) -> None:
     rows = [data.draw(st.tuples(speeds, clearances, speeds)) for _ in range(count)]

@@ -78,7 +78,7 @@ def test_who_walks_toward_a_robot_comes_nearer_by_what_they_walk(bearing_deg, st
     st.floats(-0.24, 0.24),
     st.floats(1.5, 6.0),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_what_stands_does_not_come_nearer_however_the_robot_moves(discs, forward_m, turn, walls):
     """But for what a sector's breadth leaves open: less than what a walk of .5 m/s adds up to."""
     discs = [disc for disc in discs if np.hypot(disc[0], disc[1]) > disc[2] + 0.5]

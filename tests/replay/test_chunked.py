@@ -41,7 +41,7 @@ def memory_for(rows: int) -> int:
     return rows * (4 * WIDTH + 16)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     sizes=st.lists(st.integers(1, 300), min_size=1, max_size=4),
     batch_size=st.integers(1, 10),
@@ -120,7 +120,7 @@ def fifty_thousand(
     return panel(tmp_path_factory.mktemp("panel") / "rows", 50_000)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(picked=st.lists(st.integers(0, 49_999), max_size=60), run=st.integers(0, 49_000))
 def test_rows_are_read_whatever_their_gaps(
     fifty_thousand: Any, picked: list[int], run: int

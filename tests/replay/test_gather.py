@@ -38,7 +38,7 @@ def same(given: torch.Tensor, rows: torch.Tensor, index: torch.Tensor) -> bool:
     return np.array_equal(given.numpy(), rows.numpy()[index.numpy()], equal_nan=True)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(TABLES, st.data())
 def test_gives_the_rows_in_order(table: np.ndarray, data: st.DataObject) -> None:
     rows = torch.from_numpy(table)

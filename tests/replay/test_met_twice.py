@@ -11,7 +11,7 @@ from restock.replay.store.shared_rows import MARKED, MetTwice, occurs_again
 NUMBERS = st.integers(-(2**63), 2**63 - 1)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.lists(st.lists(st.one_of(NUMBERS, st.integers(0, 9)), max_size=40), max_size=6))
 def test_none_that_comes_again_is_missed(parts: list[list[int]]) -> None:
     arrays = [np.array(part, np.int64) for part in parts]

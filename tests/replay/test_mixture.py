@@ -154,7 +154,7 @@ def test_floors_and_caps_hold_and_the_others_take_the_rest() -> None:
         wanted_shares([StratumRule(name="a", cap=0.3)], np.array([10]))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data())
 def test_scaling_keeps_within_bounds_and_sums_to_one(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 8))

@@ -27,7 +27,7 @@ def small_blocks(patch: pytest.MonkeyPatch, held_blocks: int) -> None:
     patch.setattr(packed_file, "WAITING_BYTES", 0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 90), st.integers(0, 4), st.integers(0, 2**32), st.integers(1, 40))
 def test_parts_in_any_order_make_the_same_file(
     tmp_path_factory: pytest.TempPathFactory, count: int, held: int, seed: int, at_once: int

@@ -203,7 +203,7 @@ def test_a_row_that_is_no_number_is_refused(transitions: pa.Table, tmp_path: Pat
     assert len(build_panel(table, uniform(where=where), tmp_path / "p")) == len(table) - 1
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     continues=st.lists(st.booleans(), min_size=1, max_size=40),
     n_step=st.integers(1, 45),

@@ -174,7 +174,7 @@ def test_rows_not_drawn_yet_have_the_largest_priority_so_far() -> None:
     np.testing.assert_allclose(priorities.of(np.array([0, 1, 2, 3])), [7.001, 0.101, 7.001, 1.001])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     sizes=st.lists(st.integers(1, 70), min_size=1, max_size=4),
     batch_size=st.integers(1, 40),
@@ -202,7 +202,7 @@ def test_every_row_drawn_is_of_its_stratum_whatever_the_priorities(
         drawing.update(drawn, 10 ** rng.uniform(-30, 30, batch_size))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     before=st.integers(0, 30),
     batch_size=st.integers(1, 60),
@@ -234,7 +234,7 @@ def test_a_restored_sampler_goes_on_exactly(
         np.testing.assert_array_equal(one, other)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.integers(0, 2**32), st.integers(1, 200), st.integers(0, 300), st.booleans())
 def test_compiled_places_are_those_of_numpy(
     seed: int, chunks: int, draws: int, some_empty: bool

@@ -221,7 +221,7 @@ def weighed_share(panel: Panel, stratum: str, other: str) -> float:
     st.data(),
     st.sampled_from(["pre", "post"]),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_weights_recover_natural_rates_exactly(rows, data, timing):
     """Whatever was kept, and whatever shares it is drawn in: full correction gives the rates."""
     size = len(rows)
@@ -244,7 +244,7 @@ def test_weights_recover_natural_rates_exactly(rows, data, timing):
 
 
 @given(st.lists(st.integers(1, 50), min_size=2, max_size=4), st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_natural_sample_stands_for_itself(rows, data):
     size = len(rows)
     shares = np.array(data.draw(st.lists(st.floats(0.1, 1), min_size=size, max_size=size)))

@@ -75,7 +75,7 @@ def oracle(steps: list[dict[str, Any]], discount: float, n_step: int) -> dict[tu
     return found
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     num_envs=st.integers(1, 4),
     n_step=st.integers(1, 5),
@@ -272,7 +272,7 @@ def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
     assert slips.min() > 100
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     capacity=st.integers(12, 80),
     steps=st.integers(1, 120),

@@ -60,7 +60,7 @@ def check(found: pa.Table, table: pa.Table) -> None:
         assert column.dictionary.to_pylist() == list(dict.fromkeys(values))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(1, 5),
     st.integers(1, 4),

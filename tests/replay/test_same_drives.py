@@ -47,7 +47,7 @@ def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
     return pairs
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     st.lists(
         st.tuples(

@@ -218,7 +218,7 @@ def test_a_state_of_another_rule_is_refused(kind: str) -> None:
         sampler(by_priority=True).load_state_dict({})
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(parts=PARTS, batch_size=st.integers(1, 300), draws=st.integers(1, 200))
 def test_every_batch_is_full_and_every_share_is_met_over_time(
     parts: list[int], batch_size: int, draws: int
@@ -250,7 +250,7 @@ def test_a_quota_of_twelve_is_twelve_in_every_batch() -> None:
         assert ((drawn >= 1000) == (stratum == 1)).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     sizes=st.lists(st.integers(1, 30), min_size=1, max_size=5),
     batch_size=st.integers(1, 90),
@@ -272,7 +272,7 @@ def test_without_replacement_no_row_is_drawn_twice_more_than_another(
         assert all(np.ptp(counts[members]) <= 1 for members in rows)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     steps=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5), st.integers(1, 40)), max_size=8),
     replacement=st.booleans(),

@@ -37,7 +37,7 @@ def rules(draw: st.DrawFn) -> list[StratumRule]:
     return found
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(rules(), st.data())
 def test_wanted_shares_sum_to_one_within_floors_and_caps_or_are_refused(
     given_rules: list[StratumRule], data: st.DataObject
@@ -66,7 +66,7 @@ def test_wanted_shares_sum_to_one_within_floors_and_caps_or_are_refused(
             assert share == pytest.approx(rule.share, abs=1e-6)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_no_stratum_gives_more_than_its_rows_can_bear(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 7))
@@ -97,7 +97,7 @@ def test_no_stratum_gives_more_than_its_rows_can_bear(data: st.DataObject) -> No
         assert plan.scale == pytest.approx(1, abs=1e-6) or room.sum() < 1e-6
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data())
 def test_priorities_part_the_rows(data: st.DataObject) -> None:
     count, size = data.draw(st.integers(0, 30)), data.draw(st.integers(1, 5))
@@ -180,7 +180,7 @@ def test_group_dro_feeds_the_worst_and_starves_none() -> None:
     np.testing.assert_allclose(groups.shares, [0.8, 0.2, 0.0], atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.data())
 def test_adaptive_shares_stay_within_floor_and_ceiling(data: st.DataObject) -> None:
     size = data.draw(st.integers(2, 6))

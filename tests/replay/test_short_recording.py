@@ -69,7 +69,7 @@ def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, caps
     assert not Panel.open(tmp_path / "panel").splits
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     lengths=st.lists(st.integers(1, 120), min_size=1, max_size=4),
     share=st.floats(0.05, 0.5),

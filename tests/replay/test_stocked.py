@@ -99,7 +99,7 @@ def strata_of_episodes(count: int) -> list[ResolvedStratum]:
     return [ResolvedStratum(rule, "true", None, i, "pre", "none") for i, rule in enumerate(rules)]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.data())
 def test_every_condition_that_can_have_an_episode_of_its_own_has_one(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 5), label="strata")

@@ -161,7 +161,7 @@ def test_a_panel_without_the_text_needs_the_file_as_before(folder: Path) -> None
         profile_of_panel(carrying(folder, ""))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     doc=st.text(),
     age_s=st.one_of(st.none(), st.just(float("inf")), st.floats(1e-9, 1e9)),

@@ -50,7 +50,7 @@ def closest(
     return traffic
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(places, places, angles, places, places, angles, st.booleans())
 def test_the_distance_is_that_of_the_outlines(
     x: float, y: float, yaw: float, px: float, py: float, heading: float, truck: bool

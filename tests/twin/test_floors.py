@@ -54,7 +54,7 @@ KINDS_OF_FLOOR = st.sampled_from(sorted(RECIPES))
 
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_on_a_generated_floor_every_goal_is_reached_from_every_aisle(seed: int, kind: str) -> None:
     floor = generate(seed, RECIPES[kind])
     assert floor == generate(seed, RECIPES[kind])
@@ -86,7 +86,7 @@ def test_the_splits_share_no_floor() -> None:
 
 
 @given(seed=SEEDS, kind=KINDS_OF_FLOOR)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 def test_a_floor_survives_toml_and_an_occupancy_map(
     seed: int, kind: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -46,7 +46,7 @@ def test_packed_odometry_is_what_rosbags_serialises() -> None:
     names=st.lists(st.sampled_from(["a", "left_wheel_joint", "x" * 7]), max_size=3),
     ranges=st.lists(st.floats(width=32, allow_nan=False), max_size=5),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_any_shape_packs_as_rosbags_serialises_it(
     frame: str, names: list[str], ranges: list[float]
 ) -> None:
