@@ -164,7 +164,7 @@ def test_a_forecast_holds_as_often_as_it_says(share: float) -> None:
     assert abs(held / 120 - share) < 0.15
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.lists(st.integers(0, 30), min_size=2, max_size=40).filter(any),
     st.integers(1, 5_000),

@@ -72,6 +72,7 @@ def test_what_the_treatment_does_not_name_may_not_differ(tmp_path, capsys, chang
     assert found["outcomes"] == []
 
 
+@pytest.mark.long
 def test_the_target_rule_is_compared_when_it_is_the_treatment(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     second = arm(tmp_path, "b", range(3, 6), config__target__tau=0.1)
