@@ -1,7 +1,7 @@
 """What a new run is refused for, beyond its config's own ranges, before anything is written.
 
-Settings that name what the panel does not have, settings without effect, a teacher that cannot be
-imported, and a run that the machine's memory cannot hold.
+Settings that name what the panel does not have, settings without effect, and a run that the
+machine's memory cannot hold.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from itertools import pairwise
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.train.dqn.config import GIVEN, EnvConfig, PracticeConfig, TrainConfig
+from restock.train.dqn.config import EnvConfig, PracticeConfig, TrainConfig
 from restock.train.feed.logs import check_terms
-from restock.train.feed.teacher import open_teacher
 from restock.train.ring_capacity import row_bytes
 
 _NATURAL = ("floor", "floors", "warmup_episodes", "half_life_episodes", "max_change")
@@ -28,12 +27,9 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
     Raises:
         ConfigError: as the module says; names the setting.
         PanelError: `loss.calibrated` without a return-to-go in the panel.
-        TeacherFailed: the user's class raised an error as it was made.
     """
     _refuse_no_effect(config)
     check_terms(config.loss, panel)
-    if config.teacher.source != GIVEN:
-        open_teacher(config.teacher, task, seed=config.seed)
     _refuse_too_large(config, task)
 
 

@@ -70,6 +70,7 @@ class Prepared:
     resumed: Run | None = None
     from_env_steps: int | None = None  # of an earlier checkpoint than the latest
     teacher: Any = None  # that Python code passed in
+    asked: AskedTeacher | None = None  # that a new run's config names
 
     def open(self) -> Session:
         """Make the run directory (or take up the old one), the twin and the learner.
@@ -78,9 +79,11 @@ class Prepared:
             RunError: another process trains this run; or it cannot go on, and why.
         """
         env = make_twin(self.config, self.profile, self.config.env.num_envs)
-        teacher = open_teacher(
-            self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
-        )
+        teacher = self.asked
+        if teacher is None:
+            teacher = open_teacher(
+                self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
+            )
         if teacher is not None and self.resumed is None:  # refused before anything is written
             teacher.ask(env, env.reset(seed=self.config.seed)[0])
         layouts = _evaluation_layouts(self.config)
@@ -203,6 +206,7 @@ def prepare_new(
         RunError: `out` already exists.
         ConfigError: a config that cannot be used, or no such device.
         PanelError: a panel of another discount, or of a profile that is not at hand.
+        TeacherFailed: the user's class raised an error as it was made.
     """
     check_free(out)
     if isinstance(config, TrainConfig):
@@ -234,10 +238,13 @@ def prepare_new(
     refuse_nothing_to_learn(config.teacher, drivers)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     check_new_run(config, profile.task, panel)
+    asked = None
+    if config.teacher.source != GIVEN:  # made once: it may be large
+        asked = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
     if ring is not None:
         written["ring_capacity"] = ring
-    return Prepared(out, config, profile, panel, written)
+    return Prepared(out, config, profile, panel, written, asked=asked)
 
 
 def prepare_resumed(

@@ -7,7 +7,7 @@ checkpoint, so a run that is resumed goes on exactly as it would have.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -22,7 +22,7 @@ from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.dqn.behaviour import PolicyNetwork
-from restock.train.dqn.config import TrainConfig
+from restock.train.dqn.config import TrainConfig, by_path
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score, fixed_episodes
@@ -245,23 +245,14 @@ def _refuse_edited(run: Run, before: Mapping[str, Any] | None) -> None:
     """
     if before is None:
         return
-    now = dict(_settings(run.document["config"]))
-    for key, value in _settings(before):
+    now = dict(by_path(run.document["config"]))
+    for key, value in by_path(before):
         if key in now and now[key] != value and key not in _MAY_CHANGE:
             raise RunError(
                 f"{key} is {now[key]}, but the run was trained with {value}",
                 where=str(run.path / "config.json"),
                 remedy="put it back, or train a new run with the other value",
             )
-
-
-def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each key of a config by its path, as `--set` names it."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _settings(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:

@@ -6,7 +6,7 @@ same, or the comparison says nothing about it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
@@ -19,6 +19,7 @@ import pyarrow as pa
 from restock.arrays import F64
 from restock.errors import RunError
 from restock.train.comparison.comparability import Feed
+from restock.train.dqn.config import by_path
 from restock.train.dqn.removed_settings import without_removed
 from restock.train.run.run import Run
 
@@ -248,7 +249,8 @@ def differences(first: Run, second: Run) -> list[Difference]:
 def _settings(run: Run) -> dict[str, Any]:
     """What `config.json` says of a run, by dotted name."""
     config = without_removed(run.document.get("config", {}))
-    return dict(_flat({**run.document, "config": config}))
+    document = {**run.document, "config": config}
+    return dict(by_path({key: document[key] for key in document if key not in _NO_SETTING}))
 
 
 def kind_of(setting: str) -> Kind:
@@ -258,16 +260,6 @@ def kind_of(setting: str) -> Kind:
         if (kind := _KINDS.get(".".join(parts[:length]))) is not None:
             return kind
     return "algorithm"
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in values.items():
-        if not prefix and key in _NO_SETTING:
-            continue
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
 
 
 __all__ = [

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,7 +26,6 @@ from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
 from restock.train.twin.physics.perturbation import find_perturbation
 
 RENAMED = {"guide": "jump_start"}  # keys of earlier versions
-DEFAULT_RULE = "polyak"  # of the target
 GIVEN = "given"  # the source of a teacher that Python code passed in
 
 Count = Annotated[int, Meta(ge=1)]
@@ -309,6 +308,15 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     return overrides
 
 
+def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each nested setting by its path, as `--set` names it."""
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from by_path(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
 def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """A typed config from plain values.
 
@@ -335,7 +343,7 @@ def _apply(document: dict[str, Any], override: str) -> None:
         value = text  # a bare word is a string
     *sections, last = key.strip().split(".")
     if sections == ["target"]:  # a setting of the default rule, unless a rule is named
-        document.setdefault("target", {"rule": DEFAULT_RULE})
+        document.setdefault("target", {"rule": msgspec.to_builtins(TrainConfig().target)["rule"]})
     for section in sections:
         document = document.setdefault(section, {})
         if not isinstance(document, dict):
@@ -351,6 +359,7 @@ __all__ = [
     "TrainConfig",
     "apply_overrides",
     "as_overrides",
+    "by_path",
     "load_config",
     "parse_config",
 ]
