@@ -9,8 +9,10 @@ runs (docs/evidence.md):
     lead          the same for four times the steps: where the lead of quotas ends
     ring          a small ring of fresh rows, with and without its reserve
     practice      the twin can make it: practice by success, quotas on the logs, both, neither
+    archive       the first again, with the incidents in a store of their own, weighted back to the
+                  day's rates; and against half of the logged rows from it, as kept
 
-Records what a question needs of the stand-in fleet (a day of hours, and for the first three an
+Records what a question needs of the stand-in fleet (a day of hours, and for all but `practice` an
 archive of incident bags) and ingests it, then runs the study. What is there is not done again: the
 same command goes on where it was cut off. Ends in OUT/NAME/study.md. `--primary` runs the two arms
 of the primary contrast only, with all seeds; without it the same command adds the others. `--quick`
@@ -43,7 +45,7 @@ from restock.train.study.study import DONE, Study, StudyPlan, load_study
 from restock.train.study.study_run import run_study
 
 HERE = Path(__file__).parent / "evidence"
-QUESTIONS = ("twin-nominal", "lead", "ring", "practice")
+QUESTIONS = ("twin-nominal", "lead", "ring", "practice", "archive")
 RATES = "odom=10,imu=10,scan=5,joint_states=5,amcl_pose=5,tf=5,bumper=5"
 RARE = ("wheel_slip", "blocked_aisle", "near_collision")
 
@@ -55,6 +57,8 @@ class Logs:
     rare_share: float  # of the missions, each rare kind
     first_seed: int
     incidents: int  # missions of each rare kind
+    folder: str
+    archive: str | None = None  # a store of the incidents alone; else they are in the day's
 
     @property
     def conditions(self) -> str:
@@ -63,7 +67,11 @@ class Logs:
         return ",".join(f"{kind}={share:.4g}" for kind, share in shares.items())
 
 
-LOGS = {"store-rare": Logs(1 / 250, 100, 30), "store-natural": Logs(0.04, 200, 0)}
+LOGS = {
+    "store-rare": Logs(1 / 250, 100, 30, "logs-rare"),
+    "store-natural": Logs(0.04, 200, 0, "logs-natural"),
+    "store-day": Logs(1 / 250, 100, 30, "logs-rare", archive="store-incidents"),
+}
 
 
 def main() -> int:
@@ -92,10 +100,11 @@ def _answer(options: argparse.Namespace) -> int:
     out = options.out
     if options.quick:
         study, out = quick(study), out / "quick"  # its recordings are others
-    store = out / str(study.store)
-    _make_store(store, LOGS[str(study.store)], hours, options.workers, options.quick)
+    store, logs = out / str(study.store), LOGS[str(study.store)]
+    _make_stores(store, logs, hours, options.workers, options.quick)
     study = msgspec.structs.replace(study, store=str(store.resolve()))
-    plan = StudyPlan(study, HERE, out / options.question)
+    mixtures = HERE if logs.archive is None else _beside_the_stores(options.question, out)
+    plan = StudyPlan(study, mixtures, out / options.question)
     if small := too_small(plan, power_of(plan)):
         _say(small)
     comparisons = run_study(plan, workers=options.workers, say=_say)
@@ -132,37 +141,54 @@ def quick(study: Study) -> Study:
     )
 
 
-def _make_store(store: Path, logs: Logs, hours: int, workers: int, small: bool) -> None:
+def _beside_the_stores(question: str, out: Path) -> Path:
+    """Copies of a question's mixtures where the stores are: a mixture's path starts at its file."""
+    folder = out / "mixtures"
+    folder.mkdir(parents=True, exist_ok=True)
+    for mixture in (HERE / question).glob("*.toml"):
+        write_text(folder / mixture.name, mixture.read_text(encoding="utf-8"))
+    return folder
+
+
+def _make_stores(store: Path, logs: Logs, hours: int, workers: int, small: bool) -> None:
     """Record and ingest what is not there yet: a store that was cut short goes on.
 
     Raises:
-        SystemExit: the store is of other recordings than are asked for.
+        SystemExit: a store is of other recordings than are asked for.
     """
-    folder = store.parent / store.name.replace("store", "logs")
+    folder = store.parent / logs.folder
     folder.mkdir(parents=True, exist_ok=True)
-    asked = [
+    minutes = "10" if small else "60"
+    day = [
         (
             folder / f"hour{hour:02}.mcap",
-            ["--minutes", "60", "--seed", str(logs.first_seed + hour)],
+            ["--minutes", minutes, "--seed", str(logs.first_seed + hour)],
             logs.conditions,
         )
         for hour in range(1, hours + 1)
     ]
-    if small:
-        asked = [(path, ["--minutes", "10", *flags[2:]], told) for path, flags, told in asked]
-    incidents = 3 if small and logs.incidents else logs.incidents
-    if incidents:
-        asked += [
-            (
-                folder / f"incidents_{kind}.mcap",
-                [
-                    *("--missions", str(incidents), "--seed", str(logs.first_seed + 50 + number)),
-                    *("--tag", "archive=incidents"),
-                ],
-                f"{kind}=1",
-            )
-            for number, kind in enumerate(RARE)
-        ]
+    missions = 3 if small and logs.incidents else logs.incidents
+    incidents = [
+        (
+            folder / f"incidents_{kind}.mcap",
+            [
+                *("--missions", str(missions), "--seed", str(logs.first_seed + 50 + number)),
+                *("--tag", "archive=incidents"),
+            ],
+            f"{kind}=1",
+        )
+        for number, kind in enumerate(RARE)
+        if missions
+    ]
+    if logs.archive is None:
+        _make_store(store, [*day, *incidents], workers)
+    else:
+        _make_store(store, day, workers)
+        _make_store(store.with_name(logs.archive), incidents, workers)
+
+
+def _make_store(store: Path, asked: list[tuple[Path, list[str], str]], workers: int) -> None:
+    """Of recordings: their paths, flags and conditions."""
 
     def make() -> None:
         with ThreadPoolExecutor(workers) as pool:
