@@ -1,6 +1,7 @@
 """Faults planted in logs, and what `restock diagnose --before-training` makes of them.
 
     python benchmarks/planted_row_faults.py --out /tmp/row_faults sample_logs more_logs/*.mcap
+    python benchmarks/planted_row_faults.py --out /tmp/row_faults sample_logs --unchanged
 
 A fault is planted where its like arises: in the signals, between a recording's messages and the
 observation, so that observations, actions, rewards and labels all agree with it, as with a wrong
@@ -8,7 +9,9 @@ profile or a wrong clock; or in the rows of a store, as by software that rewrite
 shares of missions or rows, scales and steps. The recordings as they are must be healthy.
 
 The limits were fixed on the types of TUNED and on healthy logs; those of LEFT_OUT were planted
-once, when the limits stood.
+once, when the limits stood, and those of LATER once, when it was changed what rows on ice count.
+
+`--unchanged` records the UNCHANGED logs, which nothing is planted in, and judges those.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pyarrow as pa
-from harness import finish, markdown, once, option_parser
+from harness import finish, markdown, once, option_parser, run_restock
 
 from restock.ingest.containers.discover import recordings_in
 from restock.ingest.pipeline import ingest
@@ -73,6 +76,16 @@ def scale(*names: str, by: float, share: float = 1.0) -> Signalled:
             filling.signals[name] = np.where(inside, column * by, column)
 
     return plant
+
+
+def in_recordings(share: float, plant: Signalled) -> Signalled:
+    """In a share of the recordings, as by one robot of a fleet."""
+
+    def planted(filling: Filling, rng: np.random.Generator) -> None:
+        if rng.random() < share:
+            plant(filling, rng)
+
+    return planted
 
 
 def later(*names: str, steps: int, share: float = 1.0) -> Signalled:
@@ -250,8 +263,36 @@ LEFT_OUT = [
       for s in (0.3, 0.6)),
     Fault("waypoints mirrored", "all", "SENSOR_MIRRORED.*plan", routed=scale(*WAYPOINTS, by=-1)),
 ]  # fmt: skip
+LATER = [
+    Fault("gyroscope reversed", "all", "SENSOR_MIRRORED.*gyro", scale(SPIN, by=-1)),
+    Fault("gyroscope reversed", "in 50% of recordings", "gyro",
+          in_recordings(0.5, scale(SPIN, by=-1))),
+    Fault("gyroscope scaled", "by 2 in 50% of recordings", "gyro",
+          in_recordings(0.5, scale(SPIN, by=2))),
+    Fault("wheels scaled", "by 0.7 in 50% of recordings", "wheels",
+          in_recordings(0.5, scale(*WHEELS, by=0.7))),
+    Fault("commands scaled", "by 0.5", "COMMAND_SCALED", scale(*COMMAND, by=0.5)),
+    Fault("wheels late", "2 steps", "SENSOR_SHIFTED.*wheels", later(*WHEELS, steps=2)),
+    Fault("lidar halved", "all", "lidar|clearances", lidar(lambda seen: 0.5 * seen)),
+]  # fmt: skip
 NOTHING = Fault("nothing", "", "")
-SETS = {"healthy": [NOTHING], "tuned": TUNED, "left out": LEFT_OUT}
+SETS = {"healthy": [NOTHING], "tuned": TUNED, "left out": LEFT_OUT, "later": LATER}
+MOSTLY = {"slippery": "wheel_slip", "blocked": "blocked_aisle", "crowded": "near_collision"}
+UNCHANGED = {  # name: arguments of `restock record`
+    **{f"plain{n}": ("25", 700 + n, ()) for n in range(1, 7)},
+    **{
+        f"{name}{n}": ("30", seed + n, ("--conditions", f"nominal=.3,{kind}=.7"))
+        for seed, (name, kind) in zip((710, 720, 730), MOSTLY.items(), strict=True)
+        for n in (1, 2)
+    },
+    "operator": ("25", 741, ("--policy", "operator")),
+    "planner": ("25", 742, ("--policy", "planner")),
+    "random": ("25", 743, ("--policy", "random")),
+    "floors": ("25", 744, ("--layouts", "generated:train")),
+    "floors2": ("25", 745, ("--layouts", "generated:test")),
+    "payload": ("25", 746, ("--perturbation", "payload")),
+    "friction": ("25", 747, ("--perturbation", "friction")),
+}
 OUTCOMES = ("named", "named otherwise", "UNDETERMINED", "HEALTHY")
 
 
@@ -315,6 +356,17 @@ def rewrite(
             target.write(with_columns(manifest, **named), copied)
 
 
+def unchanged(out: Path) -> list[Path]:
+    """Recordings without a fault, made once: all kinds of missions, drivers, floors and loads."""
+    paths = []
+    for name, (missions, seed, flags) in UNCHANGED.items():
+        paths.append(out / f"{name}.mcap")
+        if not paths[-1].exists():
+            where = ["--out", str(paths[-1]), "--missions", missions, "--seed", str(seed)]
+            run_restock(["record", *where, *flags])
+    return paths
+
+
 def outcome(fault: Fault, verdict: str, findings: list[Finding]) -> str:
     if verdict != "BUFFER":
         return verdict
@@ -329,8 +381,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="where stores go")
     parser.add_argument("--sets", default=",".join(SETS), help="of healthy, tuned, left out")
     parser.add_argument("--types", default="", help="only those with this in their name")
+    parser.add_argument("--unchanged", action="store_true", help="only unchanged logs, and more")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.unchanged:
+        options.sets, options.logs = "healthy", [*options.logs, *unchanged(options.out)]
     twin = drive_twin(PROFILE.task, PROFILE.conditions)
     counts: dict[str, dict[tuple[str, str], Counter[str]]] = {}
     details = []

@@ -31,6 +31,7 @@ from restock.stats import ConfidenceInterval
 from restock.train.comparison.diagnose import Diagnosis
 from restock.train.comparison.rows_verdict import with_rows
 from restock.train.comparison.windows import Cause
+from restock.train.diagnosis import twin_rows
 from restock.train.diagnosis.answers import GAIN, Answer
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
 from restock.train.diagnosis.causes import findings
@@ -47,6 +48,7 @@ from restock.train.twin.calibration.twin_gap import (
     trust_verdict,
     write_gap,
 )
+from restock.train.twin.drivers.policies import RandomPolicy
 
 Plant = Callable[[FedRows], FedRows]
 
@@ -195,6 +197,53 @@ def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
     found = diagnose_rows(replace(logs, action=_swapped(logs).action), twin).findings
     assert [one.cause for one in found] == ["ACTIONS_CHANGED"]
     assert "profile" not in found[0].remedy
+
+
+def test_a_fault_of_one_robot_is_named_with_its_recording(logs: FedRows, twin: FedRows) -> None:
+    """Of all rows together a third is wrong, by less than what is allowed."""
+    fleet = replace(logs, recording=np.array([f"r{one % 3}" for one in logs.episode]))
+    assert diagnose_rows(fleet, twin).verdict == "HEALTHY"
+    first, slip = map(logs.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
+    wrong = fleet.recording == "r2"
+    made = [fleet.observation.copy(), fleet.next_observation.copy()]
+    for held in made:
+        held[wrong, slip] -= 0.5 * held[wrong, first]
+        held[wrong, first] *= 1.5
+    found = diagnose_rows(replace(fleet, observation=made[0], next_observation=made[1]), twin)
+    assert [one.cause for one in found.findings] == ["SENSOR_SCALED"]
+    assert "in 1 of 3 recordings (r2): the scale of the logs' gyroscope is 1." in (
+        found.findings[0].text
+    )
+    assert all(check.endswith(", r2") for check in found.findings[0].evidence)
+    assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
+
+
+def test_a_lidar_whose_ranges_are_scaled_is_named(logs: FedRows, twin: FedRows) -> None:
+    names = logs.task.observation_names
+    sectors = [
+        place for place, name in enumerate(names) if name.startswith(("clearance_", "closing_"))
+    ]
+    made = [logs.observation.copy(), logs.next_observation.copy()]
+    for held in made:  # entries are roots of clearances
+        held[:, sectors] *= np.sqrt(0.5)
+    found = diagnose_rows(replace(logs, observation=made[0], next_observation=made[1]), twin)
+    assert [one.cause for one in found.findings] == ["LIDAR_SCALED"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("logged", ["ice", "random driver"])
+def test_ice_and_aimless_driving_are_no_faults(
+    twin: FedRows, logged: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On ice the robot turns later than its wheels; who drives elsewhere does not shorten the way
+    to go by his speed. Both were named as faults of a sensor."""
+    if logged == "ice":
+        monkeypatch.setattr(twin_rows, "KINDS", ("nominal", "wheel_slip"))
+    else:
+        monkeypatch.setattr(twin_rows, "Handover", lambda *_: RandomPolicy(seed=9))
+    found = diagnose_rows(_drive(seed=9), twin)
+    assert found.findings == []
+    assert not any(row.off for row in found.comparisons)
 
 
 def test_half_of_the_rows_swapped_is_seen(logs: FedRows, twin: FedRows) -> None:

@@ -46,6 +46,11 @@ class Answer:
     def off(self) -> bool:
         return any(one.off for one in self.comparisons)
 
+    @property
+    def fine(self) -> bool:
+        """Neither off nor undecided."""
+        return all(one.status in ("ok", "not run") for one in self.comparisons)
+
     def is_off(self, figure: str) -> bool:
         """Whether its `gain`, `delay` or `unexplained` is."""
         return any(one.off and one.check.startswith(figure) for one in self.comparisons)
@@ -60,9 +65,9 @@ def answers(logs: FedRows, twin: FedRows | None, seed: int = 0) -> list[Answer]:
 def _answer(
     relation: Relation, logs: FedRows, twin: FedRows | None, rng: np.random.Generator
 ) -> Answer:
-    without_slip = relation.tells_without_slip(logs)
-    found = relation.fit(logs, rng, without_slip)
-    expected = relation.fit(twin, rng, without_slip) if twin is not None else None
+    leave_out = relation.slip_to_leave_out(logs)
+    found = relation.fit(logs, rng, leave_out)
+    expected = relation.fit(twin, rng, leave_out) if twin is not None else None
     name, what = relation.name, f"answer of the {relation.name}"
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")

@@ -20,6 +20,7 @@ from restock.ingest.task.conditions import Condition
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.store.store import Store, is_store, profiles_of
 from restock.train.diagnosis.answers import answers, permuted_actions
+from restock.train.diagnosis.by_recording import unlike_recordings
 from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows, of_panel, of_store
@@ -125,7 +126,13 @@ def diagnose_rows(
     others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
     found = findings(compared, permuted, others, rows.task)
     comparisons = [row for one in compared for row in one.comparisons]
+    comparisons_of = {row.check for row in comparisons}
     comparisons += [row for row, _ in permuted] + others
+    of_answers = [one for one in found if not comparisons_of.isdisjoint(one.evidence)]
+    if of_answers or not found:  # else what is wrong is in the rows, whosesoever
+        own, unlike = unlike_recordings(rows, twin, seed)
+        comparisons += unlike
+        found = [one for one in found if not own or one not in of_answers] + own
     if twin is None:
         comparisons.append(not_run("twin", "rows of the twin", reason))
     verdict: Verdict = "BUFFER" if found else "HEALTHY"

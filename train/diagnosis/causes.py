@@ -43,7 +43,7 @@ _KEYS = {  # where a profile says what fills it
 VALUES = "VALUES_UNLIKE_TWIN"
 _ARRIVAL = ("terminated at the goal", "goal reward")
 FOLLOW_FROM = {  # checks that are off because an end is
-    GYROSCOPE: ("range: gyro_yaw_rate", "spread: gyro_yaw_rate"),
+    GYROSCOPE: ("range: gyro_yaw_rate", "spread: gyro_yaw_rate", "lidar scale"),
     **dict.fromkeys(
         (WHEEL_SPEED, "wheels"),
         ("range: wheel_speed", "spread: wheel_speed", "range: accel_x", "spread: accel_x"),
@@ -51,6 +51,7 @@ FOLLOW_FROM = {  # checks that are off because an end is
     POSE: (
         *("range: localised_speed", "spread: localised_speed", "range: lateral_speed"),
         *("spread: lateral_speed", "range: goal_distance", "spread: goal_distance", *_ARRIVAL),
+        "lidar scale",
     ),
     PLAN: ("range: goal_distance", "spread: goal_distance", *_ARRIVAL),
     ACCELEROMETER: ("range: accel_x", "spread: accel_x"),
@@ -125,7 +126,7 @@ def findings(
 def odd_ends(answers: Sequence[Answer]) -> dict[str, list[Answer]]:
     """The ends (or groups of them) that relations which are off have in common, each with those."""
     left = [one for one in answers if one.off]
-    fine = [one for one in answers if not one.off and one.relation.gain is not None]
+    fine = [one for one in answers if one.fine and one.relation.gain is not None]
     names = dict.fromkeys(end for one in left for end in (one.relation.x, one.relation.y))
     candidates = {name: (name,) for name in names} | GROUPS
     odd: dict[str, list[Answer]] = {}
@@ -390,6 +391,13 @@ KINDS = (
         "the logs' lidar is rotated by {lidar_bearing.effect:+.0f} degrees against the twin's: "
         "what comes nearer when driving forward is not ahead",
         "check the lidar's mounting: [task.body] lidar_yaw_rad, the scan's frame, [inputs.scan]",
+    ),
+    Kind(
+        "LIDAR_SCALED",
+        ("lidar scale",),
+        "the scale of the logs' lidar is {lidar_scale.effect:.2g} times the twin's: so much nearer "
+        "does what is ahead come for each metre driven",
+        "check the unit and the range of [inputs.scan], and [task] range_max_m",
     ),
     Kind(
         "TERMINATIONS_WRONG",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -25,9 +26,13 @@ NOW = np.zeros(1, np.int64)
 _JUMP_RAD = 0.8  # a plan was replaced, not turned
 _SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
 _JUMP_M = 0.6
+_AHEAD = 0.5  # sine of the waypoint's bearing, at most, for the way to be what is driven
 _MOST = 0.5  # of what moves
+_CLEAN = 0.1  # of what moves in a recording, in episodes without slip, for slip to be the floor's
+_FEWEST_EPISODES = 5  # of a recording that is judged by itself
 _NEAR_STEPS = 5
 _FAR = 0.97  # of the lidar's range: nothing was seen
+SlipLeftOut = Literal["episodes", "rows", "none"]
 
 
 @dataclass(frozen=True)
@@ -42,38 +47,68 @@ class Relation:
     gain: float | None = 1.0  # by definition, where there is no twin to ask
 
     def fit(
-        self, rows: FedRows, rng: np.random.Generator, without_slip: bool = False
+        self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
     ) -> Response | None:
         """None where the rows say too little."""
         x, y = self.of(rows)
-        if without_slip:
-            y = y.copy()
-            y[_slips(rows)] = np.nan
+        y = np.where(self._left_out(rows, leave_out), np.nan, y.T).T
         if x.ndim == 2:
             cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
         before = [rows.before(int(lag)) for lag in self.lags]
         return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
 
-    def tells_without_slip(self, rows: FedRows) -> bool:
-        """Whether most of what moves is left when rows labelled as slipping are left out.
+    def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
+        """What of logs to leave out so that a floor does not count as a fault of the robot.
 
-        Where wheels slip, how a robot moves is the floor's; but a sensor that is wrong looks like
-        slip too, and then most of what moves is so labelled.
+        Where wheels slip, how a robot moves is the floor's, also in the rows around those that are
+        labelled: so whole episodes, as long as others remain. But a sensor that is wrong looks
+        like slip too, all the time: then nearly every episode of its recording is so labelled.
         """
+        moves = self._motion(rows)
+        if _on_ice(rows, moves).any():
+            return "episodes"
+        return "rows" if moves[~_near_slip(rows)].sum() >= _MOST * moves.sum() else "none"
+
+    def _left_out(self, rows: FedRows, what: SlipLeftOut) -> Bools:
+        if what == "episodes":
+            return _on_ice(rows, self._motion(rows))
+        return _near_slip(rows) if what == "rows" else np.zeros(len(rows), np.bool_)
+
+    def _motion(self, rows: FedRows) -> F64:
+        """How much each row says of the relation, (N,)."""
         x, y = self.of(rows)
         moves = np.where(np.isfinite(y), x, 0.0) ** 2
-        return bool(moves[~_slips(rows)].sum() >= _MOST * moves.sum())
+        return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
 
 
 def _slips(rows: FedRows) -> Bools:
+    return np.asarray(rows.condition == "wheel_slip", np.bool_)
+
+
+def _near_slip(rows: FedRows) -> Bools:
     """Rows (N,) labelled as slipping, and those a few steps from them."""
-    slips = np.asarray(rows.condition == "wheel_slip", np.bool_)
+    slips = _slips(rows)
     near = slips.copy()
     for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
         place, known = rows.before(lag)
         near |= slips[place] & known
     return near
+
+
+def _on_ice(rows: FedRows, moves: F64) -> Bools:
+    """The rows (N,) of episodes with slip, in recordings that move without slip as well; those of
+    few episodes are judged together."""
+    if not len(rows):
+        return np.zeros(0, np.bool_)
+    _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
+    slipped = np.bincount(episode, _slips(rows)) > 0  # (E,)
+    recording = np.unique(rows.recording[first], return_inverse=True)[1] + 1  # (E,)
+    recording[np.bincount(recording)[recording] < _FEWEST_EPISODES] = 0
+    moved = np.bincount(episode, moves)
+    clean = np.bincount(recording, moved * ~slipped)  # (R,)
+    ice = clean >= np.maximum(_CLEAN * np.bincount(recording, moved), 1e-12)
+    return np.asarray((slipped & ice[recording])[episode], np.bool_)
 
 
 def _speed(rows: FedRows) -> F64:
@@ -110,10 +145,12 @@ def _turned_waypoint(rows: FedRows) -> F64:
 
 
 def _route_speed(rows: FedRows) -> F64:
-    """How fast the way to go became shorter, m/s; NaN where the plan jumped or reads its most."""
+    """How fast the way to go became shorter, m/s; NaN where the plan jumped or reads its most, and
+    where the robot is not headed along it: whoever drives elsewhere does not shorten it."""
     now, after = rows.now("goal_distance"), rows.after("goal_distance")
     shorter = 10.0 * (now - after)
-    shorter[(np.abs(shorter) > _JUMP_M) | (now >= 1.0) | (after >= 1.0)] = np.nan
+    aside = (np.abs(rows.now("near_sin")) > _AHEAD) | (rows.now("near_cos") < 0.0)
+    shorter[(np.abs(shorter) > _JUMP_M) | (now >= 1.0) | (after >= 1.0) | aside] = np.nan
     return np.asarray(shorter / rows.task.control_period_s)
 
 

@@ -22,11 +22,12 @@ from restock.stats import (
 )
 from restock.train.diagnosis.evidence import Comparison, judged, not_run, share_judged
 from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.response import FEWEST_CLUSTERS, RESAMPLES
+from restock.train.diagnosis.response import FEWEST_CLUSTERS, RESAMPLES, ratio_of
 
 BEYOND = 0.02  # of the rows
 SPREAD = 10.0  # of logs over the twin's, or its inverse
 TURNED_DEG = 20.0
+LIDAR_SCALE = 1.5  # of logs over the twin's, or its inverse
 MEASURED = (
     *("wheel_speed", "localised_speed", "lateral_speed", "gyro_yaw_rate", "accel_x"),
     "goal_distance",
@@ -40,7 +41,7 @@ _FAR = 0.97  # of the lidar's range
 
 
 def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
-    """Ranges and spreads of what is measured, then the lidar's bearing."""
+    """Ranges and spreads of what is measured, then the lidar's bearing and scale."""
     if twin is None:
         yield not_run("range", "values against the twin's", "no twin to compare with")
     else:
@@ -48,7 +49,7 @@ def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Compa
         for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
             for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
                 yield replace(row, status="undecided") if few and row.off else row
-    yield _bearing(logs, twin, np.random.default_rng([seed, 3]))
+    yield from _lidar(logs, twin, np.random.default_rng([seed, 3]))
 
 
 def _entry(
@@ -85,11 +86,13 @@ def _entry(
     )  # fmt: skip
 
 
-def _bearing(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Comparison:
-    """By how many degrees the logs' sectors are turned against the twin's (or a cosine)."""
+def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
+    """By how many degrees the logs' sectors are turned against the twin's (or a cosine), and how
+    much nearer things come for each metre driven, compared with the twin."""
     what = "bearing in which things come nearer when driving on"
     if not logs.task.lidar:
-        return not_run("lidar bearing", what, "the robot has no lidar")
+        yield not_run("lidar bearing", what, "the robot has no lidar")
+        return
     task, width = logs.task, 360 / logs.task.sectors
     found = _approach(logs, rng)
     expected = _approach(twin, rng) if twin is not None else None
@@ -98,18 +101,31 @@ def _bearing(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> C
     else:
         shape = np.cos(np.radians((np.arange(task.sectors) + 0.5) * width - 180))
     if found is None or (twin is not None and expected is None):
-        return not_run("lidar bearing", what, "too few rows of driving straight on")
+        yield not_run("lidar bearing", what, "too few rows of driving straight on")
+        return
     turns = np.arange(task.sectors)
     turned = np.stack([np.roll(shape, turn) for turn in turns])  # (turns, sectors)
     fits = found @ turned.T  # (1 + R, turns): how alike, at each turn
     best = fits.argmax(axis=1)
     degrees = np.where(best > task.sectors // 2, best - task.sectors, best) * width
     low, high = percentiles(degrees[1:])
-    return judged(
+    rows, twin_rows = len(logs), len(twin) if twin is not None else 0
+    yield judged(
         "lidar bearing", what, "degrees", ConfidenceInterval(float(degrees[0]), low, high),
         logs=float(degrees[0]), twin=0.0, least=-TURNED_DEG, most=TURNED_DEG,
-        logs_rows=len(logs), twin_rows=len(twin) if twin is not None else 0,
+        logs_rows=rows, twin_rows=twin_rows,
     )  # fmt: skip
+    if expected is not None and twin is not None:
+        nearer, of_twin = fits.max(axis=1), expected @ shape
+        fewer = min(len(np.unique(one.cluster)) for one in (logs, twin))
+        at = float(nearer[0]), float(of_twin[0])
+        norm = float(shape @ shape)
+        yield judged(
+            "lidar scale", "how much nearer things come for a metre driven", "ratio",
+            ratio_of(nearer[1:], of_twin[1:], at, fewer), logs=at[0] / norm, twin=at[1] / norm,
+            least=1 / LIDAR_SCALE, most=LIDAR_SCALE,
+            logs_rows=rows, twin_rows=twin_rows,
+        )  # fmt: skip
 
 
 def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
