@@ -236,6 +236,22 @@ def test_fitted_q_finds_the_exact_values() -> None:
     np.testing.assert_allclose(found[:-1], CHAIN.q(TARGET)[:-1], atol=0.06)
 
 
+def test_a_fitted_value_is_the_mean_of_rare_and_large_rewards() -> None:
+    """One step in ten costs 10, the others pay 1: Huber's loss said that it pays .9 on average."""
+    rows, reward = 1000, np.ones(1000, np.float32)
+    reward[::10] = -10.0
+    seen = Transitions(
+        np.ones((rows, 2), np.float32),
+        np.zeros(rows, np.int64),
+        reward,
+        np.ones((rows, 2), np.float32),
+        np.ones(rows, np.bool_),
+    )
+    policy = np.ones((rows, 1), np.float32)
+    network = fitted_q(seen, policy, discount=DISCOUNT, config=replace(TABULAR, iterations=10))
+    assert values(network, seen.observation[:1])[0, 0] == pytest.approx(-0.1, abs=0.25)
+
+
 def test_fitted_q_is_the_same_again_for_the_same_seed() -> None:
     seen, following = rows(50, 8)
     short = replace(TABULAR, iterations=3)

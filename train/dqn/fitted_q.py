@@ -110,7 +110,8 @@ def fitted_q(
             if bounds is not None:
                 target = target.clamp(*bounds)
             q = network(observation[some]).gather(1, action[some, None])[:, 0]
-            _descend(optimizer, nn.functional.smooth_l1_loss(q, target))
+            # Huber's loss would leave out most of what is rare and large: the value is a mean.
+            _descend(optimizer, nn.functional.mse_loss(q, target))
         decay.step()
         before = clone(network)
     return network
