@@ -105,6 +105,16 @@ def test_a_command_that_is_no_number_is_refused() -> None:
         made.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
 
 
+@pytest.mark.parametrize("index", [-1, 10, 0.7, np.nan])
+def test_an_index_outside_the_table_is_refused(index: float) -> None:
+    """-1 drove the last action, and .7 the first."""
+    made = WarehouseVectorEnv(2)
+    made.reset(seed=0)
+    with pytest.raises(ConfigError, match="environment 1 of the twin: an action must be an index"):
+        made.step(np.array([0, index]))
+    made.step(np.array([0.0, 9.0]))
+
+
 def test_an_unknown_face_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown action space 'velocity'"):
         WarehouseVectorEnv(1, action="velocity")

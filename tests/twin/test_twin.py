@@ -20,6 +20,7 @@ from restock.ingest.task.task import observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.train.run import checkpoint
 from restock.train.twin.drivers.policies import PlannerFollower
+from restock.train.twin.env.single_env import WarehouseEnv
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec
 from restock.train.twin.physics.perturbation import (
@@ -336,12 +337,32 @@ def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: A
         ({"num_envs": 0}, "num_envs must be 1 or more"),
         ({"conditions": {"ice": 1.0}}, "ice"),
         ({"conditions": {"nominal": 0.0}}, "not all 0"),
+        ({"conditions": {"nominal": float("nan")}}, "not all 0"),
+        ({"seed": -1}, "seed must be 0 or more, got -1"),
+        ({"render_mode": "human"}, "unknown render_mode 'human'"),
         ({"perturbation": Perturbation(timestep_s=0.003)}, "does not divide"),
     ],
 )
 def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         WarehouseVectorEnv(**arguments)
+
+
+def test_a_step_needs_a_reset_and_a_mask_an_entry_for_every_environment() -> None:
+    made = WarehouseVectorEnv(2, autoreset_mode="Disabled")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        made.step(np.zeros(2, np.int64))
+    made.reset(seed=1)
+    with pytest.raises(ConfigError, match=r"reset_mask must be of shape \(2,\), got \(1,\)"):
+        made.reset(options={"reset_mask": np.array([True])})
+
+
+def test_the_seed_of_a_single_environment_is_that_of_its_first_reset() -> None:
+    """The seed was replaced by a random one."""
+    first, again = (WarehouseEnv(seed=5).reset()[1]["episode_seed"] for _ in range(2))
+    assert first == again == WarehouseVectorEnv(1, seed=5).reset()[1]["episode_seed"][0]
+    unseeded = {int(WarehouseEnv().reset()[1]["episode_seed"]) for _ in range(2)}
+    assert len(unseeded) == 2
 
 
 def test_an_unknown_kind_of_episode_is_refused() -> None:

@@ -34,8 +34,18 @@ class DiscreteActions:
         self.space = gymnasium.spaces.Discrete(len(task.actions))
 
     def read(self, actions: NDArray[Any]) -> Chosen:
-        """What these actions (N,) are."""
-        action = np.asarray(actions, np.int64).reshape(self._num_envs)
+        """What these actions (N,) are. Raises ConfigError for one that is not in the table."""
+        given = np.asarray(actions).reshape(self._num_envs)
+        with np.errstate(invalid="ignore"):
+            action = given.astype(np.int64)
+        wrong = (action != given) | (action < 0) | (action >= len(self._table))
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            raise ConfigError(
+                f"an action must be an index from 0 to {len(self._table) - 1}, got {given[row]}",
+                where=f"environment {row} of the twin",
+                remedy='for speeds and yaw rates make the environment with action="continuous"',
+            )
         return action, self._table[action], {}
 
 

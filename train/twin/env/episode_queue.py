@@ -59,7 +59,11 @@ class EpisodeQueue(Stateful):
         """Shares per kind of episode, for episodes that begin from now on."""
         unknown = set(conditions) - set(KINDS)
         total = sum(conditions.values())
-        if unknown or min(conditions.values(), default=-1) < 0 or total <= 0:
+        if (
+            unknown
+            or not all(share >= 0 for share in conditions.values())
+            or not 0 < total < np.inf
+        ):
             raise ConfigError(
                 f"conditions {dict(conditions)} are not shares per kind of episode",
                 where="the twin",

@@ -31,7 +31,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any]):
         )
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
-        self._seeded = False
+        self._seeded = "seed" in arguments
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -123,11 +123,17 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
                 a condition's episodes, a robot that cannot be built or is wider than an aisle, no
-                environments, an unknown action space, or an autoreset mode other than SAME_STEP
-                and DISABLED.
+                environments, a seed below 0, an unknown action space or render mode, or an
+                autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
+        if seed < 0:
+            raise ConfigError(f"seed must be 0 or more, got {seed}", where="the twin")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(
+                f"unknown render_mode {render_mode!r}", where="the twin", remedy="give rgb_array"
+            )
         self.num_envs = num_envs
         self.render_mode, self._renderer = render_mode, Renderer(camera)
         self.task = task or load_profile("warehouse_amr").task
@@ -284,6 +290,11 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         super().reset(seed=seed)
         ids = np.arange(self.num_envs)
         mask = (options or {}).get("reset_mask")
+        if mask is not None and np.shape(mask) != (self.num_envs,):
+            raise ConfigError(
+                f"reset_mask must be of shape ({self.num_envs},), got {np.shape(mask)}",
+                where="the twin",
+            )
         if mask is not None and self.signals:
             ids = np.flatnonzero(mask)
         if seed is not None:
@@ -298,6 +309,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
 
     def step(self, actions: NDArray[Any]) -> Step:
         """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
+        if not self.signals:
+            raise gymnasium.error.ResetNeeded("call env.reset() before env.step()")
         now, sim, task = self.signals, self.simulation, self.task
         chosen = self._actions.read(actions)
         if self.limits is not None:
