@@ -121,6 +121,22 @@ def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
     assert measured.rows.terminated.sum() == sum(ends)
 
 
+def test_a_held_out_end_of_an_episode_is_measured_from_its_own_start(tmp_path: Path) -> None:
+    """A contact before it left none of its rows, and the evaluation ended in an IndexError."""
+    with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as opened:
+        found = opened.sql(
+            "SELECT transition_id FROM transitions"
+            " QUALIFY bool_or(bumped AND step_index > 0) OVER (PARTITION BY episode_id ORDER BY"
+            " step_index)"
+        ).fetchnumpy()
+        steps = read_steps(opened.connection, np.asarray(found["transition_id"], np.int64))
+    measured = steps.measured("success")
+    assert len(steps.condition) > 1
+    assert np.unique(measured.episode).tolist() == list(range(len(steps.condition)))
+    first = np.flatnonzero(np.diff(steps.episode, prepend=-1))
+    assert not steps.bumped_before[first].any()
+
+
 def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_none(
     panel: Panel,
 ) -> None:

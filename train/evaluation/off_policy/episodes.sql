@@ -1,13 +1,17 @@
 -- Rows for off-policy evaluation: those whose ids are in `wanted`. What happens before and after a row
--- in its episode is of all its rows, wanted or not. A contact of the last row is known where it
--- terminated the episode, and one that the first row tells of was before it.
+-- in its episode is of all its rows from the first wanted one on. A contact of the last row is known
+-- where it terminated the episode, and one that the first row tells of was before it.
 WITH whole AS (
     SELECT *,
            coalesce(lead(bumped) OVER episode, terminated AND ended_by = 'bump') AS bumps,
-           coalesce(bool_or(bumped AND step_index > 0) OVER episode_so_far, false) AS bumped_before
+           coalesce(bool_or(bumped AND step_index > first_step) OVER episode_so_far, false) AS bumped_before
     FROM transitions
     JOIN (SELECT episode_id, ended_by FROM episodes) USING (episode_id)
-    WHERE episode_id IN (SELECT episode_id FROM transitions JOIN wanted USING (transition_id))
+    JOIN (
+        SELECT episode_id, min(step_index) AS first_step
+        FROM transitions JOIN wanted USING (transition_id)
+        GROUP BY episode_id
+    ) USING (episode_id)
     WINDOW episode AS (PARTITION BY episode_id ORDER BY step_index),
            episode_so_far AS (episode ROWS BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW)
 ), named AS (  -- an episode is of the condition that most of its labelled rows have, of equals the first
