@@ -24,3 +24,6 @@ def test_another_panel_in_its_place_is_refused(tmp_path: Path) -> None:
     assert other.id != fed.id
     with pytest.raises(PanelError, match=f"is panel {other.id}, the run was fed {fed.id}"):
         run_panel(document)
+    out.rename(tmp_path / "moved")
+    with pytest.raises(PanelError, match=rf"the run was fed {fed.id}\n  move it back, or mix it"):
+        run_panel(document)

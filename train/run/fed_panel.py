@@ -19,7 +19,13 @@ def run_panel(document: Mapping[str, Any]) -> Panel | None:
     fed = document.get("panel")
     if fed is None:
         return None
-    panel = Panel.open(Path(fed["path"]))
+    if not (path := Path(fed["path"])).exists():
+        raise PanelError(
+            f"there is no panel here any more; the run was fed {fed.get('id', 'it')}",
+            where=str(path),
+            remedy="move it back, or mix it there again from the same store version and mixture",
+        )
+    panel = Panel.open(path)
     if panel.id != fed.get("id", panel.id):
         raise PanelError(
             f"is panel {panel.id}, the run was fed {fed['id']}",
