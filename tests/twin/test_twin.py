@@ -370,6 +370,12 @@ def test_an_unknown_kind_of_episode_is_refused() -> None:
         EpisodeSpec("fog", 1)
 
 
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_no_generator_takes_is_refused(seed: int) -> None:
+    with pytest.raises(ConfigError, match=r"seed must be from 0 to 2\^63 - 1"):
+        EpisodeSpec("nominal", seed)
+
+
 def test_the_map_is_drawn_with_its_robot() -> None:
     made = WarehouseVectorEnv(1, render_mode="rgb_array")
     made.reset(seed=1)

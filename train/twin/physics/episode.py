@@ -53,6 +53,8 @@ class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(
                 f"unknown kind of episode: {self.condition!r}", remedy=f"one of {', '.join(KINDS)}"
             )
+        if not 0 <= self.seed < 2**63:
+            raise ConfigError(f"an episode's seed must be from 0 to 2^63 - 1, got {self.seed}")
 
 
 @dataclass(frozen=True)
