@@ -282,6 +282,8 @@ def test_what_cannot_be_fitted_is_named(known: Path, capsys: pytest.CaptureFixtu
         assert error in capsys.readouterr().err
     assert cli.main(["twin", "fit", str(known), "--held-out", "1.5"]) == ExitCode.USAGE
     assert "held_out must be in [0, 1), got 1.5" in capsys.readouterr().err
+    assert cli.main(["twin", "fit", str(known), "--out", "fitted.json"]) == ExitCode.USAGE
+    assert "'fitted.json' does not end in .toml" in capsys.readouterr().err
     with pytest.raises(ValueError, match="'grip' cannot be fitted"):
         FitConfig(parameters=("gain", "grip"))
     with pytest.raises(ValueError, match=r"held_out must be in \[0, 1\), got 1"):

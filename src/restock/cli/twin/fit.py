@@ -79,6 +79,12 @@ class FitCommand:
         from restock.train.twin.calibration.fitted_twin import write_fit
         from restock.train.twin.calibration.logged_steps import recordings_of
 
+        if self.out is not None and self.out.suffix != ".toml":
+            raise ConfigError(
+                f"{self.out.name!r} does not end in .toml",
+                where="--out",
+                remedy="training and evaluation read a perturbation from FILE.toml",
+            )
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         with Store(self.store, version=given_version(self.version)) as store:
