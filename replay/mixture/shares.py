@@ -192,10 +192,15 @@ def row_limits(
     limit = np.where(rows > 0, 1.0, 0.0)
     if mixture.max_replays_per_row is not None and draws > 0:
         limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)
-    for index, rule in enumerate(rules):
-        if rows[index] < rule.min_rows or episodes[index] < rule.min_episodes:
-            limit[index] = 0.0
-    return limit
+    return np.where(has_minimum(rules, rows, episodes), limit, 0.0)
+
+
+def has_minimum(rules: Sequence[StratumRule], rows: Ints, episodes: Ints) -> Bools:
+    """Whether each stratum has the rows and episodes below which it gets nothing, (S,)."""
+    enough = (rows >= [rule.min_rows for rule in rules]) & (
+        episodes >= [rule.min_episodes for rule in rules]
+    )
+    return np.asarray(enough, np.bool_)
 
 
 def missing_rows(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.shares import SharePlan, missing_rows, plan_shares
+from restock.replay.mixture.shares import SharePlan, has_minimum, missing_rows, plan_shares
 from restock.replay.plan.exclusions import scramble
 from restock.replay.plan.strata import ResolvedStratum, Stratum
 from restock.replay.plan.weights import (
@@ -94,7 +94,8 @@ def plan_source(
         mixture, rules, rows, episodes, draws=draws, natural=natural, unknown=untold
     )
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
-    drawn = (shares.got > 0) | [not isinstance(rule.share, int | float | str) for rule in rules]
+    scheduled = np.array([not isinstance(rule.share, int | float | str) for rule in rules])
+    drawn = (shares.got > 0) | (scheduled & has_minimum(rules, rows, episodes))
     kept = np.asarray(drawn[source.code], np.bool_)
     code, state = source.code[kept], source.state_code[kept]
     outcome, fit = _outcomes(connection, mixture, strata, source, kept, natural)

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, moment, planned
+from support.panels import EVERY, moment, panel_of, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, EXPOSURES, TASK
 
@@ -203,6 +203,20 @@ def test_a_stratum_below_its_minimum_gets_nothing(transitions: pa.Table) -> None
     assert plan.left_out["in a stratum of share 0"] > 0
     with pytest.raises(MixtureError, match="no stratum has rows"):
         planned(transitions, text.replace("30", "30000"))
+
+
+def test_a_scheduled_stratum_below_its_minimum_has_no_row_in_the_panel(
+    transitions: pa.Table, tmp_path: Path
+) -> None:
+    rule = (
+        "[[strata]]\nname = 'wheel_slip'\nmin_rows = 100000\nshare = {schedule = 'linear',"
+        " start = 0.3, end = 0.1, to_env_steps = 9}\n[correction]\npost = 'none'\n"
+    )
+    panel = panel_of(transitions, rule + EVERY, tmp_path / "panel", conditions=CONDITIONS)
+    [slip] = [number for number, line in enumerate(panel.strata) if line.name == "wheel_slip"]
+    assert panel.strata[slip].share == 0
+    assert panel.header.left_out["in a stratum of share 0"] == panel.strata[slip].rows > 0
+    assert slip not in panel.sampler(64, seed=0).draw().strata
 
 
 def test_rows_of_no_stratum_are_refused_unless_dropped(transitions: pa.Table) -> None:
