@@ -23,6 +23,7 @@ from restock.errors import ConfigError
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
+from restock.replay.panel.panel import Panel
 from restock.replay.places import open_place
 from restock.replay.store import definitions
 from restock.replay.store.audit import (
@@ -744,6 +745,26 @@ def test_a_panel_or_a_run_of_another_store_is_refused(
     moved = shutil.copytree(store_path, tmp_path / "moved")
     with open_place(moved, beside={"panel": panels["time"], "run": run}):
         pass
+
+
+def test_a_panel_that_shares_only_some_recordings_with_the_store_fails(
+    store_path: Path, panels: dict[str, Path], tmp_path: Path
+) -> None:
+    name, panel = "panel_of_another_store", panels["time"]
+    assert beside_panel(store_path, panel, name).status == "pass"
+    part = write_store(tmp_path / "part", [recording_transitions(1), recording_transitions(4)])
+    finding = beside_panel(part, panel, name)
+    assert finding.status == "fail"
+    meta = Panel.open(panel).meta
+    held = meta["recording_id"].to_pylist()
+    absent = sorted(set(held) - {f"{1:016x}"})
+    assert finding.sample == [
+        {"recording_id": one, "missing_rows": held.count(one), "panel_recordings": len(set(held))}
+        for one in absent
+    ]
+    # Rows of the mixture's other stores are not looked for in this one.
+    others = "CREATE OR REPLACE TABLE panel.strata AS SELECT * REPLACE ('b' AS source)"
+    assert beside_panel(part, panel, name, f"{others} FROM panel.strata").status == "pass"
 
 
 def test_junit_is_as_its_readers_expect() -> None:

@@ -1,0 +1,18 @@
+-- severity: error
+-- needs: panel
+-- advice: Audit the panel with the store, or the version of it, that it was made from (`--version`; a panel's `panel.json` names both), or mix it again from this one.
+-- doc: Recordings of the panel of which rows are not in this store: it was made from another store, or from a version that held more. Rows of a mixture's other stores do not count.
+WITH drawn AS (
+    SELECT recording_id, transition_id
+    FROM panel.rows
+    SEMI JOIN (SELECT name AS stratum FROM panel.strata WHERE source = 'logs') USING (stratum)
+)
+SELECT
+    recording_id,
+    count(*) AS missing_rows,
+    any_value(recordings) AS panel_recordings
+FROM drawn
+ANTI JOIN transitions USING (transition_id)
+CROSS JOIN (SELECT count(DISTINCT recording_id) AS recordings FROM drawn)
+GROUP BY recording_id
+ORDER BY recording_id
