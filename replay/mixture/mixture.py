@@ -7,17 +7,16 @@ visible in `restock mix --dry-run`. `docs/mixture.md` explains each key.
 from __future__ import annotations
 
 import itertools
-import tomllib
 from datetime import UTC, datetime, timedelta
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from restock.errors import ConfigError
 from restock.replay.mixture.schedules import Fraction, Portion, Schedule, knots, value_at
-from restock.toml import Checked, typed
+from restock.toml import Checked, parse_toml, read_toml, typed
 from restock.toml_schema import json_schema
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
@@ -327,7 +326,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     if name in shipped_mixtures():
         text = (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
     elif path.is_file():
-        text = path.read_text(encoding="utf-8")
+        return _mixture(read_toml(path), name)
     else:
         raise ConfigError(
             f"there is no mixture {name!r}",
@@ -340,10 +339,10 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
 
 def parse_mixture(text: str, *, where: str = "mixture") -> Mixture:
     """A mixture from TOML text. Raises ConfigError with the path of what is wrong."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}", where=where) from error
+    return _mixture(parse_toml(text, where=where), where)
+
+
+def _mixture(document: dict[str, Any], where: str) -> Mixture:
     return typed(
         document,
         Mixture,

@@ -61,7 +61,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
         out.add("unsafe", unsafe)
     logged = table["logged_ns"].to_numpy()
     if mixture.max_age_days is not None:
-        too_old = logged < as_of_ns - int(mixture.max_age_days * DAY_NS)
+        too_old = logged < as_of_ns - int(min(mixture.max_age_days * DAY_NS, 2.0**62))
         if too_old.all():
             youngest = (as_of_ns - int(logged.max())) / DAY_NS
             raise MixtureError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -212,6 +213,8 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
     bounds = _bounds(kind)
     if bounds and not _inside(value, bounds):
         raise ValueError(f"{name} must be {_range_in_words(bounds)}, got {value}")
+    if bounds and math.isinf(value):  # JSON has none: what keeps the config could not be read
+        raise ValueError(f"{name} must be finite, got {value}")
 
 
 def _bounds(kind: inspect.Type) -> dict[str, float]:

@@ -81,6 +81,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"share": 1.0}, "share must be in [0, 1), got 1.0"),
     ({"share": -0.5}, "share must be in [0, 1), got -0.5"),
     ({"share": math.nan}, "share must be in [0, 1), got nan"),
+    ({"positive": math.inf}, "positive must be finite, got inf"),
+    ({"most": -math.inf}, "most must be finite, got -inf"),
     ({"count": 0}, "count must be at least 1, got 0"),
     ({"positive": 0.0}, "positive must be above 0, got 0.0"),
     ({"most": 1.5}, "most must be at most 1, got 1.5"),

@@ -29,6 +29,8 @@ def test_old_rows_are_old_however_new_they_are_in_their_store(tmp_path: Path) ->
     panel = panel_of(rows, "max_age_days = 300\n" + NO_SPLIT + EVERY, tmp_path / "b")
     assert len(panel) == len(rows)
     assert Panel.open(panel.path).header.as_of_ns == NOW_NS
+    oldest = panel_of(rows, "max_age_days = 1e300\n" + NO_SPLIT + EVERY, tmp_path / "d")
+    assert len(oldest) == len(rows)
     without = panel_of(rows, NO_SPLIT + EVERY, tmp_path / "c")
     assert without.header.as_of_ns is None  # a panel that counts no ages depends on no clock
 
