@@ -234,11 +234,24 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     the end of each episode, which is also what there is of a single one. Of few episodes, a whole
     one may be all there is of a condition: where it is more than twice the share that is asked
     for, the end of the longest is held out, and the others stay whole, with how they ended.
+    Episodes of which the mixture's `where` admits no row are in no part of it.
 
     Raises:
         MixtureError: the rule would take everything, there is only one group to split, a robot that
             it names is not there, or rows that the mixture admits are of an unknown robot or site.
     """
+    episode = codes(table, "episode_id")
+    admitted = np.isin(episode, np.unique(episode[bools(table, "admitted")]))
+    if admitted.all():
+        return _split(table, mixture)
+    split = _split(table.filter(pa.array(admitted)), mixture)
+    held, gap = np.zeros(len(table), np.bool_), np.zeros(len(table), np.bool_)
+    held[admitted], gap[admitted] = split.held, split.gap
+    return EvaluationRows(held, gap, split.by, split.note)
+
+
+def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
+    """The same of rows that all count."""
     rule, seed = mixture.evaluation_split, mixture.seed
     if rule.by == "none" or (rule.share == 0 and not rule.robots):
         return EvaluationRows.none(len(table))
@@ -281,7 +294,8 @@ def _ends_of_episodes(
     np.minimum.at(first_held, episode[held], step[held])
     near = stamp_ns > begin_ns[episode] - round(rule.gap_s * 1e9)
     near |= step >= first_held[episode] - n_step
-    left = np.bincount(episode[~near], minlength=count) / np.bincount(episode, minlength=count)
+    rows_of = np.maximum(np.bincount(episode, minlength=count), 1)
+    left = np.bincount(episode[~near], minlength=count) / rows_of
     held, near = (rows & (left > _LEFT_AT_LEAST)[episode] for rows in (held, near))
     if not held.any():
         short = f"the one episode lasts {long_s.max():.1f} s"
@@ -315,7 +329,7 @@ def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
         there = sorted(name for name, count in zip(names, rows.tolist(), strict=True) if count)
         if absent := sorted(set(rule.robots) - set(there)):
             raise MixtureError(
-                f"evaluation_split.robots: no rows of {', '.join(absent)}",
+                f"evaluation_split.robots: the mixture admits no rows of {', '.join(absent)}",
                 remedy=f"the robots are {', '.join(there)}",
             )
         if set(there) == set(rule.robots):

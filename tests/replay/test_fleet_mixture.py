@@ -60,7 +60,7 @@ def test_a_robot_can_be_held_out_by_its_name(fleet):
 
 @pytest.mark.parametrize(
     ("robots", "message"),
-    [("['c', 'amr-99']", "no rows of amr-99"), ("['a','b','c','d']", "every")],
+    [("['c', 'amr-99']", "admits no rows of amr-99"), ("['a','b','c','d']", "every")],
 )
 def test_robots_that_cannot_be_held_out_are_refused(fleet, robots, message):
     text = f"[evaluation_split]\nby = 'robot'\nrobots = {robots}\n" + EVERY
@@ -84,6 +84,18 @@ def test_a_panel_with_rows_of_a_robot_that_is_held_out_fails_its_audit(fleet, tm
         )
         (finding,) = run_audits(connection, chosen, {}, beside={"panel"})
     assert "a robot that is held out" in {row["leak"] for row in finding.sample}
+
+
+@pytest.mark.parametrize("by", ["episode", "recording", "time", "within_episode"])
+def test_only_episodes_that_the_mixture_admits_are_held_out(fleet, by):
+    # The latest recording is of another robot: all that is held out was of it.
+    text = f"where = \"robot = 'a'\"\n[evaluation_split]\nby = '{by}'\ngap_s = 0\n" + EVERY
+    with Store(fleet) as store:
+        plan = plan_panel(store.connection, parse_mixture(text), store.conditions())
+    robots = np.array(plan.rows["robot"].to_pylist())
+    assert set(robots[plan.evaluation_split]) == set(robots[plan.panel_rows]) == {"a"}
+    if by != "recording":  # one of two is half
+        assert plan.evaluation_split.sum() == pytest.approx(0.1 * (robots == "a").sum(), rel=0.5)
 
 
 def test_strata_of_robots_have_their_quotas(fleet, tmp_path):
