@@ -235,6 +235,14 @@ class StratumRule(StratumLimits, frozen=True, kw_only=True):
     priority: int | None = None  # default: the condition's; `where` strata 50; nominal 1000
     timing: Timing | None = None  # default: the condition's; "post" for a `where` stratum
 
+    def check(self) -> None:
+        super().check()
+        _require(bool(self.name), "a stratum needs a name")
+        if isinstance(share := self.share, int | float):
+            said = f"the share of {self.name!r} is {share:g}"
+            _require(share >= self.floor, f"{said}, below its floor of {self.floor:g}")
+            _require(share <= self.cap, f"{said}, above its cap of {self.cap:g}")
+
 
 class EachCondition(StratumLimits, frozen=True, kw_only=True):
     """A stratum for every condition of the store (and nominal) that `strata` does not name."""

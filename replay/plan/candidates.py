@@ -100,7 +100,7 @@ def read_candidates(
     except duckdb.Error as error:
         if damaged := damage(error):
             raise damaged from error
-        _blame(connection, predicates)
+        _blame(connection, source, predicates)
         raise StoreError(f"its transitions cannot be read: {error}") from error
     return rows.table()
 
@@ -122,11 +122,14 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
         connection.execute("RESET preserve_insertion_order")
 
 
-def _blame(connection: duckdb.DuckDBPyConnection, predicates: dict[str, tuple[str, str]]) -> None:
-    """Each predicate by itself, to say which does not run."""
+def _blame(
+    connection: duckdb.DuckDBPyConnection, source: str, predicates: dict[str, tuple[str, str]]
+) -> None:
+    """Each predicate by itself, over every row, to say which does not run."""
     for place, sql in predicates.values():
+        test = f"SELECT transition_id, ({sql}\n)::BOOLEAN AS holds FROM {source}"
         try:
-            connection.sql(f"SELECT ({sql}\n)::BOOLEAN FROM transitions LIMIT 0")
+            connection.sql(f"SELECT countif(holds) FROM ({test})").fetchall()
         except duckdb.Error as cause:
             raise ConfigError(
                 f"its SQL does not run over `transitions`: {str(cause).splitlines()[0]}",

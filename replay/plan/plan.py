@@ -153,6 +153,11 @@ def plan_panel(
         stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
     del member
     leave_out_of_strata(table, mixture, strata, stratum, out)
+    if out.gone.all():
+        reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in out.reasons.items())
+        raise MixtureError(
+            f"no row is left: {reasons}", remedy="change what leaves out too much in the mixture"
+        )
     stratum[out.gone] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code)
     warnings: tuple[str, ...] = ()

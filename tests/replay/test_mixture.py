@@ -74,6 +74,12 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
         (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
         (
+            "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",
+            "share of 'a' is 0.1, below its floor",
+        ),
+        ("[[strata]]\nname = 'a'\nshare = 0.3\ncap = 0.2", "share of 'a' is 0.3, above its cap"),
+        (EVERY + "[[strata]]\nname = ''\nwhere = 'true'", "a stratum needs a name"),
+        (
             "[adaptive]\n[[strata]]\nname = 'a'\n"
             "share = {schedule = 'linear', start = 0.1, end = 0.2, to_env_steps = 9}",
             "both a schedule",
@@ -128,6 +134,17 @@ def test_wrong_sql_in_a_stratum_is_named(transitions: pa.Table) -> None:
         planned(transitions, "[[strata]]\nname = 'fast'\nwhere = 'speed > 1'\n")
     with pytest.raises(ConfigError, match="`where`"):
         planned(transitions, "where = 'speed > 1'\n" + EVERY)
+
+
+@pytest.mark.parametrize("sql", ["zone", "CAST(zone AS INTEGER) > 1", "count(*) > 1"])
+def test_sql_that_only_fails_on_rows_is_named_too(transitions: pa.Table, sql: str) -> None:
+    with pytest.raises(ConfigError, match=r"^mixture, safety\.unsafe: its SQL does not run"):
+        planned(transitions, EVERY + f"[safety]\nunsafe = '{sql}'")
+
+
+def test_what_left_out_every_row_is_named(transitions: pa.Table) -> None:
+    with pytest.raises(MixtureError, match=r"no row is left: [\d,]+ unsafe"):
+        planned(transitions, EVERY + "[safety]\nunsafe = 'true'")
 
 
 def test_given_natural_and_equal_shares() -> None:

@@ -25,15 +25,11 @@ def rules(draw: st.DrawFn) -> list[StratumRule]:
     found = []
     for index in range(draw(st.integers(1, 7))):
         low, high = sorted((draw(PARTS), draw(PARTS)))
-        bounded = draw(st.booleans())
-        found.append(
-            StratumRule(
-                name=f"s{index}",
-                share=draw(st.one_of(st.sampled_from(["natural", "equal"]), PARTS)),
-                floor=low / 2 if bounded else 0.0,
-                cap=max(high, low) if bounded else 1.0,
-            )
-        )
+        share = draw(st.one_of(st.sampled_from(["natural", "equal"]), PARTS))
+        floor, cap = (low / 2, high) if draw(st.booleans()) else (0.0, 1.0)
+        if isinstance(share, float):
+            floor, cap = min(floor, share), max(cap, share)
+        found.append(StratumRule(name=f"s{index}", share=share, floor=floor, cap=cap))
     return found
 
 
