@@ -32,6 +32,9 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     "npz": ("one_file", "", ".npz"),
 }
 WITH_IMAGES = ("lerobot",)
+# The HDF5 library crashes where it cannot write what it holds back when a file is closed. That is
+# less than this: its caches of metadata, and of chunks.
+ROOM_BYTES = 64 << 20
 
 
 def export_dataset(
@@ -62,7 +65,8 @@ def export_dataset(
     set carries.
 
     Raises:
-        StoreError: an unknown format, a library that is missing, something at `out`, no rows.
+        StoreError: an unknown format, a library that is missing, something at `out`, no rows, a
+            disk too full for HDF5.
         PanelError, QueryError: see `open_selection`.
     """
     module, needs, ending = FORMATS.get(to, ("", "", ""))
@@ -114,8 +118,11 @@ def export_dataset(
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
         _remove(partial)
+        several = chain([first], episodes)
+        if needs:
+            several = _while_there_is_room(several, out)
         try:
-            notes = write(selection, chain([first], episodes), partial, counts)
+            notes = write(selection, several, partial, counts)
             if not ending:
                 text = card(selection, counts, contents, to, license)
                 (partial / "README.md").write_text(text, encoding="utf-8")
@@ -149,6 +156,20 @@ def _advancing(
     for trajectory in episodes:
         yield trajectory
         advance(len(trajectory))
+
+
+def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
+    """Raises StoreError before the disk is full."""
+    for trajectory in episodes:
+        free = shutil.disk_usage(out.parent).free
+        if free < ROOM_BYTES + 2 * trajectory.observations.nbytes:
+            raise StoreError(
+                f"its disk is nearly full: {free / 2**20:,.0f} MiB are free, and HDF5 needs"
+                f" {ROOM_BYTES >> 20} MiB to spare",
+                where=str(out),
+                remedy="free some space, choose another place, or export to parquet or npz",
+            )
+        yield trajectory
 
 
 def _remove(path: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -440,6 +441,21 @@ def test_what_cannot_be_exported_is_refused(
     out = tmp_path / given.pop("out")
     with pytest.raises(error, match=message):
         export_dataset(store_path, given.pop("to"), out, **given)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("to", ["minari", "d3rlpy"])
+def test_an_export_ends_before_hdf5_would_crash_on_a_full_disk(
+    to: str, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
+    monkeypatch.setattr(
+        "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)
+    )
+    out = tmp_path / ("out.h5" if to == "d3rlpy" else "out")
+    with pytest.raises(StoreError, match=r"nearly full: 1 MiB are free") as refused:
+        export_dataset(store_path, to, out)
+    assert refused.value.where == str(out)
     assert not list(tmp_path.iterdir())
 
 
