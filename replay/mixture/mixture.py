@@ -292,6 +292,11 @@ class Mixture(Checked, frozen=True):
     prioritised: Prioritised = Prioritised()
     correction: CorrectionRule = CorrectionRule()
 
+    @property
+    def most_draws(self) -> int | None:
+        """The most draws of a row, whole ones."""
+        return None if self.max_replays_per_row is None else int(self.max_replays_per_row)
+
     def check(self) -> None:
         _require(
             bool(self.strata) or self.each_condition is not None,

@@ -190,8 +190,8 @@ def row_limits(
 ) -> F64:
     """The largest share of `draws` that each stratum's rows allow, (S,)."""
     limit = np.where(rows > 0, 1.0, 0.0)
-    if mixture.max_replays_per_row is not None and draws > 0:
-        limit = np.minimum(limit, mixture.max_replays_per_row * rows / draws)
+    if mixture.most_draws is not None and draws > 0:
+        limit = np.minimum(limit, mixture.most_draws * rows / draws)
     return np.where(has_minimum(rules, rows, episodes), limit, 0.0)
 
 
@@ -216,8 +216,8 @@ def missing_rows(
     Rows of `min_episodes` are counted as of the episodes that there are.
     """
     needed = np.ones(len(rows))
-    if mixture.max_replays_per_row is not None:
-        needed = np.maximum(needed, wanted * draws / mixture.max_replays_per_row)
+    if mixture.most_draws is not None:
+        needed = np.maximum(needed, wanted * draws / mixture.most_draws)
     for index, rule in enumerate(rules):
         an_episode = rows[index] / max(int(episodes[index]), 1)
         needed[index] = max(needed[index], rule.min_rows, rule.min_episodes * an_episode)

@@ -67,7 +67,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self.path = panel.path if isinstance(panel, Panel) else Path(panel)
         self.panel = panel if isinstance(panel, Panel) else Panel.open(panel)
         self.batch_size, self.batches, self.seed, self.epoch = batch_size, batches, seed, 0
-        self._limit = self.panel.header.mixture.max_replays_per_row
+        self._limit = self.panel.header.mixture.most_draws
         # Passes begun by each worker, in memory that the workers of every pass share.
         self._begun = torch.zeros(_MOST_WORKERS, dtype=torch.int16).share_memory_()  # type: ignore[no-untyped-call]
         self._check()
@@ -128,7 +128,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         draw = sampler.draw()
         if len(draw.rows) < self.batch_size:
             raise MixtureError(
-                f"every row of the panel was drawn {self._limit:g} times",
+                f"every row of the panel was drawn {self._limit} times",
                 where=str(self.path),
                 remedy="draw fewer batches, or mix with a larger max_replays_per_row",
             )

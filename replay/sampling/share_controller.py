@@ -227,8 +227,7 @@ class ShareController(Stateful):
     @property
     def max_replays(self) -> int | None:
         """The most draws of a row."""
-        cap = self.mixture.max_replays_per_row
-        return None if cap is None else int(cap)
+        return self.mixture.most_draws
 
     def at(self, env_steps: float) -> bool:
         """Before a batch is drawn: move to its moment. True where the shares changed."""

@@ -218,6 +218,17 @@ def test_replays_per_row_cap_a_small_stratum_and_the_surplus_goes_to_the_others(
     np.testing.assert_allclose(small.got, [0.75, 0.25])
 
 
+def test_part_of_a_draw_is_planned_for_no_row(transitions: pa.Table) -> None:
+    # A run draws a row once where it may be drawn 1.5 times.
+    text = (
+        "max_replays_per_row = {}\n[planned]\nupdates = 5\n[correction]\npost = 'none'\n"
+        "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\n" + EVERY
+    )
+    assert planned(transitions, text.format(1.5)).strata == (
+        planned(transitions, text.format(1)).strata
+    )
+
+
 def test_a_stratum_below_its_minimum_gets_nothing(transitions: pa.Table) -> None:
     text = "[each_condition]\nshare = 'equal'\nmin_rows = 30\n[planned]\nupdates = 10\n"
     text += "[correction]\npost = 'none'\n"
