@@ -118,7 +118,7 @@ def export_dataset(
         out.parent.mkdir(parents=True, exist_ok=True)
         partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
         _remove(partial)
-        several = chain([first], episodes)
+        several: Iterator[Trajectory] = chain([first], episodes)
         if needs:
             several = _while_there_is_room(several, out)
         try:
