@@ -294,7 +294,7 @@ class Mixture(Checked, frozen=True):
 
     @property
     def most_draws(self) -> int | None:
-        """The most draws of a row, whole ones."""
+        """The most draws of one row, rounded down."""
         return None if self.max_replays_per_row is None else int(self.max_replays_per_row)
 
     def check(self) -> None:
