@@ -67,7 +67,8 @@ def _joined(each: Sequence[tuple[str, Finding]], compared: int) -> Finding:
     return replace(
         first,
         text=f"in {len(each)} of {compared} recordings ({names}{more}): {first.text}",
-        remedy=f"{first.remedy}; the store's `recordings` view has their files and tags",
+        remedy="for these recordings alone (the store's `recordings` view has their files and"
+        f" tags): {first.remedy}",
         evidence=tuple(check for _, one in each for check in one.evidence),
     )
 
