@@ -47,6 +47,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.long
 def test_what_it_sees_is_what_ingest_stores_and_it_acts_as_torch_does(
     policy: Path, tmp_path: Path
 ) -> None:

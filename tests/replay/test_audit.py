@@ -631,6 +631,7 @@ def test_thresholds_are_those_the_audits_use() -> None:
     }
 
 
+@pytest.mark.long
 def test_findings_do_not_depend_on_what_is_held_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -258,6 +258,7 @@ def test_the_command_shows_a_pair_without_an_interval(tmp_path, capsys) -> None:
     assert json.loads(capsys.readouterr().out)["order"][0]["more_return"] == [None, None]
 
 
+@pytest.mark.long
 @settings(max_examples=30)
 @given(st.integers(3, 60), st.integers(3, 60), st.floats(0.1, 10), st.integers(0, 99))
 def test_returns_have_students_interval(n: int, m: int, spread: float, seed: int) -> None:

@@ -46,6 +46,7 @@ def success(
     return {k: float(np.mean([ok for block, ok in result.values() if block == k])) for k in kinds}
 
 
+@pytest.mark.long
 def test_the_planner_is_good_in_nominal_aisles_and_stuck_in_partly_blocked_ones() -> None:
     assert success(PlannerFollower(), "nominal")["none"] >= 0.95
     blocked = success(PlannerFollower(), "blocked_aisle")

@@ -241,6 +241,7 @@ def test_conditions_come_in_their_shares() -> None:
     assert 0.35 < share < 0.65
 
 
+@pytest.mark.long
 def test_the_true_condition_shows_where_its_cause_is() -> None:
     seen: dict[str, set[str]] = {}
     for kind in KINDS:
