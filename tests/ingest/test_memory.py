@@ -113,6 +113,7 @@ def recording(kind: str, drive: Path, folder: Path, images: int) -> Path:
     return compress_files(bag) if kind == "zstd file" else bag
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc to read peaks from")
 @pytest.mark.parametrize("kind", one_in(2, ["mcap", "not chunked", "sqlite3", "zstd file"]))
 def test_memory_does_not_grow_with_the_bytes_of_a_recording(kind: str, tmp_path: Path) -> None:
