@@ -126,13 +126,13 @@ def diagnose_rows(
     others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
     found = findings(compared, permuted, others, rows.task)
     comparisons = [row for one in compared for row in one.comparisons]
-    comparisons_of = {row.check for row in comparisons}
+    of_relations = {row.check for row in comparisons}
     comparisons += [row for row, _ in permuted] + others
-    of_answers = [one for one in found if not comparisons_of.isdisjoint(one.evidence)]
-    if of_answers or not found:  # else what is wrong is in the rows, whosesoever
+    of_robots = [one for one in found if not of_relations.isdisjoint(one.evidence)]
+    if of_robots or not found:  # else the rows are at fault, whichever robot's they are
         own, unlike = unlike_recordings(rows, twin, seed)
         comparisons += unlike
-        found = [one for one in found if not own or one not in of_answers] + own
+        found = [one for one in found if not own or one not in of_robots] + own
     if twin is None:
         comparisons.append(not_run("twin", "rows of the twin", reason))
     verdict: Verdict = "BUFFER" if found else "HEALTHY"

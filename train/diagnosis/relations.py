@@ -51,7 +51,8 @@ class Relation:
     ) -> Response | None:
         """None where the rows say too little."""
         x, y = self.of(rows)
-        y = np.where(self._left_out(rows, leave_out), np.nan, y.T).T
+        y = y.copy()
+        y[self._left_out(rows, leave_out)] = np.nan
         if x.ndim == 2:
             cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
