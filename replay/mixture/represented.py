@@ -3,7 +3,8 @@
 An archive of incident bags is no natural sample: a near collision in every other mission says what
 was kept, not how the floor is. `represents` in the mixture's sources says what the rows stand for.
 Natural shares (of rows, by stratum) are then the represented ones, `share = "natural"` means those,
-and corrections weigh the rows back to them.
+and corrections weigh the rows back to them. A cap on an episode's or a recording's rows chooses
+what is packed, too: what is left stands for all the rows that the mixture admits.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ class Source(Protocol):
     def name(self) -> str: ...
     @property
     def code(self) -> NDArray[np.int16]: ...
+    @property
+    def admitted(self) -> Ints: ...  # (S,) rows of each stratum, those beyond a cap too
 
 
 class Resolved(Protocol):
@@ -54,16 +57,17 @@ def represented_shares(
     """
     names = [stratum.rule.name for stratum in strata]
     rows = [np.bincount(source.code, minlength=len(names)) for source in sources]
-    first = mixture.sources.represents
-    main: F64 = rows[0] / max(int(rows[0].sum()), 1)
-    if isinstance(first, Mapping):
-        main = _told(first, names, rows[0], sources[0].name)
-    shares: list[F64 | None] = [main if isinstance(first, Mapping) else None]
-    for source, counts, store in zip(sources[1:], rows[1:], mixture.sources.stores, strict=True):
-        if isinstance(store.represents, Mapping):
-            shares.append(_told(store.represents, names, counts, source.name))
-        else:
-            shares.append(main if store.represents == "archive" else None)
+    own: list[F64] = [source.admitted / max(int(source.admitted.sum()), 1) for source in sources]
+    shares: list[F64 | None] = []
+    for number, (source, said) in enumerate(
+        zip(sources, mixture.sources.said.values(), strict=True)
+    ):
+        if isinstance(said, Mapping):
+            own[number] = _told(said, names, source.admitted, source.name)
+        elif said == "archive":
+            own[number] = own[0]
+        capped = bool((source.admitted > rows[number]).any())
+        shares.append(own[number] if capped or mixture.sources.chosen(source.name) else None)
     for source, share, counts in zip(sources, shares, rows, strict=True):
         if share is not None:
             _refuse_unknown(strata, share, counts, source.name)

@@ -327,7 +327,7 @@ def controller_for(
             rule,
             size,
             stratum.episodes,
-            stratum.natural_share if mixture.sources.chosen(stratum.source) else None,
+            stratum.natural_share if mixture.resampled(stratum.source) else None,
         )
         for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
     ]
@@ -355,7 +355,7 @@ def _weights(panel: Panel) -> WeightsInForce | F32 | None:
         outcome,
         [
             np.array([stratum.natural_share for stratum in strata[place : place + size]])
-            if panel.header.mixture.sources.chosen(strata[place].source)
+            if panel.header.mixture.resampled(strata[place].source)
             else None
             for place in range(0, len(strata), size)
         ],

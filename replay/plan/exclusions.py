@@ -136,8 +136,10 @@ def leave_out_of_strata(
     strata: list[ResolvedStratum],
     stratum: NDArray[np.int16],
     out: LeftOut,
-) -> None:
+) -> Bools:
     """Rows of no stratum, and those beyond a cap on one episode's or recording's rows.
+
+    Returns the latter, (N,): they still count for natural shares.
 
     Raises:
         MixtureError: rows of no stratum, where the mixture refuses them.
@@ -152,16 +154,19 @@ def leave_out_of_strata(
             + 'or set unlisted = "drop"',
         )
     out.add("in no stratum", unlisted)
+    beyond_any = np.zeros(len(table), np.bool_)
     for column, name in (("episode_id", "episode"), ("recording_id", "recording")):
         caps = np.array([_cap(s, mixture, f"max_rows_per_{name}") for s in strata], np.int64)
         if (caps < len(table)).any():
             beyond = beyond_cap(table, column, stratum, caps, out.gone, mixture.seed)
+            beyond_any |= beyond
             out.add(
                 f"beyond the cap of rows an {name}"
                 if name == "episode"
                 else f"beyond the cap of rows a {name}",
                 beyond,
             )
+    return beyond_any
 
 
 def _cap(stratum: ResolvedStratum, mixture: Mixture, name: str) -> int:

@@ -152,14 +152,14 @@ def plan_panel(
     if mixture.prefer == "rarest":
         stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
     del member
-    leave_out_of_strata(table, mixture, strata, stratum, out)
+    beyond_cap = leave_out_of_strata(table, mixture, strata, stratum, out)
     if out.gone.all():
         reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in out.reasons.items())
         raise MixtureError(
             f"no row is left: {reasons}", remedy="change what leaves out too much in the mixture"
         )
-    stratum[out.gone] = NO_STRATUM
-    given = _sources(mixture, table, stratum, state_code)
+    stratum[out.gone & ~beyond_cap] = NO_STRATUM
+    given = _sources(mixture, table, stratum, state_code, beyond_cap, len(strata))
     warnings: tuple[str, ...] = ()
     if others:
         met = episodes_met(connection, mixture, conditions)
@@ -223,14 +223,20 @@ def _dealt(
 
 
 def _sources(
-    mixture: Mixture, table: pa.Table, stratum: NDArray[np.int16], state_code: NDArray[np.int16]
+    mixture: Mixture,
+    table: pa.Table,
+    stratum: NDArray[np.int16],
+    state_code: NDArray[np.int16],
+    beyond_cap: Bools,
+    size: int,
 ) -> list[SourceRows]:
-    """What each store may give, with its share of a batch as a run begins."""
+    """What each store may give, with its share of a batch as a run begins; `size` strata."""
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
-        at = np.flatnonzero((stratum != NO_STRATUM) & (store == number))
+        admitted = (stratum != NO_STRATUM) & (store == number)
+        at = np.flatnonzero(admitted & ~beyond_cap)
         sources.append(
             SourceRows(
                 name,
@@ -241,6 +247,7 @@ def _sources(
                 state_code[at],
                 episode[at],
                 hours_of(recording[store == number], stamp_ns[store == number]),
+                np.bincount(stratum[admitted], minlength=size),
             )
         )
     return sources

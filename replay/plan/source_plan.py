@@ -42,6 +42,7 @@ class SourceRows:
     state_code: NDArray[np.int16]  # the one their state alone would put them in
     episode: Codes
     hours: float  # of logging that its store is of
+    admitted: Ints  # (S,) rows of each stratum, those beyond a cap too
 
 
 @dataclass(frozen=True)

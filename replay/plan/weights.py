@@ -61,7 +61,7 @@ class RowWeights:
         strata: (S,) whose timing and correction decide.
         outcome: (N, S) the probability of each "density_ratio" stratum given a row's state and
             action (0 for the other strata), or None.
-        natural: (S,) how often each stratum occurs, where the rows were chosen (an archive);
+        natural: (S,) how often each stratum occurs, where the rows were chosen (an archive, a cap);
             None: as often as it has rows.
     """
 

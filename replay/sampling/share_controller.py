@@ -44,7 +44,7 @@ class SampledStratum:
     rule: StratumRule
     rows: int  # in the panel; 0 where it is never drawn
     episodes: int
-    occurs: float | None = None  # how often, where its rows were chosen (an archive)
+    occurs: float | None = None  # how often, where its rows were chosen (an archive, a cap)
 
 
 class GroupDro(Stateful):

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.panels import panel_of
 from support.stores import recording_transitions, write_store
 
 from restock import cli
@@ -214,6 +215,42 @@ def weighed_share(panel: Panel, stratum: str, other: str) -> float:
         for name in part:
             part[name] += float(drawn.weight[drawn.strata == names.index(name)].sum())
     return part[stratum] / sum(part.values())
+
+
+CAPPED = """
+unlisted = "drop"
+[evaluation_split]
+by = "none"
+[[strata]]
+name = "nominal"
+{nominal}
+{cap}
+[[strata]]
+name = "near_collision"
+where = "list_contains(conditions, 'near_collision')"
+timing = "pre"
+{near}
+[correction]
+pre = "full"
+"""
+
+
+@pytest.mark.parametrize("shares", [("", ""), ("share = 0.6", "share = 0.4")])
+def test_a_cap_on_the_rows_of_an_episode_changes_no_natural_rate(transitions, tmp_path, shares):
+    """Neither what "natural" means, nor what a correction leads back to, in a plan and a run."""
+    nominal, near = shares
+    whole, capped = (
+        panel_of(transitions, CAPPED.format(nominal=nominal, near=near, cap=cap), tmp_path / name)
+        for name, cap in (("whole", ""), ("capped", "max_rows_per_episode = 4"))
+    )
+    of_whole, of_capped = ({s.name: s for s in panel.strata} for panel in (whole, capped))
+    assert of_capped["nominal"].rows < of_whole["nominal"].rows / 2
+    for name, line in of_whole.items():
+        assert of_capped[name].natural_share == line.natural_share
+        assert of_capped[name].share == pytest.approx(line.share)
+        assert of_capped[name].effective_share == pytest.approx(line.natural_share, rel=1e-5)
+    run = weighed_share(capped, "near_collision", "nominal")
+    assert run == pytest.approx(of_whole["near_collision"].natural_share, rel=0.02)
 
 
 @given(
