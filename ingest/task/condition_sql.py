@@ -43,6 +43,8 @@ _GROWING = {
     *("repeat", "list_repeat", "array_repeat", "range", "generate_series", "generate_subscripts"),
     *("lpad", "rpad", "bar", "list_resize", "array_resize", "printf", "format", "factorial"),
 }
+# Of a zone that is given, or fixed as it is here.
+_OF_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
 _BACKWARD = {
     *("WINDOW_AGGREGATE", "WINDOW_LAG"),
@@ -184,14 +186,50 @@ def _outside() -> frozenset[str]:
     by those a name is not one of them.
     """
     with sandbox().cursor() as connection:
+        macros = connection.sql(
+            "SELECT function_name FROM duckdb_functions() WHERE function_type = 'macro'"
+        ).fetchall()
+    return (
+        _changing()
+        | {"age", "error"}  # age of one time: until today
+        | {name for (name,) in macros if not name.startswith(_MACROS) and name not in _MORE_MACROS}
+    )
+
+
+@cache
+def _changing() -> frozenset[str]:
+    """Names of functions that may answer otherwise when they are asked again."""
+    with sandbox().cursor() as connection:
         rows = connection.sql(
-            "SELECT DISTINCT function_name, function_type, stability, parameter_types::VARCHAR[]"
-            " FROM duckdb_functions()"
+            "SELECT DISTINCT function_name, stability, parameter_types::VARCHAR[]"
+            " FROM duckdb_functions() WHERE function_type <> 'macro'"
         ).fetchall()
     return frozenset(
         name
-        for name, kind, stability, takes in rows
+        for name, stability, takes in rows
         if (stability == "VOLATILE")
         or (stability == "CONSISTENT_WITHIN_QUERY" and not _ZONED.intersection(takes))
-        or (kind == "macro" and not name.startswith(_MACROS) and name not in _MORE_MACROS)
-    ) | {"age"}  # of one time: until today
+    ) - {"error"}
+
+
+@lru_cache(maxsize=1024)
+def not_repeatable(sql: str) -> str | None:
+    """What in an expression may come out otherwise on the same rows, or None.
+
+    SQL that cannot be read is DuckDB's to refuse.
+    """
+    with sandbox().cursor() as connection:
+        query = "SELECT json_serialize_sql(?::VARCHAR)"
+        ((text,),) = connection.execute(query, [f"SELECT ({sql}\n)"]).fetchall()
+    for part in _walk(json.loads(text).get("statements", [])):
+        kind = part["class"]
+        name = part.get("function_name", "").lower()
+        if kind == "COLUMN_REF" and len(part["column_names"]) == 1:  # current_date, without ()
+            name = part["column_names"][0].lower()
+            if not name.startswith("current_"):
+                continue
+        if name in _changing() - _OF_ZONES or (name == "age" and len(part["arguments"]) == 1):
+            return f"{name}() may differ from one time to the next"
+        if kind == "WINDOW" and part["type"] != "WINDOW_AGGREGATE" and not part["orders"]:
+            return f"{name}() OVER (…) without ORDER BY depends on the order in which rows are read"
+    return None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Codes
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
+from restock.ingest.task.condition_sql import not_repeatable
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.rows_in_order import RowsInOrder
@@ -66,7 +67,7 @@ def read_candidates(
     mixture's `uncertain` has them.
 
     Raises:
-        ConfigError: a predicate that does not run; names it.
+        ConfigError: a predicate that does not run, or could choose other rows another time.
         StoreError: transitions that cannot be read.
     """
     predicates = {"admitted": ("`where`", mixture.where or "true")}
@@ -77,6 +78,15 @@ def read_candidates(
         if stratum.state_predicate is not None:
             state = (f"stratum {stratum.name!r}", stratum.state_predicate)
             predicates[f"state_{index}"] = state
+    for place, sql in predicates.values():
+        if reason := not_repeatable(sql):
+            raise ConfigError(
+                f"its SQL could choose other rows when it is mixed again: {reason}",
+                where=f"mixture, {place}",
+                remedy="choose by columns: a part of the episodes by md5_number_lower(episode_id)"
+                " % 10 < 3, recent rows by max_age_days and as_of, the order of rows by"
+                " ORDER BY transition_id",
+            )
     tests = ", ".join(
         f"coalesce(({sql}\n)::BOOLEAN, false) AS {name}" for name, (_, sql) in predicates.items()
     )

@@ -142,6 +142,42 @@ def test_sql_that_only_fails_on_rows_is_named_too(transitions: pa.Table, sql: st
         planned(transitions, EVERY + f"[safety]\nunsafe = '{sql}'")
 
 
+@pytest.mark.parametrize(
+    ("sql", "name"),
+    [
+        ("random() < .5", "random"),
+        ("stamp_ns < epoch_ns(now())", "now"),
+        ("current_date > DATE '2026-01-01'", "current_date"),
+        ("age(make_timestamp_ns(stamp_ns)::TIMESTAMP) > INTERVAL 1 DAY", "age"),
+        ("transition_id IN (SELECT 1 WHERE uuid() IS NOT NULL)", "uuid"),
+        ("row_number() OVER (PARTITION BY episode_id) < 9", "without ORDER BY"),
+    ],
+)
+def test_sql_that_may_choose_other_rows_another_time_is_refused(
+    transitions: pa.Table, sql: str, name: str
+) -> None:
+    for text, place in (
+        (f'where = "{sql}"\n', "`where`"),
+        (f'[safety]\nunsafe = "{sql}"\n', "safety.unsafe"),
+        (f'[[strata]]\nname = "mine"\nwhere = "{sql}"\n', "stratum 'mine'"),
+    ):
+        with pytest.raises(ConfigError, match=name) as refused:
+            planned(transitions, text + EVERY)
+        assert place in str(refused.value)
+
+
+def test_sql_that_always_chooses_the_same_rows_is_taken(transitions: pa.Table) -> None:
+    sql = (
+        "md5_number_lower(episode_id) % 10 < 9",
+        "row_number() OVER (PARTITION BY episode_id ORDER BY transition_id) < 9",
+        "sum(reward) OVER (PARTITION BY episode_id) > -1e9",
+        "date_trunc('day', to_timestamp(stamp_ns / 1e9) AT TIME ZONE 'UTC') > '2020-01-01'",
+        "CASE WHEN stamp_ns < 0 THEN error('bad') ELSE true END",
+    )
+    text = f'where = "{" AND ".join(sql)}"\n'
+    assert len(planned(transitions, text + EVERY).panel_rows)
+
+
 def test_what_left_out_every_row_is_named(transitions: pa.Table) -> None:
     with pytest.raises(MixtureError, match=r"no row is left: [\d,]+ unsafe"):
         planned(transitions, EVERY + "[safety]\nunsafe = 'true'")
