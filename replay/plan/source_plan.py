@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
-from restock.replay.mixture.shares import SharePlan, has_minimum, missing_rows, plan_shares
+from restock.replay.mixture.shares import (
+    SharePlan,
+    adaptive_bounds,
+    has_minimum,
+    missing_rows,
+    plan_shares,
+)
 from restock.replay.plan.exclusions import scramble
 from restock.replay.plan.strata import ResolvedStratum, Stratum
 from restock.replay.plan.weights import (
@@ -76,8 +82,8 @@ def plan_source(
     the conditions that none of them tells, and why.
 
     Raises:
-        MixtureError: too few rows, or weights that take a stratum below its natural share, where
-            the mixture refuses that.
+        MixtureError: too few rows, bounds of [adaptive] that no shares keep, or weights that take a
+            stratum below its natural share, where the mixture refuses that.
     """
     size = len(strata)
     rows = np.bincount(source.code, minlength=size).astype(np.int64)
@@ -94,6 +100,9 @@ def plan_source(
     shares = plan_shares(
         mixture, rules, rows, episodes, draws=draws, natural=natural, unknown=untold
     )
+    if mixture.adaptive is not None:  # as a run would refuse it
+        floors, caps = (np.array([getattr(r, of) for r in rules]) for of in ("floor", "cap"))
+        adaptive_bounds(mixture.adaptive, shares.got, floors, caps)
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
     scheduled = np.array([not isinstance(rule.share, int | float | str) for rule in rules])
     drawn = (shares.got > 0) | (scheduled & has_minimum(rules, rows, episodes))

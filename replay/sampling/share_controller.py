@@ -19,7 +19,12 @@ from restock.arrays import F64, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Adaptive, Mixture, Shortfall, SourceShares, StratumRule
 from restock.replay.mixture.schedules import knots, mean_over, value_at
-from restock.replay.mixture.shares import scaled_within, wanted_shares, within_limits
+from restock.replay.mixture.shares import (
+    adaptive_bounds,
+    scaled_within,
+    wanted_shares,
+    within_limits,
+)
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # shares with a schedule are worked out again after so many
@@ -67,16 +72,7 @@ class GroupDro(Stateful):
 
     def __init__(self, rule: Adaptive, shares: F64, floor: F64, cap: F64) -> None:
         self.rule = rule
-        drawn = shares > 0
-        self.low: F64 = np.where(drawn, np.maximum(floor, rule.floor), 0.0)
-        self.high: F64 = np.where(drawn, np.minimum(cap, rule.ceiling), 0.0)
-        self.low = np.minimum(self.low, self.high)
-        if self.low.sum() > 1 + 1e-9 or self.high.sum() < 1 - 1e-9:
-            raise MixtureError(
-                f"adaptive: {int(drawn.sum())} strata cannot share out 1 with floors that sum to"
-                f" {self.low.sum():g} and ceilings that sum to {self.high.sum():g}",
-                remedy="lower adaptive.floor, raise adaptive.ceiling, or drop [adaptive]",
-            )
+        self.low, self.high = adaptive_bounds(rule, shares, floor, cap)
         self.shares: F64 = scaled_within(shares, self.low, self.high)
         self.td_abs: F64 = np.full(len(shares), np.nan)  # what the last step saw, (S,)
         self._sum: F64 = np.zeros(len(shares))

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.panels import EVERY, moment, panel_of, planned
+from support.panels import EVERY, NO_SPLIT, moment, panel_of, planned
 from support.paths import ROOT
 from support.stores import CONDITIONS, EXPOSURES, TASK
 
@@ -436,6 +436,20 @@ def test_effective_count() -> None:
     assert effective_count(np.array([5, 5, 5])) == pytest.approx(3)
     assert effective_count(np.array([100, 1, 1])) < 1.1
     assert effective_count(np.array([])) == 0
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ("floor = 0.3", r"floors that sum to 1\.5"),
+        ("ceiling = 0.15", r"ceilings that sum to 0\.75"),
+    ],
+)
+def test_adaptive_bounds_that_no_run_could_keep_are_refused_in_the_plan(
+    transitions: pa.Table, bounds: str, message: str
+) -> None:
+    with pytest.raises(MixtureError, match=message):
+        planned(transitions, NO_SPLIT + EVERY + f"[adaptive]\n{bounds}\n")
 
 
 def test_the_plan_counts_replays(transitions: pa.Table) -> None:
