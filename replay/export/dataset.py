@@ -8,7 +8,6 @@ be installed.
 from __future__ import annotations
 
 import importlib
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
+from restock.files import building
 from restock.imports import installed
 from restock.ingest.store.version import Version
 from restock.replay.export.card import Contents, card, check_license
@@ -115,20 +115,16 @@ def export_dataset(
                 where=selection.where,
                 remedy="export the observations as they are stored",
             )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        partial = out.with_name(f".{out.stem}.{os.getpid()}.partial{ending}")
-        _remove(partial)
         several: Iterator[Trajectory] = chain([first], episodes)
         if needs:
             several = _while_there_is_room(several, out)
-        try:
+        with building(out) as folder:
+            partial = folder / out.name
             notes = write(selection, several, partial, counts)
             if not ending:
                 text = card(selection, counts, contents, to, license)
                 (partial / "README.md").write_text(text, encoding="utf-8")
             partial.rename(out)
-        finally:
-            _remove(partial)
     return {
         "format": to,
         "path": str(out),
@@ -170,10 +166,3 @@ def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[
                 remedy="free some space, choose another place, or export to parquet or npz",
             )
         yield trajectory
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

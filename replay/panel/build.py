@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import platform
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -21,7 +19,7 @@ import pyarrow as pa
 
 from restock import __version__
 from restock.errors import PanelError, StoreError
-from restock.files import is_running
+from restock.files import building
 from restock.ingest.store.location import Location
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
@@ -163,7 +161,7 @@ def write_panel(
     """
     out = Path(out)
     _check_free(out, force)
-    with _building(out) as partial, _enough_memory():
+    with building(out) as partial, _enough_memory():
         scratch = partial / "scratch"
         scratch.mkdir()
         task_json = source.task_json(plan.task_hash)
@@ -231,28 +229,6 @@ def _check_free(out: Path, force: bool) -> None:
             where=str(out),
             remedy="choose another --out" + ("; --force replaces a panel" if is_panel else ""),
         )
-
-
-@contextmanager
-def _building(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that no other builder has; what is left of it at the end goes away.
-
-    Those of builders that were killed go away first.
-    """
-    out.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f".{out.name}.building~"
-    for left in out.parent.iterdir():
-        host, _, process = left.name.removeprefix(prefix).rpartition("~")[0].rpartition("~")
-        of_this_host = (
-            left.name.startswith(prefix) and host == platform.node() and process.isdigit()
-        )
-        if of_this_host and not is_running(int(process)):
-            shutil.rmtree(left, ignore_errors=True)
-    partial = Path(tempfile.mkdtemp("", f"{prefix}{platform.node()}~{os.getpid()}~", out.parent))
-    try:
-        yield partial
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _finish(path: Path) -> None:

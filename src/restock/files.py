@@ -9,7 +9,11 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Sequence
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +163,28 @@ def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
     return removed
 
 
+@contextmanager
+def building(out: Path) -> Iterator[Path]:
+    """A folder beside `out` that no other builder has; what is left of it at the end goes away.
+
+    Those of builders that were killed go away first.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    prefix = f".{out.name}.building~"
+    for left in out.parent.iterdir():
+        host, _, process = left.name.removeprefix(prefix).rpartition("~")[0].rpartition("~")
+        of_this_host = (
+            left.name.startswith(prefix) and host == platform.node() and process.isdigit()
+        )
+        if of_this_host and not is_running(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+    partial = Path(tempfile.mkdtemp("", f"{prefix}{platform.node()}~{os.getpid()}~", out.parent))
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def cores() -> int:
     """How many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -178,6 +204,7 @@ def is_running(process: int) -> bool:
 
 
 __all__ = [
+    "building",
     "first_line",
     "is_running",
     "read_json",
