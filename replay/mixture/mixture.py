@@ -297,15 +297,6 @@ class Mixture(Checked, frozen=True):
         """The most draws of one row, rounded down."""
         return None if self.max_replays_per_row is None else int(self.max_replays_per_row)
 
-    def resampled(self, source: str) -> bool:
-        """Whether a source's rows in a panel may stand for other rates than their own."""
-        rules: list[Mixture | StratumLimits] = [self, *self.strata]
-        if self.each_condition is not None:
-            rules.append(self.each_condition)
-        return self.sources.chosen(source) or any(
-            rule.max_rows_per_episode or rule.max_rows_per_recording for rule in rules
-        )
-
     def check(self) -> None:
         _require(
             bool(self.strata) or self.each_condition is not None,

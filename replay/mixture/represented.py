@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture, Represents, StratumRule
+from restock.replay.mixture.mixture import (
+    Mixture,
+    Represents,
+    StratumLimits,
+    StratumRule,
+)
 
 # How many times the others' odds of a condition, by episode, are reason to warn, and to refuse an
 # archive that does not say that it is one; and of how many such episodes. Odds, because what a
@@ -72,6 +77,16 @@ def represented_shares(
         if share is not None:
             _refuse_unknown(strata, share, counts, source.name)
     return shares
+
+
+def stands_for_others(mixture: Mixture, source: str) -> bool:
+    """Whether a source's rows in a panel may stand for other rates than their own."""
+    rules: list[Mixture | StratumLimits] = [mixture, *mixture.strata]
+    if mixture.each_condition is not None:
+        rules.append(mixture.each_condition)
+    return mixture.sources.chosen(source) or any(
+        rule.max_rows_per_episode or rule.max_rows_per_recording for rule in rules
+    )
 
 
 def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.represented import stands_for_others
 from restock.replay.plan.plan import outcome_column
 from restock.replay.plan.strata import rules_of
 from restock.replay.plan.weights import WeightsInForce
@@ -327,7 +328,7 @@ def controller_for(
             rule,
             size,
             stratum.episodes,
-            stratum.natural_share if mixture.resampled(stratum.source) else None,
+            stratum.natural_share if stands_for_others(mixture, stratum.source) else None,
         )
         for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
     ]
@@ -355,7 +356,7 @@ def _weights(panel: Panel) -> WeightsInForce | F32 | None:
         outcome,
         [
             np.array([stratum.natural_share for stratum in strata[place : place + size]])
-            if panel.header.mixture.resampled(strata[place].source)
+            if stands_for_others(panel.header.mixture, strata[place].source)
             else None
             for place in range(0, len(strata), size)
         ],
