@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,13 +13,15 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.mixture import Mixture, StratumRule
+from restock.replay.mixture.schedules import knots
 from restock.replay.mixture.shares import (
     SharePlan,
     adaptive_bounds,
     has_minimum,
     missing_rows,
     plan_shares,
+    wanted_shares,
 )
 from restock.replay.plan.exclusions import scramble
 from restock.replay.plan.strata import ResolvedStratum, Stratum
@@ -100,6 +103,7 @@ def plan_source(
     shares = plan_shares(
         mixture, rules, rows, episodes, draws=draws, natural=natural, unknown=untold
     )
+    _refuse_later_shares(rules, rows if natural is None else natural)
     if mixture.adaptive is not None:  # as a run would refuse it
         floors, caps = (np.array([getattr(r, of) for r in rules]) for of in ("floor", "cap"))
         adaptive_bounds(mixture.adaptive, shares.got, floors, caps)
@@ -142,6 +146,21 @@ def plan_source(
     if mixture.correction.below_natural == "refuse":
         _refuse_below_natural(lines)
     return SourcePlan(shares, kept, weight, outcome, fit, lines)
+
+
+def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> None:
+    """Raises MixtureError where schedules leave the other strata no way to share out the rest."""
+    portions = [rule.share for rule in rules if not isinstance(rule.share, str)]
+    bends = sorted({step for portion in portions for step in knots(portion)})
+    # Between two bends a cosine can lie above the line that joins them.
+    fine = [a + (b - a) * i / 16 for a, b in itertools.pairwise(bends) for i in range(16)]
+    for step in [*fine, *bends[-1:]]:
+        try:
+            wanted_shares(rules, natural, step)
+        except MixtureError as error:
+            raise MixtureError(
+                f"at environment step {step:,.0f}: {error.what}", remedy=error.remedy
+            ) from error
 
 
 def below_natural(line: Stratum) -> bool:

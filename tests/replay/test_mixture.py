@@ -438,6 +438,18 @@ def test_effective_count() -> None:
     assert effective_count(np.array([])) == 0
 
 
+def test_schedules_that_leave_no_room_later_are_refused_in_the_plan(
+    transitions: pa.Table,
+) -> None:
+    text = (
+        'unlisted = "drop"\n' + NO_SPLIT + '[[strata]]\nname = "nominal"\ncap = 0.6\n'
+        '[[strata]]\nname = "wheel_slip"\n'
+        'share = { schedule = "linear", start = 0.5, end = 0.3, to_env_steps = 1000 }\n'
+    )
+    with pytest.raises(MixtureError, match=r"at environment step 5\d\d: .* caps to 0\.6"):
+        planned(transitions, text)
+
+
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
