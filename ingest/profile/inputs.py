@@ -74,7 +74,8 @@ class Input(Checked, frozen=True):
     topic: str
     type: str
     fields: dict[str, str]
-    max_age_s: float | None = None  # largest age; None: latched until the next message
+    # Largest age; None: latched until the next message.
+    max_age_s: Annotated[float, Meta(gt=0)] | None = None
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
     stop_holds: bool = False  # a command to stop holds until the next one

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.toml import Checked
@@ -14,8 +15,8 @@ from restock.toml import Checked
 class Body(Checked, frozen=True):
     """The robot's rectangular outline and where its lidar sits, in the base frame (x forward)."""
 
-    length_m: float
-    width_m: float
+    length_m: Annotated[float, Meta(gt=0)]
+    width_m: Annotated[float, Meta(gt=0)]
     lidar_x_m: float = 0.0  # of the lidar, ahead of the outline's centre
     lidar_yaw_rad: float = 0.0  # angle of the scan's zero to the robot's forward axis
 

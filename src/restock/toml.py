@@ -2,7 +2,8 @@
 
 A range stands in the type (`Annotated[float, Meta(ge=0, lt=1)]`): it is checked when a file is
 read, when a `Checked` struct is made in Python, and it goes into a JSON Schema. What concerns
-several fields stays in a struct's own `check`.
+several fields stays in a struct's own `check`. A number is finite whether it has a range or not:
+comparisons with `nan` are silently false, and JSON has neither it nor `inf`.
 """
 
 from __future__ import annotations
@@ -166,7 +167,7 @@ def _key(name: str) -> str:
 
 @functools.cache
 def _ranges(kind: type) -> dict[str, inspect.Type]:
-    """The fields of a struct whose type has a range, or holds items that have one."""
+    """The fields of a struct that are numbers to check, or hold some."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     return {f.name: f.type for f in info.fields if _ranged(f.type)}
@@ -178,7 +179,11 @@ def _ranged(kind: inspect.Type) -> bool:
     if isinstance(kind, inspect.TupleType):
         return any(map(_ranged, kind.item_types))
     item = _item(kind)
-    return bool(_bounds(kind)) or (item is not None and _ranged(item))
+    return _is_number(kind) or (item is not None and _ranged(item))
+
+
+def _is_number(kind: inspect.Type) -> bool:
+    return bool(_bounds(kind)) or isinstance(kind, inspect.FloatType)
 
 
 def _item(kind: inspect.Type) -> inspect.Type | None:
@@ -193,7 +198,7 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
     if value is None:
         return
     if isinstance(kind, inspect.UnionType):
-        fitting = [k for k in kind.types if _bounds(k) and isinstance(value, int | float)]
+        fitting = [k for k in kind.types if _is_number(k) and isinstance(value, int | float)]
         fitting += [k for k in kind.types if _item(k) and not isinstance(value, int | float | str)]
         for option in fitting:
             _check(name, option, value)
@@ -213,7 +218,7 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
     bounds = _bounds(kind)
     if bounds and not _inside(value, bounds):
         raise ValueError(f"{name} must be {_range_in_words(bounds)}, got {value}")
-    if bounds and math.isinf(value):  # JSON has none: what keeps the config could not be read
+    if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{name} must be finite, got {value}")
 
 

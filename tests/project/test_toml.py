@@ -66,6 +66,8 @@ class Config(Checked, frozen=True):
     maybe: Share | None = None
     either: Literal["auto"] | Share = "auto"
     several: float | list[Share] | dict[str, Share] = 0.0
+    unbounded: float = 0.0
+    points: tuple[tuple[float, float], ...] = ()
     inner: Inner = Inner()
     inners: tuple[Inner, ...] = ()
     by_name: dict[str, Inner] = msgspec.field(default_factory=dict)
@@ -83,6 +85,9 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"share": math.nan}, "share must be in [0, 1), got nan"),
     ({"positive": math.inf}, "positive must be finite, got inf"),
     ({"most": -math.inf}, "most must be finite, got -inf"),
+    ({"unbounded": math.nan}, "unbounded must be finite, got nan"),
+    ({"several": math.inf}, "several must be finite, got inf"),
+    ({"points": [[0.0, math.nan]]}, "points[0][1] must be finite, got nan"),
     ({"count": 0}, "count must be at least 1, got 0"),
     ({"positive": 0.0}, "positive must be above 0, got 0.0"),
     ({"most": 1.5}, "most must be at most 1, got 1.5"),
