@@ -330,6 +330,9 @@ def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: A
     path.write_text("fiction = 1\n")
     with pytest.raises(ConfigError, match="fiction"):
         load_perturbation(path)
+    path.write_text("[ranges]\npayload_kg = [0, 50]\n")  # as `twin fit --per-recording` writes it
+    with pytest.raises(ConfigError, match=r"is a schedule.*\n.*one perturbation"):
+        load_perturbation(path)
 
 
 @pytest.mark.parametrize(

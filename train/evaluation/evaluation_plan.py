@@ -36,6 +36,7 @@ from restock.train.twin.physics.perturbation import (
     Perturbation,
     Schedule,
     find_perturbation,
+    is_schedule,
 )
 
 CLEAN = "none"
@@ -270,11 +271,7 @@ def _perturb(name: str) -> Perturbation | None:
         return None
     perturbation = find_perturbation(name, where="--perturbations")
     if isinstance(perturbation, Schedule):
-        raise ConfigError(
-            "is a schedule: policies are compared under the same parameters",
-            where=name,
-            remedy="give the TOML file of one perturbation",
-        )
+        raise is_schedule(name)
     if perturbation.timestep_s != Perturbation().timestep_s:
         raise ConfigError(
             f"is for a timestep of {perturbation.timestep_s:g} s, but the evaluation runs at "

@@ -100,9 +100,23 @@ def load_perturbation(path: Path) -> Perturbation:
     """Read a perturbation from TOML: one `field = number` a line.
 
     Raises:
-        ConfigError: no such file, a field that does not exist, or a value out of its range.
+        ConfigError: no such file, a field that does not exist, a value out of its range, or a
+            schedule.
     """
-    return typed(read_toml(path), Perturbation, where=str(path), remedy=_FIELDS)
+    values = read_toml(path)
+    if "ranges" in values:
+        raise is_schedule(str(path))
+    return typed(values, Perturbation, where=str(path), remedy=_FIELDS)
+
+
+def is_schedule(where: str) -> ConfigError:
+    """The refusal of a schedule where one set of parameters is needed."""
+    return ConfigError(
+        "is a schedule, whose parameters differ from episode to episode: here they must be fixed",
+        where=where,
+        remedy="give the TOML file of one perturbation (`restock twin fit` without "
+        "--per-recording writes one)",
+    )
 
 
 def load_schedule(path: Path) -> Schedule:
