@@ -40,6 +40,12 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
     from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, get_typestore
 
+    if not recording.exists():
+        raise RecordingError(
+            "no such file or folder",
+            where=str(recording),
+            remedy="give an MCAP file or a rosbag2 folder",
+        )
     profile = pilot.profile
     command, task = profile.inputs.command, profile.task
     period_ns, fired_ns = round(task.control_period_s * NS), None

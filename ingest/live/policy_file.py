@@ -13,11 +13,13 @@ import numpy as np
 
 from restock.arrays import F32
 from restock.errors import ConfigError
+from restock.files import first_line
 from restock.imports import import_extra
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.profile.profile_text import read_profile_toml
 
 FORMAT = "restock-policy/1"
+_REMEDY = "give the file that `restock export RUN --to onnx --out policy.onnx` wrote"
 
 
 class PolicyFile:
@@ -74,11 +76,12 @@ def open_session(path: Path) -> Any:
     """The ONNX runtime's session of a file, on one thread.
 
     Raises:
-        ConfigError: no such file, no ONNX model, or the runtime is not installed.
+        ConfigError: no such file, a folder, no ONNX model, or the runtime is not installed.
     """
     runtime = import_extra("onnxruntime", "onnx", "an exported policy is run by onnxruntime")
     if not path.is_file():
-        raise ConfigError("no such file", where=str(path), remedy="restock export RUN --to onnx")
+        what = "is a folder, not an ONNX file" if path.is_dir() else "no such file"
+        raise ConfigError(what, where=str(path), remedy=_REMEDY)
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1  # a small network: handing it out costs more
     options.log_severity_level = 4
@@ -86,7 +89,7 @@ def open_session(path: Path) -> Any:
         return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise ConfigError(
-            f"is not an ONNX model: {str(error).splitlines()[0]}", where=str(path)
+            f"is not an ONNX model: {first_line(error)}", where=str(path), remedy=_REMEDY
         ) from error
 
 

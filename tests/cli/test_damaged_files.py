@@ -6,6 +6,7 @@ No traceback and no exit 1: that one means that an audit failed or a comparison 
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 from pathlib import Path
 
@@ -372,6 +373,25 @@ def test_too_little_memory_is_said_by_a_verb_without_a_limit(
     assert "9 GiB used" in said
     assert "free some memory" in said
     assert not {"damaged", "Possible", "--memory-limit"} & set(said.split())
+
+
+def test_a_mujoco_gl_that_cannot_be_used_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mujoco.rendering.classic import gl_context
+
+    def imported(args: list[str]) -> int:  # again, as the first import of MuJoCo in a process does
+        runpy.run_path(str(gl_context.__file__), run_name=gl_context.__name__)
+        return 0
+
+    monkeypatch.setattr(cli, "_dispatch", imported)
+    monkeypatch.setenv("MUJOCO_GL", "foo")
+    assert cli.main(["twin", "layout", "default"]) == 2
+    said = capsys.readouterr().err
+    assert "MUJOCO_GL in the environment: MuJoCo cannot use 'foo'" in said
+    assert "egl, osmesa or glfw" in said
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert cli.main(["twin", "layout", "default"]) == 0
 
 
 def test_what_nobody_foresaw_exits_2_and_developers_see_where(

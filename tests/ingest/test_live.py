@@ -106,8 +106,8 @@ def test_a_recording_is_played_at_the_shell(
     assert main(["node", str(tmp_path / "none.onnx"), "--on", str(BAG)]) == 2
     assert main(["node", str(policy)]) == 2
     said = capsys.readouterr().err
-    assert "cannot be played" in said
-    assert "no such file" in said
+    assert "none: no such file or folder" in said
+    assert "none.onnx: no such file" in said
     assert "needs ROS 2" in said
 
 

@@ -86,7 +86,8 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, ca
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())
     for name, said in (
         ("missing.onnx", "no such file"),
-        ("text.onnx", "is not an ONNX model"),
+        (".", r"is a folder, not an ONNX file\n.*restock export"),
+        ("text.onnx", r"is not an ONNX model.*\n.*restock export"),
         ("other.onnx", r"the task's observation is \(N, "),
     ):
         with pytest.raises(ConfigError, match=said):

@@ -177,11 +177,15 @@ def test_scans_that_do_not_fit_together_leave_the_corridor(tmp_path: Path) -> No
     assert made.by == "corridor"
 
 
-def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(tmp_path: Path) -> None:
+def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     origin = (-3.0, 2.0, 0.0)
     poses = lap(origin)[:-30]  # not the whole way round
     bag = write_bag(tmp_path / "bag", poses=poses, grid=OccupancyGrid(hall(), CELL_M, origin))
     arguments = ["twin", "layout", "--from", str(bag), "--out", str(tmp_path / "floor.toml")]
+    assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.txt")]) == 2
+    assert "'a.txt' does not end in .png" in capsys.readouterr().err
     assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.png")]) == 0
     floor = read_floor(tmp_path / "floor.toml")
     assert (floor.width_m, floor.depth_m) == pytest.approx((8.6, 6.6))

@@ -17,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from restock import native
+from restock.cli.failures import GL, NO_GL
 from restock.errors import ExitCode, RestockError
 from restock.files import cores
 from restock.imports import install_command
@@ -146,10 +147,9 @@ def _drawing() -> Finding:
         backend = os.environ.get("MUJOCO_GL", "egl")
         return Finding("works", "pictures", "ok", f"MuJoCo renders off screen ({backend})")
     why = (ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"])[-1]
-    remedy = (
-        "install libegl1 (or set MUJOCO_GL=osmesa and install libosmesa6); only the twin's "
-        "cameras need it"
-    )
+    remedy = "install libegl1; only the twin's cameras need it"
+    if os.environ.get(GL):
+        remedy = f"{GL} is {os.environ[GL]!r}: {NO_GL}"
     return Finding("works", "pictures", "missing", why, remedy)
 
 

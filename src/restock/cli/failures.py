@@ -7,6 +7,7 @@ traceback as well, for those who develop Restock.
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Sequence
 
@@ -16,6 +17,8 @@ from restock.files import first_line
 
 _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = f"{_CHECK}; `restock compact STORE --drop-damaged --dry-run` looks for one in a store"
+GL = "MUJOCO_GL"
+NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
 # package of an exception -> what to do
 _REMEDIES = {
     "duckdb": _OF_A_STORE,
@@ -58,6 +61,12 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             where=" -> ".join(files) or where,
             remedy="check the path, the permissions and the free space",
         )
+    if _in_gl(error):  # of MuJoCo as it is imported: any verb that needs the twin
+        return RestockError(
+            f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}",
+            where=f"{GL} in the environment",
+            remedy=NO_GL,
+        )
     package = kind.__module__.split(".")[0]
     if package == "torch" and kind.__name__ == "OutOfMemoryError":
         return RestockError(
@@ -88,6 +97,14 @@ def _out_of_memory(error: BaseException | None) -> str:
     return ""
 
 
+def _in_gl(error: Exception) -> bool:
+    """Whether it came through the module in which MuJoCo loads what MUJOCO_GL names."""
+    names = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return GL in os.environ and any(
+        str(name).startswith("mujoco.") and str(name).endswith("gl_context") for name in names
+    )
+
+
 def _at(error: Exception) -> str:
     """The innermost line of Restock that it came through."""
     lines = [
@@ -98,4 +115,4 @@ def _at(error: Exception) -> str:
     return lines[-1] if lines else ""
 
 
-__all__ = ["as_restock_error"]
+__all__ = ["GL", "NO_GL", "as_restock_error"]

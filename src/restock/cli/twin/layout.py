@@ -105,6 +105,12 @@ class LayoutCommand:
     def _to_write(self, maps: bool) -> list[Path]:
         if self.out is not None and not maps and self.out.suffix != ".toml":
             raise RestockError(f"{self.out.name!r} ends in neither .toml nor .yaml", where="--out")
+        if self.png is not None and self.png.suffix.lower() != ".png":
+            raise RestockError(
+                f"{self.png.name!r} does not end in .png",
+                where="--png",
+                remedy="a PNG is all that it writes: give FILE.png",
+            )
         written = [path for path in (self.out, self.png, self.zones) if path is not None]
         if maps and self.out is not None:
             written.append(self.out.with_suffix(".pgm"))
