@@ -227,9 +227,9 @@ class ShareController(Stateful):
 
     def at(self, env_steps: float) -> bool:
         """Before a batch is drawn: move to its moment. True where the shares changed."""
+        self.env_steps = env_steps
         if not self._moves or self.batches % REFRESH_BATCHES:
             return False
-        self.env_steps = env_steps
         return self._work_out("redistribute")
 
     def count(self, stratum: NDArray[Any]) -> None:
@@ -283,7 +283,7 @@ class ShareController(Stateful):
             else source.dro.shares
         )
         drawn = self.drawn[source.strata]
-        ahead = max(source.offline + source.online - float(drawn.sum()), 1.0)
+        ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
         limit = np.where(source.rows > 0, 1.0, 0.0)
         if self.max_replays is not None:
             left = np.maximum(self.max_replays * source.rows - drawn, 0)
@@ -311,6 +311,18 @@ class ShareController(Stateful):
         online = ahead - offline
         filled = plan.scale if online <= 0 else min(max(fill - offline, 0.0) / online, 1.0)
         return plan.got, plan.scale, filled
+
+    def _ahead(self, source: _SourceDraws, drawn: float) -> float:
+        """The draws that batches to come ask of a source: not what those before did not get."""
+        by_draws = source.offline + source.online - drawn
+        begin, end = self.planned.begin_env_steps, self.planned.end_env_steps
+        if drawn < source.offline or self.env_steps <= begin or end <= begin:
+            return by_draws
+        part = self.mixture.sources.parts[source.name]
+        now = min(self.env_steps, end)
+        whole = mean_over(part, begin, end) * (end - begin)
+        left = mean_over(part, now, end) * (end - now) / max(whole, 1e-12)
+        return min(by_draws, source.online * left)
 
     def describe(self) -> list[dict[str, Any]]:
         """A row a stratum, for people and for a run's table `shares`."""

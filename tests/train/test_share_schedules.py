@@ -66,6 +66,23 @@ def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     assert shrunk.logs_share == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize(
+    "logs", ["0.5", "{schedule='linear', start=0.9, end=0.1, to_env_steps=1000}"]
+)
+def test_rows_that_bear_too_few_draws_bear_them_all(logs: str) -> None:
+    """Each time shares were worked out again, what batches had not got was asked for once more, so
+    with a schedule each later batch got less: .69 of the draws."""
+    text = f"max_replays_per_row=50\n[sources]\nlogs={logs}\n{HALVES}"
+    plan = controller(text, [100, 100], PlannedDraws(0, 128_000, 0, 1000))
+    owed = 0.0
+    for step in range(1000):
+        plan.at(step)
+        owed += 128 * plan.logs_share
+        plan.count(np.arange(int(owed)) % 2)
+        owed -= int(owed)
+    assert plan.drawn.sum() == pytest.approx(200 * 50, rel=0.05)
+
+
 def test_shares_follow_schedules_of_sources_and_strata() -> None:
     text = (
         "[sources]\nlogs = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n"
