@@ -27,7 +27,7 @@ from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
-from restock.ingest.steps.episodes import Split, split
+from restock.ingest.steps.episodes import split, why_none
 from restock.ingest.steps.needs import as_recorded, read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.corrections import (
@@ -203,10 +203,11 @@ class _Ingest:
         watch, ticks = self.recording.watch, len(steps)
         episodes = split(profile.task, steps)
         if not episodes.transitions:
+            why, remedy = why_none(steps, episodes)
             raise RecordingError(
-                f"gives no transition with the profile {self.profile.name!r}: "
-                f"{_why(steps, episodes)}",
-                remedy="choose another --profile, or correct its maximum ages; see docs/ingest.md",
+                f"gives no transition with the profile {self.profile.name!r}: {why}",
+                remedy=remedy
+                or "choose another --profile, or correct its maximum ages; see docs/ingest.md",
             )
         provenance = Provenance(
             self.recording.recording_id, self.ingest_id, visible(self.path), software_version()
@@ -359,10 +360,3 @@ class _Ingest:
                 )
             )
         return notes
-
-
-def _why(steps: Steps, episodes: Split) -> str:
-    if not len(steps):
-        return "it contains no command, so there are no steps"
-    reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
-    return "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons)

@@ -26,10 +26,9 @@ from restock.ingest.propose.evidence.roles import (
 from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.proposal_lines import profile_lines, steered_by
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
+from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import as_recorded, read_topics
-
-LOG_TIME = 'alignment = "log_time"'  # as refusals of header stamps say
 
 # What a recording lacks -> what to do about it.
 REMEDIES = {
@@ -125,7 +124,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     trial = Trial()
     if not problems:
         trial = tried(recording, text)
-        if trial.problem and LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
+        if trial.problem and BY_LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
         seen, trial = _by_rate(recording, seen, name, trial)

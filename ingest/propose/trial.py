@@ -19,7 +19,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
-from restock.ingest.steps.episodes import Split, split
+from restock.ingest.steps.episodes import Split, split, why_none
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.conditions import in_steps
 from restock.ingest.task.task import Task
@@ -72,14 +72,15 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         steps = steps_of(profile, topics)
     except RecordingError as error:
         return Trial(problem=f"{error.what}; {error.remedy}" if error.remedy else error.what)
-    if not len(steps):
-        return Trial(problem="it contains no command, so there are no steps")
     episodes = split(profile.task, steps)
+    why, remedy = why_none(steps, episodes)
+    why = f"{why}; {remedy}" if remedy else why
+    if not len(steps):
+        return Trial(problem=why)
     endings = Counter(episode.ended_by for episode in episodes.episodes)
     asked = _Advisor(profile, topics, steps, episodes)
     advice = [*asked.ages(), *asked.gaps(), *asked.ticks(), *asked.outline()]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
-    why = "; ".join(f"{reason}: {count} of {len(steps)} ticks" for reason, count in worst)
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]
     return Trial(

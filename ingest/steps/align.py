@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it was received
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
+BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
 TOLERANCE_S = 0.1  # half a control period
 MOST_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
@@ -132,8 +133,8 @@ def align(
     stamped = stamped_topics(topics, latched | transforms)
     if not stamped:
         raise RecordingError(
-            "none of the profile's topics has a header stamp",
-            remedy='set [clock] alignment = "log_time" in the profile',
+            "none of the profile's topics has a header stamp (other than zero)",
+            remedy=BY_LOG_TIME,
         )
     reference = max(stamped, key=lambda name: (len(stamped[name]), name))
     if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > clock.jump_s * NS:
@@ -167,11 +168,12 @@ def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool
 def stamped_topics(
     topics: Mapping[str, TopicColumns], besides: frozenset[str]
 ) -> dict[str, TopicColumns]:
-    """Every topic with header stamps and messages, but those `besides`."""
+    """Every topic with header stamps and messages, but those `besides`. Drivers that do not fill
+    stamps in leave them at zero: such a topic does not say what time it is."""
     return {
         name: columns
         for name, columns in topics.items()
-        if STAMP in columns.fields and name not in besides and len(columns)
+        if STAMP in columns.fields and name not in besides and np.any(columns.fields[STAMP])
     }
 
 
@@ -302,7 +304,7 @@ class _Drifts:
                 f"log time and header stamps drift apart, and {source} gives the time of a "
                 f"message only within {spread / NS:.2f} s (1st to 99th percentile), more than"
                 f" the {self.tolerance_ns / NS:g} s of half a control period",
-                remedy='set [clock] alignment = "log_time" in the profile',
+                remedy=BY_LOG_TIME,
             )
         ahead = []  # of the map, by topic: the least delayed one shows best when it was sent
         for name, columns in stamped.items():
@@ -369,6 +371,7 @@ def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> Non
 
 
 __all__ = [
+    "BY_LOG_TIME",
     "CLOCK_FIELD",
     "CLOCK_TOPIC",
     "NS",

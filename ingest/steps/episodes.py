@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from restock.arrays import Bools, Ints
+from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
@@ -64,6 +65,24 @@ def split(task: Task, steps: Steps) -> Split:
         goal, plan = routing.goal[changed - 1], routing.plan[changed - 1]
         old_route[changed] = terminated(task, with_route(task, steps, changed, goal, plan))
     return _Walk(task, steps, terminated(task, steps.signals), old_route).walk()
+
+
+def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
+    """Why a recording gives no transition, and what to do about it where that is known."""
+    reasons = sorted(episodes.dropped.items(), key=lambda item: -item[1])
+    why = [f"{reason}: {count} of {len(steps)} ticks" for reason, count in reasons]
+    off = steps.clock.off_clock
+    mostly = [one for one in steps.clocks if off.get(one.topic, 0) > one.messages / 2]
+    if not len(steps):
+        command = "no command whose time is usable" if mostly else "no command"
+        why = [f"it contains {command}, so there are no steps"]
+    for one in mostly:
+        zero = f", {one.zero_stamps:,} are zero" if one.zero_stamps else ""
+        why.append(
+            f"{off[one.topic]:,} of {one.messages:,} messages of {one.topic} were left out: their "
+            f"header stamps do not fit the clock{zero}"
+        )
+    return "; ".join(why), BY_LOG_TIME if mostly else None
 
 
 def changed_route(steps: Steps) -> Ints:

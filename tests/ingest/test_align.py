@@ -20,6 +20,7 @@ from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, Samples, align, ticks_of
+from restock.ingest.steps.clocks import STAMP
 
 stamps = st.lists(st.integers(0, 10_000), max_size=30).map(sorted)
 
@@ -177,6 +178,37 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
     out = tmp_path / "new.toml"
     assert main(["profile", "new", str(bag), "--out", str(out)]) in (0, 3)
     assert out.exists()
+
+
+def never_stamped(drive: Drive, *names: str) -> dict[str, Any]:
+    """A drive's typed topics, some of a driver that leaves header stamps at zero."""
+    found = dict(typed_topics(drive))
+    for name in names:
+        kind, topic = found[name]
+        fields = {**topic.fields, STAMP: np.zeros(len(topic), np.int64)}
+        found[name] = kind, TopicColumns(topic.log_time_ns, topic.publish_time_ns, fields)
+    return found
+
+
+@pytest.mark.parametrize("names", [("/imu",), ("/odom", "/imu")])
+def test_stamps_that_a_driver_left_at_zero_are_named(names, tmp_path, capsys):
+    bag = write_topics(never_stamped(Drive(4.0), *names), tmp_path / "bag")
+    assert main(["ingest", str(bag), "--dry-run"]) == 2
+    said = capsys.readouterr().err
+    for name in names:
+        assert (
+            f"200 of 200 messages of {name} were left out: their header stamps do not fit the "
+            "clock, 200 are zero"
+        ) in said
+    assert 'set [clock] alignment = "log_time" in the profile' in said
+    assert main(["profile", "check", "warehouse_amr", str(bag)]) == 2
+    assert "200 of 200 messages of /imu were left out" in capsys.readouterr().err
+
+
+def test_topics_without_a_stamp_other_than_zero_are_no_clock():
+    topics = never_stamped(Drive(4.0), "/odom")
+    with pytest.raises(RecordingError, match=r"has a header stamp \(other than zero\)"):
+        align({"/odom": topics["/odom"][1]}, Clock())
 
 
 @pytest.mark.parametrize("alignment", ["header.stamp", "log_time"])
