@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from functools import lru_cache
+from math import isnan, nan
 from typing import Any
 
 import numpy as np
@@ -94,9 +95,19 @@ class Filling:
     def behaviour(self) -> list[tuple[str, str | None, float | None]]:
         """Who acted at each tick: policy, version, probability of the action."""
         default, by = self.profile.behaviour_policy, self.aligned.commanded_by()
-        return [
+        found = [
             (source or default, None, None) if text is None else parse_policy(text)
             for text, source in zip(self.texts("behaviour_policy"), by, strict=True)
+        ]
+        wrong = [chance is not None and isnan(chance) for _, _, chance in found]
+        if any(wrong):
+            self.notes.append(
+                f"behaviour_policy: the probability at {sum(wrong):,} of {len(wrong):,} ticks is "
+                "not in (0, 1], and is treated as unknown"
+            )
+        return [
+            (name, version, None if bad else chance)
+            for (name, version, chance), bad in zip(found, wrong, strict=True)
         ]
 
     def texts(self, name: str) -> list[str | None]:
@@ -337,16 +348,23 @@ def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
 
 @lru_cache(maxsize=1024)
 def parse_policy(text: str) -> tuple[str, str | None, float | None]:
-    """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three."""
+    """`{"policy": …, "version": …, "probability": …}`, or a bare name, to the three.
+
+    NaN is a probability that is none, as -3 is.
+    """
     try:
         message = json.loads(text)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):  # a ValueError: not JSON, or a number of too many digits
         return text.strip() or "unknown", None, None
     if not isinstance(message, dict):
         return str(message), None, None
-    version, probability = message.get("version"), message.get("probability")
+    name, version, chance = (message.get(key) for key in ("policy", "version", "probability"))
+    if chance is not None:
+        is_number = isinstance(chance, int | float) and not isinstance(chance, bool)
+        # A float32 sum may be a little above 1.
+        chance = min(float(chance), 1.0) if is_number and 0 < chance < 1 + 1e-6 else nan
     return (
-        str(message.get("policy", "unknown")),
+        "unknown" if name is None else str(name),
         None if version is None else str(version),
-        float(probability) if isinstance(probability, int | float) else None,
+        chance,
     )

@@ -59,7 +59,7 @@ def parse_perturbation(text: str) -> tuple[str, dict[str, float]] | None:
         message = json.loads(text)
         name, values = message["name"], message["values"]
         numbers = {field: float(value) for field, value in values.items()}
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return None
     if not isinstance(name, str) or not all(isfinite(value) for value in numbers.values()):
         return None

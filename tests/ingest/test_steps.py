@@ -198,6 +198,21 @@ def test_policies_are_json_or_a_bare_name():
     assert parse_policy(" planner ") == ("planner", None, None)
     assert parse_policy("") == ("unknown", None, None)
     assert parse_policy("3") == ("3", None, None)
+    assert parse_policy('{"policy": null, "probability": 1.0000001}') == ("unknown", None, 1.0)
+    for text in ("[" * 100_000, "9" * 5_000):
+        assert parse_policy(text) == (text, None, None)
+
+
+@pytest.mark.parametrize("said", ["-3", "0", "7", "NaN", "true", '"high"', "9" * 400])
+def test_a_probability_that_is_none_is_unknown_and_counted(said):
+    texts = [(0.0, f'{{"policy": "dqn", "probability": {said}}}'), (2.0, "planner")]
+    steps = steps_of(PROFILE, Drive(policies=texts).topics())
+    assert steps.policy[:10] == ["dqn"] * 10
+    assert steps.probability == [None] * 30
+    assert (
+        "behaviour_policy: the probability at 10 of 30 ticks is not in (0, 1], and is treated as "
+        "unknown"
+    ) in steps.notes
 
 
 def test_a_robot_that_was_carried_does_not_drive_on():

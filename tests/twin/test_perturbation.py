@@ -173,7 +173,11 @@ def test_fresh_episodes_are_forgotten_with_their_rows() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["wet", "3", '{"name": "wet"}', '{"name": 1, "values": {}}', '{"name": "a", "values": 1}'],
+    [
+        *("wet", "3", '{"name": "wet"}', '{"name": 1, "values": {}}', '{"name": "a", "values": 1}'),
+        *("[" * 100_000, '{"name": "a", "values": {"x": ' + "9" * 400 + "}}"),
+    ],
+    ids=lambda text: text[:40],
 )
 def test_what_is_no_perturbation_is_not_known_and_said(text: str) -> None:
     assert parse_perturbation(text) is None
