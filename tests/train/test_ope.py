@@ -196,6 +196,9 @@ def test_the_verb_evaluates_and_says_why_it_refuses(
     assert "refused" in said.out
     assert "episodes, less than" in " ".join(said.err.split())
     assert "are estimated (cloned) for" in " ".join(said.err.split())
+    # The quick models make 2 regressions, so they see less than the task's 240 steps.
+    reach = "looks 2 steps ahead, but an episode may take 240 (9 of 9 held-out episodes are longer)"
+    assert reach in " ".join(said.err.split())
     assert main([*argv, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["results"]
     table = pq.read_table(run / "eval" / "off_policy.parquet").to_pylist()

@@ -41,7 +41,7 @@ class Transitions:
 class FittedQConfig:
     """How a model is fitted."""
 
-    iterations: int = 240  # the time limit of the warehouse task, in steps
+    iterations: int = 240  # steps that it looks ahead: the warehouse task's time limit
     updates: int = 25  # gradient steps an iteration
     batch_size: int = 256
     hidden: Sequence[int] = (128, 128)

@@ -110,7 +110,21 @@ def evaluate_run_off_policy(
         clocks = {"env_steps": None, "gradient_steps": steps}
         table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
         write_table(table, path / "eval" / FILE)
-    return OpeResult(rows, dataset.notes, agent.version)
+    notes = dataset.notes + _beyond_the_model(task, dataset.evaluation, config.model.iterations)
+    return OpeResult(rows, notes, agent.version)
+
+
+def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...]:
+    """What is worth saying of episodes that may take more steps than the model looks ahead."""
+    if task.time_limit_steps <= reach:
+        return ()
+    lengths = np.bincount(steps.episode)
+    return (
+        f"the fitted model looks {reach:,} steps ahead, but an episode may take"
+        f" {task.time_limit_steps:,} ({int((lengths > reach).sum()):,} of {len(lengths):,} held-out"
+        " episodes are longer): its values leave out what comes later, such as a goal that is"
+        " reached then",
+    )
 
 
 def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
