@@ -315,9 +315,23 @@ def test_a_schedule_draws_a_perturbation_for_every_episode(tmp_path: Path) -> No
     expected = np.array(roll(made, 10, 0))
     made.load_state_dict(state)
     np.testing.assert_array_equal(np.array(roll(made, 10, 0)), expected)
+    np.testing.assert_array_equal(made.perturbation_name, again.perturbation_name)
     path.write_text("[ranges]\npayload_kg = [0, 500]\n")
     with pytest.raises(ConfigError, match=r"payload_kg must rise within \[0, 150\]"):
         load_schedule(path)
+
+
+def test_the_name_of_a_perturbation_is_whole_however_long() -> None:
+    names = [f"as fitted to the robots of the northern site, {which}" for which in ("old", "new")]
+    env = WarehouseVectorEnv(2)
+    env.set_episodes(
+        [EpisodeSpec("nominal", 1, Perturbation(name=name, payload_kg=5)) for name in names]
+    )
+    info = env.reset()[1]
+    assert info["perturbation"].tolist() == names
+    other = WarehouseVectorEnv(2)
+    other.load_state_dict(env.state_dict())
+    assert other.step(np.zeros(2, np.int64))[4]["perturbation"].tolist() == names
 
 
 def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: Any) -> None:

@@ -69,7 +69,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
     STATE = (
         *("specs", "observation", "signals", "previous_action", "steps", "bumps", "episode_number"),
-        *("episode_seed", "episode_condition", "block", "perturbation_name", "episodes_begun"),
+        *("episode_seed", "episode_condition", "block", "episodes_begun"),
         *("mission_arm", "diverged", "queue", "simulation", "sensing", "truth", "navigation"),
     )
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {"specs": list[EpisodeSpec]}
@@ -193,7 +193,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         self.episode_seed = np.zeros(num_envs, np.int64)
         self.episode_condition = np.full(num_envs, "nominal", "U16")
         self.block = np.full(num_envs, "none", "U8")
-        self.perturbation_name = np.full(num_envs, "nominal", "U32")
+        self.perturbation_name = np.full(num_envs, "nominal", object)  # of any length
         self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
 
     # -- floors ---------------------------------------------------------------------------------
