@@ -191,6 +191,8 @@ def _choice(text: str) -> Choice:
     text = text.strip()
     if not text:
         return Choice(None)
+    if re.fullmatch(r"[-:\d]*\d{10}[-:\d]*", text):
+        raise PathProblem(f"[{text[:24]}]: an index has at most 9 digits")
     if re.fullmatch(r"-?\d+", text):
         return Choice(int(text))
     if re.fullmatch(r"(-?\d+)?:(-?\d+)?(:\d+)?", text):

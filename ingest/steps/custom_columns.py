@@ -107,7 +107,7 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
             elif signal.values is not None or read.values.dtype.kind not in "biuf":
                 values, unread = _numbers(read.values, signal.values)
                 texts[f"{_key(name)}, no number"] = first = np.full(count, "", object)
-                first[read.message[unread]] = read.values[unread].astype(str)
+                first[read.message[unread]] = _texts(read.values[unread])
                 read = PathValues(read.message, values)
     except (PathProblem, ValueError, TypeError) as problem:
         raise RecordingError(
@@ -133,19 +133,24 @@ def _numbers(
     values: NDArray[Any], mapping: Mapping[str, float] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Values (V,) as numbers, NaN where they are none; and which of them say no number."""
-    kinds, inverse = np.unique(values.astype(str), return_inverse=True)
-    known = np.full(len(kinds), np.nan)
-    unread = np.zeros(len(kinds), np.bool_)
+    texts = _texts(values)
+    found: dict[str, float | None] = {}  # text -> its number; None: it is none
     numbers = (
         {key.lower(): value for key, value in mapping.items()} if mapping is not None else None
     )
-    for index, text in enumerate(kinds.tolist()):
+    for text in set(texts):
         plain = text.removesuffix(".0") if values.dtype.kind == "f" else text
         try:
-            known[index] = float(text) if numbers is None else numbers[plain.lower()]
+            found[text] = float(text) if numbers is None else numbers[plain.lower()]
         except (ValueError, KeyError):
-            unread[index] = True
-    return known[inverse], unread[inverse]
+            found[text] = None
+    read = [found[text] for text in texts]
+    return np.array(read, np.float64), np.array([one is None for one in read], np.bool_)
+
+
+def _texts(values: NDArray[Any]) -> list[str]:
+    """Values (V,) as texts. Not as NumPy's, each of which takes the memory of the longest."""
+    return [str(value) for value in (values if values.dtype.kind == "O" else values.astype(str))]
 
 
 def _reduced(read: PathValues, how: Reduce | None) -> PathValues:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from restock.errors import ConfigError, RecordingError, StoreError
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import refuse_other_signals
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.steps.custom_columns import column_of
 from restock.ingest.steps.steps import Steps, steps_of
 
 SAMPLE = ROOT / "sample_logs" / "amr_tuesday"
@@ -118,6 +120,20 @@ def test_texts_that_are_no_number_are_counted_and_shown():
     ]
     (row,) = steps.custom.rows()
     assert (row["messages"], row["found"], row["unread"], row["steps"]) == (3, 1, 2, 5)
+
+
+def test_a_long_text_takes_its_own_memory_alone():
+    said = np.array(["n/a", "1"] * 2_000, object)
+    said[7] = "x" * 100_000
+    topic = TopicColumns(np.arange(4_000), np.arange(4_000), {"t": said})
+    tracemalloc.start()
+    found = column_of(
+        "s", parse_profile(with_signals(signal("s", "t")), where="p").signals["s"], topic
+    )
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (found.found, len(found.unread)) == (1_999, 2_001)
+    assert most < 4_000_000  # NumPy's own texts are all as long as the longest: 1.6 GB
 
 
 def test_a_quaternion_becomes_its_yaw():

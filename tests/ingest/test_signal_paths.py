@@ -108,6 +108,8 @@ def test_an_index_is_pythons(rows):
         ("1a", "cannot be read"),
         ("a b", "cannot be read"),
         ("a[::0]", "a step of 0"),
+        ("a[-99999999999999999999]", "an index has at most 9 digits"),
+        ("a[::9999999999]", "an index has at most 9 digits"),
     ],
 )
 def test_invalid_paths(path, problem_text):
