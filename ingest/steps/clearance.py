@@ -18,13 +18,15 @@ from restock.ingest.task.task import Task
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
 BEAMS = "number of beams"  # (N,) int64
 BLIND = "whether no beam has a valid range"  # (N,) bool; inf is one: nothing was hit
+UNAIMED = "whether its angles say where no beam points"  # (N,) bool
 
 _VALUES = 1 << 18  # ranges reduced at a time: what is in between stays in the processor's cache
 _MAPS = 64  # geometries that are remembered; a lidar has one
+_TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
 def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reduction:
-    """What makes SECTORS, BEAMS and BLIND of a topic's scans, by the profile input's `fields`.
+    """What makes SECTORS, BEAMS, BLIND and UNAIMED of scans, by the profile input's `fields`.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
@@ -48,14 +50,18 @@ class _ScanReducer:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
         blind = np.zeros(len(beams), np.bool_)
-        geometry = np.stack([first, increment, beams], axis=1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            angles = np.maximum(np.abs(first), np.abs(first + increment * (beams - 1)))
+        unaimed = (beams > 0) & ~(angles <= _TURNS_RAD)  # so is NaN
+        unaimed |= (beams > 1) & (increment == 0)
+        geometry = np.stack([first, increment, np.where(unaimed, 0, beams)], axis=1)
         if len(geometry) and (geometry == geometry[0]).all():
             self._fill(clearance, blind, ranges, None, geometry[0])
         else:
             kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
             for index, one in enumerate(kinds):
                 self._fill(clearance, blind, ranges, np.flatnonzero(kind == index), one)
-        return {SECTORS: clearance, BEAMS: beams, BLIND: blind}
+        return {SECTORS: clearance, BEAMS: beams, BLIND: blind, UNAIMED: unaimed}
 
     def _fill(
         self,
@@ -67,7 +73,7 @@ class _ScanReducer:
     ) -> None:
         """Clearance and blindness of these rows (None: of all), which have one geometry."""
         first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
-        if not beams or not np.isfinite(first + increment):
+        if not beams:
             return
         sectors, task = self._map(first, increment, beams), self.task
         count = len(clearance) if rows is None else len(rows)

@@ -19,7 +19,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.topic_reading import Fields
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, scan_reduction
+from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.steps.motion import motion_at
 from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
 from restock.ingest.task.hindsight import missions
@@ -233,9 +233,13 @@ class Filling:
                 beams = np.zeros(count, np.int64)
                 beams[fresh] = np.asarray(fields[BEAMS])[rows]
                 self._mark_invalid(fresh & (beams == 0), "scan: no beams")
-                blind = np.zeros(count, np.bool_)
-                blind[fresh] = np.asarray(fields[BLIND])[rows]
-                self._mark_invalid(blind, "scan: no beam has a valid range")
+                for flag, reason in (
+                    (BLIND, "no beam has a valid range"),
+                    (UNAIMED, "unusable angles"),
+                ):
+                    bad = np.zeros(count, np.bool_)
+                    bad[fresh] = np.asarray(fields[flag])[rows]
+                    self._mark_invalid(bad, f"scan: {reason}")
                 sectors[fresh] = np.asarray(fields[SECTORS])[rows]
         nearest = sectors.min(axis=1) if self.task.sectors else np.full(count, np.nan)
         self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}

@@ -11,7 +11,7 @@ from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps import clearance
-from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, scan_reduction
+from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.scan import SectorMap
 
 TASK = load_profile("warehouse_amr").task
@@ -58,7 +58,7 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
             REDUCE.apply({name: take(column, some) for name, column in fields.items()})
             for some in (rows[:at], rows[at:])
         ]
-    for name in (SECTORS, BEAMS, BLIND):
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
         together = np.concatenate([np.asarray(part[name]) for part in parts])
         assert np.array_equal(np.asarray(whole[name]), together)
     for row, (beams, first) in enumerate(kinds):
@@ -75,6 +75,7 @@ def test_a_scan_by_itself_gives_what_it_gives_among_others(
         assert np.array_equal(np.asarray(whole[SECTORS])[row], expected)
         assert np.asarray(whole[BEAMS])[row] == beams
         assert np.asarray(whole[BLIND])[row] == blind
+        assert np.asarray(whole[UNAIMED])[row] == (beams > 0 and np.isnan(first))
 
 
 def test_ranges_of_a_fixed_size_are_no_different() -> None:

@@ -122,6 +122,22 @@ def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
     assert set(np.array(steps.problem)[~blind]) == {""}
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *(("angle_increment", value) for value in (np.nan, np.inf, 0.0, 5.0)),
+        *(("angle_min", value) for value in (np.nan, -180.0)),
+    ],
+)
+def test_a_scan_whose_beams_point_nowhere_is_not_free_floor(field, value):
+    topics = Drive().topics()
+    topics["/scan"].fields[field][30:40] = value  # of 1 s; angles in degrees, or not filled in
+    steps = steps_of(PROFILE, topics)
+    unaimed = np.array(steps.problem) == "scan: unusable angles"
+    assert unaimed.sum() == 5
+    assert set(np.array(steps.problem)[~unaimed]) == {""}
+
+
 def proposed(time_s, speed_mps):
     fields = {"linear.x": np.asarray(speed_mps, float), "angular.z": np.full(len(time_s), -0.2)}
     return columns(np.asarray(time_s), fields, stamped=False)
