@@ -173,7 +173,9 @@ def stamped_topics(
     return {
         name: columns
         for name, columns in topics.items()
-        if STAMP in columns.fields and name not in besides and np.any(columns.fields[STAMP])
+        if STAMP in columns.fields
+        and name not in besides
+        and np.any(np.asarray(columns.fields[STAMP]))
     }
 
 

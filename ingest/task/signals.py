@@ -124,8 +124,15 @@ def wrap_angle(angle_rad: NDArray[Any]) -> NDArray[Any]:
 def yaw_of(
     x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], w: NDArray[Any]
 ) -> NDArray[np.float64]:
-    """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
-    with np.errstate(over="ignore", invalid="ignore"):  # NaN stays NaN
+    """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise.
+
+    NaN where one has no length: it was not filled in. Those of other lengths are normalised.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # NaN stays NaN
+        length = np.sqrt(x * x + y * y + z * z + w * w)
+        scale = np.where((length > 1e-9) & (length < np.inf), 1 / length, np.nan)
+        scale[np.abs(length - 1) < 1e-3] = 1.0
+        x, y, z, w = (part * scale for part in (x, y, z, w))
         return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), np.float64)
 
 

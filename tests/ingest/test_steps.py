@@ -122,6 +122,13 @@ def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
     assert set(np.array(steps.problem)[~blind]) == {""}
 
 
+def test_a_pose_without_an_orientation_looks_nowhere():
+    topics = Drive().topics()
+    topics["/amcl_pose"].fields["pose.pose.orientation.w"][30:40] = 0.0  # of 1 s: all four are
+    steps = steps_of(PROFILE, topics)
+    assert steps.problem.count("pose: not finite") == 5
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.scan import Body
-from restock.ingest.task.signals import SIGNALS, localised_velocity, wrap_angle
+from restock.ingest.task.signals import SIGNALS, localised_velocity, wrap_angle, yaw_of
 from restock.ingest.task.task import (
     Mirror,
     Rewards,
@@ -291,3 +291,10 @@ def test_actions_have_names_for_people():
     names = load_profile("warehouse_amr").task.action_names
     assert len(set(names)) == len(names)
     assert names[0] == "stop"
+
+
+def test_a_quaternion_without_a_length_has_no_yaw_and_any_other_length_the_same():
+    turn = np.array([0.1, -0.2, 0.5, 0.8])
+    yaw = yaw_of(*(turn / np.linalg.norm(turn))[:, None])[0]
+    scaled = yaw_of(*np.outer(turn, [1.0, 1e-6, 40.0, 0.0, 1e300, np.nan]))
+    assert scaled == pytest.approx([yaw, yaw, yaw, np.nan, np.nan, np.nan], nan_ok=True)
