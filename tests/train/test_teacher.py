@@ -38,7 +38,7 @@ from restock.train.dqn.behaviour import (
     make_policy,
     plausible_actions,
 )
-from restock.train.dqn.config import TeacherConfig, parse_config
+from restock.train.dqn.config import GIVEN, TeacherConfig, parse_config
 from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.loss import td_target
@@ -346,6 +346,7 @@ def test_rows_are_mirrored_where_the_operator_teaches_and_turns_have_their_oppos
         ([1.0, 1.0, 1.0, 1.0], r"returned float64 \(4,\)"),
         ([1, 1, 3, 1], "returned action 3 for environment 2: the task's are 0 to 2"),
         ([1, -2, 0, 1], "returned action -2 for environment 1"),
+        ([[1], [1, 2], [0], [1]], "returned a list that is no array"),
     ],
 )
 def test_a_teacher_that_gives_no_action_is_refused(
@@ -356,6 +357,18 @@ def test_a_teacher_that_gives_no_action_is_refused(
         train(live)
     live.close()
     assert live.progress.online_updates == 0
+
+
+def test_what_a_teacher_does_to_its_observations_stays_with_it() -> None:
+    def answer(env: Any, observation: Any) -> Any:
+        observation[:] = 0
+        return np.ones(len(observation), np.int64)
+
+    asked = open_teacher(TeacherConfig(source=GIVEN), TASK, seed=0, given=answer)
+    assert asked is not None
+    observation = np.ones((4, 3), np.float32)
+    assert asked.ask(None, observation).tolist() == [1, 1, 1, 1]
+    assert observation.all()
 
 
 TEACHERS = """

@@ -101,9 +101,15 @@ class AskedTeacher(Stateful):
                 the task has not.
         """
         with _of_the_user(f"the teacher {self._name}", self._teacher.act):
-            given = self._teacher.act(env, observation)
-        label = np.asarray(given)
+            # A copy: what it does to it does not reach what the agent sees and the run keeps.
+            given = self._teacher.act(env, observation.copy())
         count = len(observation)
+        try:
+            label = np.asarray(given)
+        except (TypeError, ValueError) as error:  # rows of several lengths, a tensor on a GPU
+            raise self._refused(
+                f"returned a {type(given).__name__} that is no array: {first_line(error)}"
+            ) from error
         if label.shape != (count,) or not np.issubdtype(label.dtype, np.integer):
             what = "nothing" if given is None else f"{label.dtype} {label.shape}"
             raise self._refused(f"returned {what}, not {count} whole numbers, one an environment")
