@@ -9,6 +9,7 @@ from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.feed.cloned_rows import cloned
+from restock.train.feed.practice import MOVING
 from restock.train.loop import TrainResult, time_left
 from restock.train.prepare import Prepared, rows_by_policy
 from restock.train.session import Session
@@ -93,6 +94,22 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
         " as at the beginning; online updates begin after"
         f" schedule.warmup_env_steps={config.schedule.warmup_env_steps:,}, once there are"
         f" replay.batch_size={config.replay.batch_size:,} rows: give more --env-steps"
+    )
+
+
+def unmoved(practised: list[dict[str, Any]], config: TrainConfig) -> str | None:
+    """Why the shares of a practice that was to follow success were never other than at first.
+
+    `practised` are the rows of the run's table `practice`; None where they moved, or are not to.
+    """
+    practice = config.practice
+    drawn = {(row["arm"], row["wanted_share"]) for row in practised}
+    if practice.rule not in MOVING or len(drawn) > len({arm for arm, _ in drawn}):
+        return None
+    return (
+        f'practice.rule="{practice.rule}" never changed the shares of the missions: it may at the'
+        f" end of every practice.every_env_steps={practice.every_env_steps:,}, by arms or kinds of"
+        f" which practice.warmup_episodes={practice.warmup_episodes:,} missions have ended"
     )
 
 

@@ -60,7 +60,7 @@ class Piecewise(Checked, frozen=True, tag_field="schedule", tag="piecewise"):
         steps = [step for step, _ in self.points]
         if not steps or any(b <= a for a, b in itertools.pairwise(steps)):
             raise ValueError(
-                f"a piecewise schedule needs points [env_steps, share] in rising order, got {steps}"
+                f"points must be [env_steps, share] with rising env_steps, got {steps}"
             )
 
     def at(self, env_steps: float) -> float:
@@ -112,6 +112,6 @@ def _part(ramp: Linear | Cosine, env_steps: float) -> float:
 def _check_span(ramp: Linear | Cosine) -> None:
     if ramp.from_env_steps >= ramp.to_env_steps:
         raise ValueError(
-            "a schedule needs from_env_steps < to_env_steps,"
-            f" got {ramp.from_env_steps} and {ramp.to_env_steps}"
+            f"to_env_steps must be above from_env_steps, which is {ramp.from_env_steps:,}, got"
+            f" {ramp.to_env_steps:,}"
         )

@@ -72,6 +72,10 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         ),
         (EVERY + "[sources]\nlogs = {schedule = 'step', start = 1}", "sources.logs.schedule"),
         (EVERY + "[sources]\nlogs = {schedule = 'piecewise', points = [[9, 1], [2, 0]]}", "rising"),
+        (
+            EVERY + "[sources]\nlogs = {schedule='linear', start=0, end=1, to_env_steps=0}",
+            r"sources\.logs\.to_env_steps must be above from_env_steps, which is 0, got 0",
+        ),
         (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
         (
             "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",

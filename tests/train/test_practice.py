@@ -21,7 +21,8 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.comparison.arms import differences
-from restock.train.dqn.config import PracticeConfig, load_config
+from restock.train.describe import unmoved
+from restock.train.dqn.config import PracticeConfig, load_config, parse_config
 from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.practice import Practice
 from restock.train.feed.practice_shares import logged_shares, moved, unordered, with_floors
@@ -187,6 +188,19 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
     assert sum(natural.values()) == pytest.approx(1.0)
 
 
+def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
+    moving = parse_config({"practice": {"rule": "success", "warmup_episodes": 9}}, where="here")
+    first = [{"arm": arm, "wanted_share": 0.5} for arm in ("nominal", "wheel_slip")]
+    for practised in ([], first, first * 2):
+        said = unmoved(practised, moving)
+        assert said is not None
+        assert "practice.every_env_steps=1,000" in said
+        assert "practice.warmup_episodes=9" in said
+    then = [{"arm": "nominal", "wanted_share": 0.4}, {"arm": "wheel_slip", "wanted_share": 0.6}]
+    assert unmoved(first + then, moving) is None
+    assert unmoved(first, parse_config({"practice": {"rule": "even"}}, where="here")) is None
+
+
 # -- refused by name ------------------------------------------------------------------------------
 
 
@@ -195,6 +209,7 @@ def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
     [
         ({"rule": "shares", "shares": {"fog": 1.0}}, "'fog' is not a kind of missions"),
         ({"rule": "shares", "shares": {"nominal": 0.0}}, "a share above 0"),
+        ({"rule": "shares", "shares": {"nominal": 1e308, "wheel_slip": 1e308}}, "a finite number"),
         ({"rule": "even", "shares": {"nominal": 1.0}}, 'shares need the rule "shares"'),
         ({"rule": "success", "floor": 0.3}, r"floors of 4 arms sum to 1\.2, above 1"),
         ({"floors": {"nominal": 0.7, "wheel_slip": 0.4}}, "floors must sum to at most 1"),

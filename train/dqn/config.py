@@ -7,6 +7,7 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 from __future__ import annotations
 
 import copy
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -201,6 +202,8 @@ class PracticeConfig(Checked, frozen=True):
     def check(self) -> None:
         if self.rule == "shares" and sum(self.shares.values()) <= 0:
             raise ValueError(f"shares must have a share above 0, got {self.shares}")
+        if math.isinf(sum(self.shares.values())):
+            raise ValueError(f"shares must sum to a finite number, got {self.shares}")
         if self.rule != "shares" and self.shares:
             raise ValueError(f'shares need the rule "shares", but the rule is "{self.rule}"')
         if sum(self.floors.values()) > 1:

@@ -224,10 +224,16 @@ def _print(
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
-    from restock.train.describe import no_update
+    from restock.train.describe import no_update, unmoved
+    from restock.train.run.run import Run
 
-    if (why := no_update(outcome, prepared.config)) is not None:
-        say(f"warning: {why}")
+    practised = Run.open(prepared.path).table("practice").to_pylist() if outcome.env_steps else None
+    for why in (
+        no_update(outcome, prepared.config),
+        None if practised is None else unmoved(practised, prepared.config),
+    ):
+        if why is not None:
+            say(f"warning: {why}")
     path = str(prepared.path)
     if as_json:
         fresh = {"flushed": asdict(flushed)} if flushed is not None else {}
