@@ -234,6 +234,7 @@ def test_log_time_where_stamps_cannot_be_followed(tmp_path, capsys):
                 del topics[name]
             odom = topics["/odom"]
             fields = {path: np.asarray(column)[slow] for path, column in odom.fields.items()}
+            fields |= pose("pose.pose", 0.4 * np.arange(len(slow)), 0.0)
             topics["/odom"] = TopicColumns(odom.log_time_ns[slow], odom.log_time_ns[slow], fields)
             return topics
 
