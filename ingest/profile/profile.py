@@ -159,8 +159,14 @@ class Profile(Checked, frozen=True):
 
     @property
     def sources(self) -> dict[str, Input]:
-        """The inputs, and as `command_sources.NAME` those of commands, none of which is needed."""
+        """The inputs, and as `command_sources.NAME` those of commands, none of which is needed; nor
+        are goal and plan where the task has none."""
         optional = {
+            name: msgspec.structs.replace(source, optional=True)
+            for name, source in self.inputs.items()
+            if name in ("goal", "plan") and self.task.goal == "none"
+        }
+        optional |= {
             f"{COMMAND_SOURCES}.{name}": msgspec.structs.replace(source, optional=True)
             for name, source in self.command_sources.items()
         }

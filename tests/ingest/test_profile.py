@@ -7,10 +7,12 @@ import pickle
 
 import numpy as np
 import pytest
+from support.driven_robot import Drive, typed_topics, write_topics
 from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
-from restock.errors import ConfigError
+from restock.errors import ConfigError, RecordingError
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile, parse_profile, shipped_profiles
 from restock.ingest.profile.profile_text import profile_toml
 
@@ -103,6 +105,19 @@ def test_a_route_needs_a_goal_and_a_plan():
     start, end = TEXT.index("[inputs.plan]"), TEXT.index("[inputs.bumper]")
     with pytest.raises(ConfigError, match=r"`inputs\.plan` is missing"):
         parse_profile(TEXT[:start] + TEXT[end:], where="mine.toml")
+
+
+def test_without_a_goal_its_topics_are_not_needed(tmp_path):
+    topics = {
+        name: one
+        for name, one in typed_topics(Drive(3.0)).items()
+        if name not in ("/goal_pose", "/plan")
+    }
+    bag = write_topics(topics, tmp_path / "bag")
+    with pytest.raises(RecordingError, match=r"no topic /goal_pose \(goal\)"):
+        ingest(bag, parse_profile(TEXT, where="p"), store=None)
+    aimless = parse_profile(TEXT.replace('goal = "route"', 'goal = "none"'), where="p")
+    assert ingest(bag, aimless, store=None).manifest["transitions"] == 14
 
 
 def test_a_condition_of_ones_own():
