@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from restock.ingest.propose.evidence.roles import (
     LATCHED,
     REQUIRED,
     Kind,
+    robots_in,
 )
 from restock.ingest.propose.node_lines import node_lines
 from restock.ingest.propose.task_lines import actions_of, task_lines
@@ -29,16 +31,29 @@ from restock.ingest.task.conditions import unseen
 from restock.ingest.task.signals import Noise
 
 
+def in_one_recording(robots: Sequence[str]) -> str:
+    """Whose profile it is, where a recording is of several robots."""
+    others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
+    return (
+        f"of the robot {robots[0]}, one of {len(robots)} in the recording: for {others} write that "
+        f"in place of {robots[0]} in every topic, and ingest into another store, as a store keeps "
+        "one set of rows of a recording"
+    )
+
+
 def profile_lines(
     seen: Evidence, name: str, problems: list[str], trial: Trial | None = None
 ) -> list[str]:
     """The TOML of a profile; with what a `trial` of it made of the recording."""
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
+    robots = robots_in(recording)
+    of_one_robot = f"It is {in_one_recording(robots)}." if robots else ""
     lines = [
         f"# Proposed from {recording.path.name}: check the comments, then run",
         f"# restock profile check THIS_FILE {recording.path.name}",
         *(f"# NOT USABLE YET: {problem}" for problem in problems),
+        *(f"# {line}" for line in textwrap.wrap(of_one_robot, 98)),
         *_trial_lines(trial),
         "#",
         *_topic_lines(seen),

@@ -20,11 +20,12 @@ from restock.ingest.propose.evidence.gather import Evidence, gather
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.roles import (
     REQUIRED,
+    robots_in,
     several_commands,
     usable_topics,
 )
 from restock.ingest.propose.kinds import no_wheeled_robot
-from restock.ingest.propose.proposal_lines import profile_lines, steered_by
+from restock.ingest.propose.proposal_lines import in_one_recording, profile_lines, steered_by
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.clocks import STAMP
@@ -136,6 +137,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
             problems.append(trial.problem)
         text = "\n".join(profile_lines(seen, name, problems, trial))
     advice = [*trial.advice]
+    if robots := robots_in(recording):
+        advice.append(Advice("inputs", in_one_recording(robots)))
     if seen.turns is not None and not seen.turns.problem:
         advice.append(Advice("inputs.command", steered_by(seen)))
     if seen.robot.guessed_steering and not seen.commands.steered:

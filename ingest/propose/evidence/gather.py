@@ -52,6 +52,7 @@ from restock.ingest.propose.evidence.roles import (
     FrameGuess,
     Roles,
     node_topics,
+    other_robots_topics,
     topics_for,
     transform_frames,
     usable_topics,
@@ -104,7 +105,7 @@ def gather(
     hindsight_goals: bool = False,
 ) -> Evidence:
     """What a recording says of its robot."""
-    topics = usable_topics(recording)
+    topics, others = usable_topics(recording), other_robots_topics(recording)
     roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
     chosen = CommandChoice()
     if not roles["command"] and odometry_as_command:
@@ -184,10 +185,10 @@ def gather(
         GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
         candidates(
             recording,
-            without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS,
+            without={topic.name for role, topic, _ in best if role in SPENT} | NODE_TOPICS | others,
             used={(topic.name, path) for _, topic, kind in best for path in kind.fields.values()},
         ),
-        camera_topics(recording, recorded_s),
+        [one for one in camera_topics(recording, recorded_s) if one.topic.name not in others],
         robot,
         node_topics(recording),
     )

@@ -184,6 +184,12 @@ KINDS: dict[str, tuple[Kind, ...]] = {
 ODOMETRY_AS_COMMAND = (
     Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
 )
+# Message type -> what of a robot it is. Poses may also be of odometry's type.
+_KIND_OF = {
+    kind.type: role
+    for role in ("pose", "imu", "scan", "plan", "wheels", "command")
+    for kind in KINDS[role]
+}
 REQUIRED = ("command", "pose")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
@@ -195,8 +201,59 @@ Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 
 
 def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
-    """The topics that can be decoded and have messages, without those of Restock's node."""
-    return {name: topic for name, topic in _readable(recording) if name not in NODE_TOPICS}
+    """The topics that can be decoded and have messages, without those of Restock's node, and of
+    other robots."""
+    others = other_robots_topics(recording)
+    return {
+        name: topic
+        for name, topic in _readable(recording)
+        if name not in NODE_TOPICS and name not in others
+    }
+
+
+def robots_in(recording: Recording) -> list[str]:
+    """The namespaces of a recording's robots, where it has several; first the one to propose for:
+    with a command, and topics of most kinds.
+
+    Robots' namespaces lie side by side, and topics of two kinds at least have the same name in
+    more than one of them: `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one
+    robot.
+    """
+    inside: dict[str, list[tuple[str, str, TopicInfo]]] = {}  # namespace -> the rest, kind, topic
+    where: dict[tuple[str, str, str], set[str]] = {}  # what is beside it, the rest, kind -> those
+    for name, topic in _readable(recording):
+        if (kind := _KIND_OF.get(topic.type)) is None:
+            continue
+        parts = name.strip("/").split("/")
+        for place in range(1, len(parts)):
+            namespace, rest = "/" + "/".join(parts[:place]), "/".join(parts[place:])
+            inside.setdefault(namespace, []).append((rest, kind, topic))
+            where.setdefault((namespace.rpartition("/")[0], rest, kind), set()).add(namespace)
+    robots = []
+    for namespace, topics in inside.items():
+        beside = namespace.rpartition("/")[0]
+        shared = {kind for rest, kind, _ in topics if len(where[beside, rest, kind]) > 1}
+        if len(shared) > 1:
+            robots.append(namespace)
+    kinds = {robot: {kind for _, kind, _ in inside[robot]} for robot in robots}
+    if len(robots) < 2 or not any("command" in found for found in kinds.values()):
+        return []
+    messages = {robot: sum(topic.expected for *_, topic in inside[robot]) for robot in robots}
+    return sorted(
+        robots,
+        key=lambda one: (
+            "command" not in kinds[one],
+            -len(kinds[one] - {"imu"}),  # which everything can do without
+            -messages[one],
+            one,
+        ),
+    )
+
+
+def other_robots_topics(recording: Recording) -> set[str]:
+    """The topics of a recording's other robots than the one to propose for."""
+    others = tuple(f"{robot}/" for robot in robots_in(recording)[1:])
+    return {name for name in recording.topics if name.startswith(others)}
 
 
 def node_topics(recording: Recording) -> dict[str, str]:
@@ -279,6 +336,8 @@ def transform_frames(recording: Recording) -> FrameGuess | None:
     """The map's and the robot's frame, or None where no transforms join any such two."""
     edges = transform_edges(recording)
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
+    others = {robot.rpartition("/")[2] for robot in robots_in(recording)[1:]}
+    frames = {frame for frame in frames if frame.split("/")[0] not in others}
     for fixed in named_frames(FIXED_FRAMES, frames):
         for base in named_frames(BASE_FRAMES, frames):
             if fixed in upward(base, edges.parents):
