@@ -52,7 +52,7 @@ class Relation:
         """None where the rows say too little."""
         x, y = self.of(rows)
         y = y.copy()
-        y[self._left_out(rows, leave_out)] = np.nan
+        y[_left_out(rows, _motion(x, y), leave_out)] = np.nan
         if x.ndim == 2:
             cluster = np.repeat(rows.cluster, x.shape[1])
             return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
@@ -66,21 +66,22 @@ class Relation:
         labelled: so whole episodes, as long as others remain. But a sensor that is wrong looks
         like slip too, all the time: then nearly every episode of its recording is so labelled.
         """
-        moves = self._motion(rows)
+        moves = _motion(*self.of(rows))
         if _on_ice(rows, moves).any():
             return "episodes"
         return "rows" if moves[~_near_slip(rows)].sum() >= _MOST * moves.sum() else "none"
 
-    def _left_out(self, rows: FedRows, what: SlipLeftOut) -> Bools:
-        if what == "episodes":
-            return _on_ice(rows, self._motion(rows))
-        return _near_slip(rows) if what == "rows" else np.zeros(len(rows), np.bool_)
 
-    def _motion(self, rows: FedRows) -> F64:
-        """How much each row says of the relation, (N,)."""
-        x, y = self.of(rows)
-        moves = np.where(np.isfinite(y), x, 0.0) ** 2
-        return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
+def _motion(x: F64, y: F64) -> F64:
+    """How much each row says of a relation, (N,)."""
+    moves = np.where(np.isfinite(y), x, 0.0) ** 2
+    return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
+
+
+def _left_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
+    if what == "episodes":
+        return _on_ice(rows, moves)
+    return _near_slip(rows) if what == "rows" else np.zeros(len(rows), np.bool_)
 
 
 def _slips(rows: FedRows) -> Bools:
