@@ -21,8 +21,9 @@ from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
+from restock.toml import by_path
 from restock.train.dqn.behaviour import PolicyNetwork
-from restock.train.dqn.config import TrainConfig, by_path
+from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score, fixed_episodes

@@ -14,7 +14,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -317,4 +317,13 @@ def _join(*parts: str) -> str:
     return text
 
 
-__all__ = ["Checked", "parse_toml", "read_toml", "toml_value", "typed"]
+def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each nested setting by its path, as `--set` names it."""
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from by_path(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+__all__ = ["Checked", "by_path", "parse_toml", "read_toml", "toml_value", "typed"]

@@ -18,8 +18,8 @@ import pyarrow as pa
 
 from restock.arrays import F64
 from restock.errors import RunError
+from restock.toml import by_path
 from restock.train.comparison.comparability import Feed
-from restock.train.dqn.config import by_path
 from restock.train.dqn.removed_settings import without_removed
 from restock.train.run.run import Run
 

@@ -10,7 +10,7 @@ import copy
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -311,15 +311,6 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
     return overrides
 
 
-def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each nested setting by its path, as `--set` names it."""
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from by_path(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
-
-
 def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """A typed config from plain values.
 
@@ -362,7 +353,6 @@ __all__ = [
     "TrainConfig",
     "apply_overrides",
     "as_overrides",
-    "by_path",
     "load_config",
     "parse_config",
 ]

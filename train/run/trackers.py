@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 
 from restock.errors import ConfigError
 from restock.imports import installed
+from restock.toml import by_path
 from restock.train.run.events import Sink, tracked
 from restock.train.run.run import Run
 
@@ -144,7 +145,7 @@ class MlflowSink:
         experiment = self._client.get_experiment_by_name(name)
         number = experiment.experiment_id if experiment else self._client.create_experiment(name)
         self._id = self._client.create_run(number, run_name=run.path.name).info.run_id
-        params = (Param(k, str(v)[:_LONGEST]) for k, v in flat(run.document["config"]))
+        params = (Param(k, str(v)[:_LONGEST]) for k, v in by_path(run.document["config"]))
         while some := list(islice(params, _PARAMS)):
             self._client.log_batch(self._id, params=some)
         inputs = [
@@ -172,15 +173,6 @@ class MlflowSink:
 
     def describe(self) -> dict[str, Any]:
         return {"run_id": self._id, "uri": self._uri}
-
-
-def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested settings by their dotted keys."""
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
 
 
 __all__ = ["fed_by", "require_trackers", "tracker_sinks"]
