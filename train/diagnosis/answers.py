@@ -17,7 +17,7 @@ from restock.arrays import F64
 from restock.stats import ConfidenceInterval
 from restock.train.diagnosis.evidence import Comparison, judged, not_run
 from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.relations import RELATIONS, Relation
+from restock.train.diagnosis.relations import RELATIONS, Relation, SlipLeftOut
 from restock.train.diagnosis.response import Response, difference_of, interval_of, ratio_of
 
 GAIN = 1.2  # of logs over the twin's, or its inverse
@@ -31,6 +31,7 @@ HELD = 3  # steps of one action in a row, for its motion to be that action's
 _FEWEST_HELD = 15
 _AWAY = 0.25  # of the fastest action on each axis
 _MOST_ROWS = 0.8  # of an action's, those with the motion of one other
+TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and what it leaves out
 
 
 @dataclass(frozen=True)
@@ -56,18 +57,28 @@ class Answer:
         return any(one.off and one.check.startswith(figure) for one in self.comparisons)
 
 
-def answers(logs: FedRows, twin: FedRows | None, seed: int = 0) -> list[Answer]:
-    """Every relation, compared."""
+def answers(
+    logs: FedRows, twin: FedRows | None, seed: int = 0, of_twin: TwinFits | None = None
+) -> list[Answer]:
+    """Every relation, compared. `of_twin` keeps the twin's fits for the next logs."""
     rng = np.random.default_rng([seed, 1])
-    return [_answer(relation, logs, twin, rng) for relation in RELATIONS]
+    of_twin = {} if of_twin is None else of_twin
+    return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
 
 
 def _answer(
-    relation: Relation, logs: FedRows, twin: FedRows | None, rng: np.random.Generator
+    relation: Relation,
+    logs: FedRows,
+    twin: FedRows | None,
+    rng: np.random.Generator,
+    of_twin: TwinFits,
 ) -> Answer:
     leave_out = relation.slip_to_leave_out(logs)
     found = relation.fit(logs, rng, leave_out)
-    expected = relation.fit(twin, rng, leave_out) if twin is not None else None
+    kept = relation.name, leave_out
+    if twin is not None and kept not in of_twin:
+        of_twin[kept] = relation.fit(twin, rng, leave_out)
+    expected = of_twin.get(kept)
     name, what = relation.name, f"answer of the {relation.name}"
     if found is None or (twin is not None and expected is None):
         reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
@@ -169,4 +180,4 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comp
         yield replace(row, low=None, high=None), nearest if is_other else action
 
 
-__all__ = ["Answer", "answers", "held_motion", "permuted_actions"]
+__all__ = ["Answer", "TwinFits", "answers", "held_motion", "permuted_actions"]

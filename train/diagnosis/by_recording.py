@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from restock.train.diagnosis.answers import Answer, answers
+from restock.train.diagnosis.answers import Answer, TwinFits, answers
 from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows
@@ -37,8 +37,10 @@ def unlike_recordings(
         return [], [not_run(CHECK, what, f"no recording has {FEWEST_ROWS} rows")]
     found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
     off: list[Comparison] = []
+    of_twin: TwinFits = {}  # the same for every recording
     for name in chosen.tolist():
-        own = [_named(one, name) for one in answers(logs.take(logs.recording == name), twin, seed)]
+        rows_of = logs.take(logs.recording == name)
+        own = [_named(one, name) for one in answers(rows_of, twin, seed, of_twin)]
         for one in findings(own, [], [], logs.task):
             found.setdefault(one.cause, []).append((name, one))
         off += [row for one in own for row in one.comparisons if row.off]

@@ -196,4 +196,4 @@ RELATIONS = (
 )  # fmt: skip
 
 
-__all__ = ["RELATIONS", "Relation"]
+__all__ = ["RELATIONS", "Relation", "SlipLeftOut"]
