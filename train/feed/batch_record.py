@@ -170,14 +170,16 @@ class FeedRecord(Stateful):
         drawn = len(self._logged) + len(self._fresh)
         means: dict[str, float | None] = dict.fromkeys(_MEANS)
         if drawn:
-            td, q, reward = (
-                np.concatenate([logged[name], fresh[name]]) for name in ("td", "q", "reward")
-            )
+            sums = {
+                name: sum(float(of(rows[name]).sum(dtype=np.float64)) for rows in (logged, fresh))
+                for name, of in (("td", np.abs), ("q", np.asarray), ("reward", np.asarray))
+            }
+            most = (np.abs(rows["q"]).max(initial=0.0) for rows in (logged, fresh))
             means = {
-                "td_abs_mean": float(np.abs(td).mean()),
-                "q_mean": float(q.mean()),
-                "q_abs_max": float(np.abs(q).max()),
-                "reward_mean": float(reward.mean()),
+                "td_abs_mean": sums["td"] / drawn,
+                "q_mean": sums["q"] / drawn,
+                "q_abs_max": float(max(most)),
+                "reward_mean": sums["reward"] / drawn,
                 "logs_share": len(self._logged) / drawn,
             }
         if self.logs is not None and len(self._logged):
@@ -235,17 +237,17 @@ class FeedRecord(Stateful):
             self.run.append_columns("audit", columns)
 
     def _write(self, source: SourceRows, clocks: Mapping[str, int], phase: str) -> None:
-        first, total = source.first_of_row, self._total[source.name]
+        total = self._total[source.name]
         total += np.bincount(source.stratum, minlength=len(total))
         of_phase = {**clocks, "phase": phase}
         tables: dict[str, tuple[Mapping[str, Any], Columns]] = {
-            "strata": (of_phase, interval_tables.strata(source, first, total.copy())),
+            "strata": (of_phase, interval_tables.strata(source, total.copy())),
             "conditions": (of_phase, interval_tables.conditions(source)),
             "sampled_episodes": (clocks, interval_tables.sampled_episodes(source)),
             "policies": (clocks, interval_tables.policies(source)),
         }
         if self.actions is not None:
-            rows = interval_tables.actions(source, first, self.actions)
+            rows = interval_tables.actions(source, self.actions)
             tables["actions"] = of_phase, rows
         for name, (steps, columns) in tables.items():
             self.run.append_columns(name, {**steps, **columns})
@@ -297,7 +299,8 @@ class FeedRecord(Stateful):
             rows=rows,
             stratum=stratum,
             strata=names,
-            row=(rows["episode"] << 20) | rows["episode_step"],
+            row=rows["episode"] * (int(rows["episode_step"].max(initial=0)) + 1)
+            + rows["episode_step"],
             available=available,
             timings=[None] * len(names),
             quota=[None] * len(names),

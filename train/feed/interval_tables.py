@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,16 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Ints
 from restock.train.feed.sampled_rows import Columns, episode_sums
 
+_MOST_MARKS = 1 << 25  # keys that are marked in place; those of a wider range are sorted instead
+
 
 @dataclass(frozen=True)
 class SourceRows:
-    """The rows (n,) of an interval that came from one source, and what their codes name."""
+    """The rows (n,) of an interval that came from one source, and what their codes name.
+
+    A row has one action and one condition. *Cells* are combinations of stratum, condition and
+    action, numbered in that order (the action's number changes fastest).
+    """
 
     name: str  # logs | fresh
     rows: Mapping[str, NDArray[Any]]  # td, q, weight, action, reward, discount
@@ -34,12 +41,69 @@ class SourceRows:
     ages: Mapping[str, F64]  # by their unit
     greedy: GreedyRows | None  # None: the policy is not at hand
 
+    @cached_property
+    def pair(self) -> Ints:
+        """Stratum and condition of each row (n,)."""
+        return self.stratum * len(self.conditions) + self.condition
+
     @property
-    def first_of_row(self) -> Ints:
-        """Of each different row in each stratum, one of its places."""
-        key = self.row * len(self.strata) + self.stratum
-        first: Ints = np.unique(key, return_index=True)[1]
-        return first
+    def pairs(self) -> int:
+        """How many combinations of stratum and condition there are."""
+        return len(self.strata) * len(self.conditions)
+
+    @cached_property
+    def action_count(self) -> int:
+        """How many actions cells tell apart."""
+        return int(self.rows["action"].max(initial=0)) + 1
+
+    @cached_property
+    def drawn(self) -> Ints:
+        """Rows by cell (S, C, A)."""
+        return self._by_cell(slice(None))
+
+    @cached_property
+    def unique(self) -> Ints:
+        """Different rows by cell (S, C, A)."""
+        return self._by_cell(one_of_each(self.row * len(self.strata) + self.stratum))
+
+    def summed(self, values: NDArray[Any]) -> F64:
+        """Sums of `values` (n,) by stratum and condition (S, C)."""
+        sums: F64 = np.bincount(self.pair, values, minlength=self.pairs).astype(np.float64)
+        return sums.reshape(len(self.strata), len(self.conditions))
+
+    @cached_property
+    def sums(self) -> dict[str, F64]:
+        """Of what is averaged, by stratum and condition (S, C)."""
+        rows = self.rows
+        return {
+            "weight": self.summed(rows["weight"]),
+            "td_abs": self.summed(np.abs(rows["td"])),
+            "q": self.summed(rows["q"]),
+            "reward": self.summed(rows["reward"]),
+            "terminal": self.summed(rows["discount"] == 0),
+        }
+
+    def _by_cell(self, chosen: slice | Ints) -> Ints:
+        """How many of the chosen rows are in each cell."""
+        shape = len(self.strata), len(self.conditions), self.action_count
+        cell = self.pair[chosen] * self.action_count + self.rows["action"][chosen]
+        return np.bincount(cell, minlength=self.pairs * self.action_count).reshape(shape)
+
+
+def one_of_each(key: Ints) -> Ints:
+    """Of each different value of `key` (n,), one of its places, in the values' order.
+
+    Keys of rows are dense enough to be marked in place, which takes a thirtieth of sorting them.
+    """
+    first = int(key.min()) if len(key) else 0
+    span = int(key.max(initial=first)) - first + 1
+    if span > _MOST_MARKS:
+        sorted_places: Ints = np.unique(key, return_index=True)[1]
+        return sorted_places
+    marked, place = np.zeros(span, np.bool_), np.empty(span, np.int32)
+    marked[key - first] = True
+    place[key - first] = np.arange(len(key), dtype=np.int32)
+    return place[np.flatnonzero(marked)].astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -51,16 +115,14 @@ class GreedyRows:
     action: Ints
 
 
-def strata(source: SourceRows, first: Ints, total: Ints) -> Columns:
-    """Of `strata`. `first` is `source.first_of_row`; `total` (S,) are rows since the run began."""
-    size, stratum, rows = len(source.strata), source.stratum, source.rows
-    drawn = np.bincount(stratum, minlength=size)
-    weight = np.bincount(stratum, rows["weight"], minlength=size)
-    unique = np.bincount(stratum[first], minlength=size)
+def strata(source: SourceRows, total: Ints) -> Columns:
+    """Of `strata`. `total` (S,) are rows since the run began."""
+    drawn, unique = (of.sum(axis=(1, 2)) for of in (source.drawn, source.unique))
+    sums = {name: by_pair.sum(axis=1) for name, by_pair in source.sums.items()}
 
-    def mean(values: NDArray[Any]) -> list[float | None]:
-        sums = np.bincount(stratum, values, minlength=size).tolist()
-        return [x / n if n else None for x, n in zip(sums, drawn.tolist(), strict=True)]
+    def mean(name: str) -> list[float | None]:
+        pairs = zip(sums[name].tolist(), drawn.tolist(), strict=True)
+        return [x / n if n else None for x, n in pairs]
 
     return {
         "source": source.name,
@@ -70,80 +132,84 @@ def strata(source: SourceRows, first: Ints, total: Ints) -> Columns:
         "available_rows": source.available,
         "available_share": source.available / max(source.available.sum(), 1),
         "drawn_rows": drawn,
-        "drawn_share": drawn / len(stratum),
-        "effective_share": weight / max(weight.sum(), 1e-12),
+        "drawn_share": drawn / len(source.stratum),
+        "effective_share": sums["weight"] / max(sums["weight"].sum(), 1e-12),
         "unique_rows": unique,
         "replays_per_row": [n / u if u else None for n, u in zip(drawn, unique, strict=True)],
         "total_drawn_rows": total,
-        "td_abs_mean": mean(np.abs(rows["td"])),
-        "q_mean": mean(rows["q"]),
-        "reward_mean": mean(rows["reward"]),
-        "terminal_share": mean(rows["discount"] == 0),
+        "td_abs_mean": mean("td_abs"),
+        "q_mean": mean("q"),
+        "reward_mean": mean("reward"),
+        "terminal_share": mean("terminal"),
     }
 
 
 def conditions(source: SourceRows) -> Columns:
     """Of `conditions`."""
-    code, size = source.condition, len(source.conditions)
-    drawn = np.bincount(code, minlength=size)
-    weight, td, q = (
-        np.bincount(code, values, minlength=size)
-        for values in (source.rows["weight"], np.abs(source.rows["td"]), source.rows["q"])
-    )
+    drawn = source.drawn.sum(axis=(0, 2))
+    weight, td, q = (source.sums[name].sum(axis=0) for name in ("weight", "td_abs", "q"))
     met = np.flatnonzero(drawn)
     return {
         "source": source.name,
         "condition": np.array(source.conditions, object)[met],
         "drawn_rows": drawn[met],
-        "drawn_share": drawn[met] / len(code),
+        "drawn_share": drawn[met] / len(source.condition),
         "effective_share": weight[met] / max(weight.sum(), 1e-12),
         "td_abs_mean": td[met] / drawn[met],
         "q_mean": q[met] / drawn[met],
     }
 
 
-def actions(source: SourceRows, first: Ints, names: Sequence[str]) -> Columns:
+def actions(source: SourceRows, names: Sequence[str]) -> Columns:
     """Of `actions`: every action of each stratum and condition that was met, those never drawn too.
 
     `names` (A,) are the task's.
     """
     count, size = len(names), len(source.conditions)
-    pair = source.stratum * size + source.condition
-    cell = pair * count + source.rows["action"]
-    pairs = np.unique(pair)
-    cells = (pairs[:, None] * count + np.arange(count)).ravel()  # (P * A,)
-    most = int(cells.max(initial=-1)) + 1
-    drawn, unique = (np.bincount(of, minlength=most)[cells] for of in (cell, cell[first]))
-    in_pair = np.repeat(drawn.reshape(-1, count).sum(axis=1), count)
+    pairs = np.flatnonzero(source.drawn.sum(axis=2).ravel())  # (P,)
+
+    def of_task(by_cell: Ints) -> Ints:
+        """(S, C, a) or (S * C, a), of the pairs that were met and all actions: (P, A)."""
+        of_pairs = by_cell.reshape(source.pairs, -1)[pairs]
+        none_of = ((0, 0), (0, max(count - of_pairs.shape[1], 0)))
+        whole: Ints = np.pad(of_pairs, none_of)[:, :count]
+        return whole
+
+    drawn, unique = of_task(source.drawn), of_task(source.unique)
+    in_pair = np.repeat(drawn.sum(axis=1), count)
     wanted: dict[str, Any] = {"audited_rows": None, "greedy_rows": None, "greedy_share": None}
     if source.greedy is not None:
         audited = source.greedy.stratum * size + source.greedy.condition
-        greedy = np.bincount(audited * count + source.greedy.action, minlength=most)[cells]
-        looked_at = np.repeat(greedy.reshape(-1, count).sum(axis=1), count)
-        share = [n / of if of else None for n, of in zip(greedy, looked_at, strict=True)]
-        wanted = {"audited_rows": looked_at, "greedy_rows": greedy, "greedy_share": share}
+        cell = audited * count + source.greedy.action
+        greedy = of_task(np.bincount(cell, minlength=source.pairs * count))
+        looked_at = np.repeat(greedy.sum(axis=1), count)
+        per_action = zip(greedy.ravel(), looked_at, strict=True)
+        share = [n / of if of else None for n, of in per_action]
+        wanted = {"audited_rows": looked_at, "greedy_rows": greedy.ravel(), "greedy_share": share}
+    of_pair = np.repeat(pairs, count)
     return {
         "source": source.name,
-        "stratum": np.array(source.strata, object)[cells // count // size],
-        "condition": np.array(source.conditions, object)[cells // count % size],
+        "stratum": np.array(source.strata, object)[of_pair // size],
+        "condition": np.array(source.conditions, object)[of_pair % size],
         "action": np.tile(np.arange(count), len(pairs)),
         "name": np.tile(np.array(names, object), len(pairs)),
-        "drawn_rows": drawn,
-        "drawn_share": drawn / in_pair,
-        "unique_rows": unique,
+        "drawn_rows": drawn.ravel(),
+        "drawn_share": drawn.ravel() / in_pair,
+        "unique_rows": unique.ravel(),
         **wanted,
     }
 
 
 def ages(unit: str, age: F64) -> Columns:
     """Of `ages`, without the source."""
-    bucket = np.where(age < 1, -1, np.floor(np.log2(np.maximum(age, 1)))).astype(np.int32)
-    buckets, counts = np.unique(bucket, return_counts=True)
+    # 2**bucket <= age < 2**(bucket + 1); -1 below 1
+    rows = np.bincount(np.frexp(np.maximum(age, 0.5))[1])
+    met = np.flatnonzero(rows)
     quantiles = np.quantile(age, [0.5, 0.9, 0.99]).tolist()
     return {
         "unit": unit,
-        "bucket": buckets,
-        "count": counts,
+        "bucket": met - 1,
+        "count": rows[met],
         **dict(zip(("p50", "p90", "p99"), quantiles, strict=True)),
     }
 
@@ -174,6 +240,7 @@ __all__ = [
     "actions",
     "ages",
     "conditions",
+    "one_of_each",
     "policies",
     "sampled_episodes",
     "strata",

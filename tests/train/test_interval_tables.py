@@ -1,0 +1,132 @@
+"""The sums of an interval's rows, beside the same counted row by row."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from restock.train.feed import interval_tables
+from restock.train.feed.interval_tables import GreedyRows, SourceRows, one_of_each
+
+STRATA, CONDITIONS, ACTIONS = (
+    ("easy", "rare", "unmet"),
+    ("nominal", "slip"),
+    ("left", "right", "stop"),
+)
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.integers(-5, 40) | st.integers(7 << 40, (7 << 40) + 9), max_size=60),
+    st.integers(0, 1 << 50),
+)
+def test_one_place_of_each_value_however_far_apart_they_are(values: list[int], first: int) -> None:
+    key = np.array(values, np.int64) + first
+    places = one_of_each(key)
+    assert key[places].tolist() == sorted(set(key.tolist()))
+
+
+@settings(max_examples=40)
+@given(arrays(np.float64, st.integers(1, 40), elements=st.floats(0, 2**40)))
+def test_every_age_is_in_the_bucket_of_its_power_of_two(age: np.ndarray) -> None:
+    columns = interval_tables.ages("days", age)
+    assert sum(columns["count"]) == len(age)
+    counted = zip(columns["bucket"].tolist(), columns["count"].tolist(), strict=True)
+    for bucket, count in counted:
+        low, high = (0, 1) if bucket == -1 else (2.0**bucket, 2.0 ** (bucket + 1))
+        assert ((low <= age) & (age < high)).sum() == count > 0
+
+
+def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
+    """Rows of 20 different ones, each with its own stratum, condition and action."""
+    rng = np.random.default_rng(seed)
+    row = rng.integers(20, size=rows)
+    stratum, condition, action = row % 2, row // 2 % 2, row // 4 % 2  # "unmet" and "stop": never
+    asked = slice(rows // 2)
+    return SourceRows(
+        name="logs",
+        rows={
+            "td": rng.normal(size=rows).astype(np.float32),
+            "q": rng.normal(size=rows).astype(np.float32),
+            "weight": rng.uniform(0.5, 1, rows).astype(np.float32),
+            "action": action.astype(np.int16),
+            "reward": rng.normal(size=rows).astype(np.float32),
+            "discount": rng.choice([0, 0.99], rows).astype(np.float32),
+        },
+        stratum=stratum,
+        strata=STRATA,
+        row=row,
+        available=np.array([10, 10, 0]),
+        timings=[None] * 3,
+        quota=[None] * 3,
+        condition=condition,
+        conditions=CONDITIONS,
+        episode=row // 5,
+        episodes=None,
+        policy=np.zeros(rows, np.int64),
+        policies=["operator"],
+        ages={},
+        greedy=GreedyRows(stratum[asked], condition[asked], np.full(rows, 2)[asked])
+        if greedy
+        else None,
+    )
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 80), st.integers(0, 99), st.booleans())
+def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool) -> None:
+    of = source(rows, seed, greedy=greedy)
+    strata = interval_tables.strata(of, np.array([rows, 0, 0]))
+    weight = of.rows["weight"].astype(np.float64)
+    for code in range(len(STRATA)):
+        mine = of.stratum == code
+        assert strata["drawn_rows"][code] == mine.sum()
+        assert strata["unique_rows"][code] == len(set(of.row[mine].tolist()))
+        share = strata["effective_share"][code]
+        assert share == pytest.approx(weight[mine].sum() / weight.sum())
+        if not mine.any():
+            assert strata["td_abs_mean"][code] is None
+            continue
+        for name, values in (
+            ("td_abs_mean", np.abs(of.rows["td"])),
+            ("q_mean", of.rows["q"]),
+            ("reward_mean", of.rows["reward"]),
+            ("terminal_share", of.rows["discount"] == 0),
+        ):
+            assert strata[name][code] == pytest.approx(values[mine].mean(), abs=1e-6)
+    conditions = interval_tables.conditions(of)
+    met = Counter(CONDITIONS[code] for code in of.condition.tolist())
+    assert dict(zip(conditions["condition"], conditions["drawn_rows"], strict=True)) == met
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 80), st.integers(0, 99), st.booleans())
+def test_every_action_of_what_was_met_has_a_row_the_never_drawn_too(
+    rows: int, seed: int, greedy: bool
+) -> None:
+    of = source(rows, seed, greedy=greedy)
+    columns = interval_tables.actions(of, ACTIONS)
+    cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))
+    met = {(int(s), int(c)) for s, c in zip(of.stratum, of.condition, strict=True)}
+    assert cells == [
+        (STRATA[s], CONDITIONS[c], action) for s, c in sorted(met) for action in ACTIONS
+    ]
+    for place, (stratum, condition, action) in enumerate(cells):
+        pair = of.stratum == STRATA.index(stratum)
+        pair &= of.condition == CONDITIONS.index(condition)
+        mine = pair & (of.rows["action"] == ACTIONS.index(action))
+        assert columns["drawn_rows"][place] == mine.sum()
+        assert columns["drawn_share"][place] == mine.sum() / pair.sum()
+        assert columns["unique_rows"][place] == len(set(of.row[mine].tolist()))
+        if greedy:
+            asked = pair[: rows // 2].sum()
+            assert columns["audited_rows"][place] == asked
+            assert columns["greedy_rows"][place] == (asked if action == "stop" else 0)
+            assert columns["greedy_share"][place] == ((action == "stop") if asked else None)
+    if not greedy:
+        assert columns["greedy_rows"] is None
