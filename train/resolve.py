@@ -9,7 +9,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.task.task import Mirror, Task
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
-from restock.train.dqn.config import TeacherConfig, TrainConfig
+from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.cloned_rows import cloned
 from restock.train.missions import mission_orders
 from restock.train.twin.env.interface import AFTER_LOGS
@@ -52,12 +52,13 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
 
     Raises:
         ConfigError: rows are to be mirrored, and an action has no opposite; successes are to be
-            cloned where no goals are logged.
+            cloned where no goals are logged; a setting has no effect, because nobody teaches.
     """
     teacher = config.teacher
     if teacher.source is None:
         source = "operator" if profile.task.goal == "route" else "none"
         teacher = msgspec.structs.replace(teacher, source=source)
+    refuse_untaught(teacher)
     teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:
         rows = 0 if panel is None or not teacher.filters else int(cloned(panel, teacher).sum())

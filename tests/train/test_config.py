@@ -74,6 +74,8 @@ def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
         ("replay.ring_capacity=99999999999", r"of them for replay\.ring_capacity; this machine"),
         ("network.hidden=[9000000, 9000000]", r"of them for network\.hidden; this machine"),
         ("practice.floor=0.1", r'practice\.floor: has no effect under the rule "natural"'),
+        ("teacher={source='none', ratio=0.2}", r"teacher\.ratio: has no effect where .* \"none\""),
+        ("teacher={source='none', mirror=true}", r"teacher\.mirror: has no effect where"),
         ("env.missions_share=0.9", r"env\.missions_share: has no effect without missions"),
         ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
         ("loss.calibrated=true", r"apply to logged rows, but this run has no logs"),

@@ -18,8 +18,9 @@ from restock.train.comparison.confirm import confirm, swapped
 from restock.train.comparison.diagnose import diagnose
 from restock.train.diagnosis.before_training import RowDiagnosis
 from restock.train.diagnosis.causes import Finding
-from restock.train.dqn.config import TrainConfig, apply_overrides, parse_config
+from restock.train.dqn.config import TeacherConfig, TrainConfig, apply_overrides, parse_config
 from restock.train.dqn.target import Hard, Polyak, TargetRule
+from restock.train.prepare import Prepared
 from restock.train.run.run import Run
 
 CONDITIONS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision", "recovery")
@@ -462,6 +463,25 @@ def test_an_experiment_that_changes_nothing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="has the settings of the experiment already"):
         confirm(sick, found, tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+def test_an_experiment_repeats_a_run_without_a_teacher(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its config has the other settings of `teacher`, resolved, which nobody may give."""
+    run = make_run(tmp_path / "r", lag=0.9)
+    run.document["config"]["teacher"] |= {"source": "none", "successes": False, "ratio": 0.2}
+    run.document["panel"] = None
+    taught: list[TeacherConfig] = []
+
+    def stop(prepared: Prepared) -> None:
+        taught.append(prepared.config.teacher)
+        raise RunError("prepared")
+
+    monkeypatch.setattr(Prepared, "open", stop)
+    with pytest.raises(RunError, match="prepared"):
+        confirm(run, diagnose([run]), tmp_path / "c")
+    assert (taught[0].source, taught[0].ratio) == ("none", TeacherConfig().ratio)
 
 
 @pytest.mark.parametrize(

@@ -242,6 +242,13 @@ def test_an_arm_that_would_make_no_update_is_refused(tmp_path, settings, said) -
         load_study(tmp_path / "s.toml")
 
 
+def test_an_arm_without_a_teacher_has_no_settings_of_one(tmp_path) -> None:
+    study = "[settings]\nteacher.ratio = 0.2\n[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
+    (tmp_path / "s.toml").write_text(f"{study}settings = {{ teacher.source = 'none' }}\n")
+    with pytest.raises(ConfigError, match=r"arm 'b': teacher\.ratio: has no effect"):
+        load_study(tmp_path / "s.toml")
+
+
 def test_an_interrupted_study_says_how_to_continue(tmp_path: Path, capsys, monkeypatch) -> None:
     def stopped(plan, job, say):
         raise KeyboardInterrupt

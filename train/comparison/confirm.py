@@ -76,6 +76,8 @@ def confirm(
             remedy=diagnosis.experiment,
         )
     panel = run.document["panel"]
+    if config["teacher"]["source"] == "none":  # its other settings, resolved, have no effect
+        config = config | {"teacher": {"source": "none"}}
     settings = as_overrides(config) + changed
     prepared = prepare_new(out, Path(panel["path"]) if panel else None, None, settings)
     session = prepared.open()

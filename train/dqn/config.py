@@ -278,6 +278,20 @@ class TrainConfig(Checked, frozen=True):
             )
 
 
+def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
+    """Raises ConfigError where a setting of the teacher is given, but nobody teaches."""
+    if teacher.source != "none":
+        return
+    default = TeacherConfig(source="none")
+    for key in teacher.__struct_fields__:
+        if getattr(teacher, key) != getattr(default, key):
+            raise ConfigError(
+                'has no effect where teacher.source is "none"',
+                where=f"{within}teacher.{key}",
+                remedy="leave it out, or set teacher.source",
+            )
+
+
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:
     """A config from a TOML file (or the defaults), then `key.path=value` overrides.
 
@@ -355,4 +369,5 @@ __all__ = [
     "as_overrides",
     "load_config",
     "parse_config",
+    "refuse_untaught",
 ]

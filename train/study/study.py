@@ -20,6 +20,7 @@ from restock.train.dqn.config import (
     apply_overrides,
     as_overrides,
     parse_config,
+    refuse_untaught,
 )
 from restock.train.evaluation.references import wrong_seed
 from restock.train.libraries.library_arm import Library
@@ -210,6 +211,7 @@ def load_study(path: Path) -> Study:
             f"arm {arm.name!r}", config.evaluation, study.evaluation, str(path)
         )
         _refuse_without_updates(arm, config.schedule, str(path))
+        refuse_untaught(config.teacher, within=f"{path}: arm {arm.name!r}: ")
     return study
 
 
