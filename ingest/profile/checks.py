@@ -16,6 +16,7 @@ from restock.ingest.profile.inputs import (
 )
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Kind, label_with_probabilities
+from restock.ingest.task.hindsight import GoalRules
 from restock.ingest.task.robot import beyond_limits
 from restock.ingest.task.schema import steps_schema
 
@@ -145,6 +146,18 @@ def _check_goal(profile: Profile, where: str) -> None:
                 where=where,
                 remedy=f"give the topic of the {name}; or take goals in hindsight, [goal] source ="
                 ' "hindsight"; or set task.goal = "none"',
+            )
+
+
+def refuse_unused_goal_rules(profile: Profile, where: str) -> None:
+    """Raises ConfigError where `[goal]` says how goals are found in hindsight, and none are."""
+    rules, default = profile.goal, GoalRules()
+    for key in rules.__struct_fields__:
+        if rules.source == "logged" and getattr(rules, key) != getattr(default, key):
+            raise ConfigError(
+                f"`goal.{key}` is given, and `goal.source` is 'logged': it would not be used",
+                where=where,
+                remedy=f'leave goal.{key} out, or set goal.source = "hindsight"',
             )
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.profile.camera import Camera
-from restock.ingest.profile.checks import check_profile
+from restock.ingest.profile.checks import check_profile, refuse_unused_goal_rules
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
@@ -253,7 +253,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
             else f"the shipped profiles are: {', '.join(names)}",
         )
     profile = _typed(read_toml(path), where=where, folder=path.parent)
-    # Of stores too it would shut out those that an older Restock wrote: here, and in the twin.
+    # Of stores too these would shut out those that an older Restock wrote: here, and in the twin.
+    refuse_unused_goal_rules(profile, where)
     refuse_beyond_steering(profile.robot, profile.task.actions, where=where)
     return profile
 

@@ -172,6 +172,16 @@ def test_the_key_is_checked_and_leaves_other_profiles_as_they_were(tmp_path) -> 
         parse_profile(hindsight.replace('goal = "route"', 'goal = "none"'), where="text")
 
 
+def test_rules_of_hindsight_are_refused_where_goals_are_logged(tmp_path) -> None:
+    text = profile_toml(load_profile("warehouse_amr"))
+    unused = tmp_path / "unused.toml"
+    unused.write_text(text.replace("still_s = 3.0", "still_s = 5.0"))
+    with pytest.raises(ConfigError, match=r"`goal\.still_s` is given.*would not be used"):
+        load_profile(unused)
+    # A store that an older Restock wrote is still read.
+    assert parse_profile(unused.read_text(), where="store").goal.still_s == 5.0
+
+
 def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
     _, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
     with pytest.raises(ConfigError, match="in hindsight, which is not possible live"):
