@@ -24,6 +24,7 @@ from msgspec import inspect
 from restock.errors import ConfigError
 
 T = TypeVar("T")
+_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # of a message's path, and what follows it
 
 
 class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -261,6 +262,9 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
             bounds, value, key = *place[:2], _join(prefix, place[2])
             return f"{key} must be {_range_in_words(bounds)}, got {value}"
     if re.match(r"Expected `|Invalid ", what) or not path:
+        choices = sorted(set(_choices(inspect.type_info(kind), path)))
+        if choices and choices[0].startswith('"'):  # names stand before other kinds
+            what += f"; choose from {', '.join(choices)}"
         return f"`{key}`: {what}" if key else what
     # A check of a struct's own names its fields: `loss.margin …` where the struct is at `loss`.
     return what if what.startswith((key, "`")) or " " not in what else f"{key}.{what}"
@@ -276,7 +280,7 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
     if not path:
         bounds = _bounds(kind)
         return (bounds, value, "") if bounds and not _inside(value, bounds) else None
-    step, rest = re.fullmatch(r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)", path, re.S).groups()  # type: ignore[union-attr]
+    step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
     if isinstance(kind, inspect.StructType | inspect.TypedDictType | inspect.DataclassType):
         fields = {field.encode_name: field.type for field in kind.fields}
         name = step[1:]
@@ -298,6 +302,31 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
     # `[...]` may stand for another item of the map, one that is longer.
     place = _walk(item, value[index], rest) if index < len(value) else None
     return place and (place[0], place[1], _join(step, place[2]))
+
+
+def _choices(kind: inspect.Type, path: str) -> Iterator[str]:
+    """What may stand where a message's path leads to: names in quotes, or a number or table."""
+    if isinstance(kind, inspect.UnionType):
+        for option in kind.types:
+            yield from _choices(option, path)
+        return
+    if not path:
+        if isinstance(kind, inspect.LiteralType):
+            yield from (f'"{value}"' for value in kind.values)
+        elif isinstance(kind, inspect.IntType | inspect.FloatType):
+            yield "a number"
+        elif isinstance(kind, inspect.StructType | inspect.DictType):
+            yield "a table"
+        return
+    step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
+    if isinstance(kind, inspect.StructType):
+        if step[1:] == kind.tag_field:
+            yield f'"{kind.tag}"'
+        for field in kind.fields:
+            if field.encode_name == step[1:]:
+                yield from _choices(field.type, rest)
+    elif (item := _item(kind)) is not None:
+        yield from _choices(item, rest)
 
 
 def _has(document: Any, keys: list[str]) -> bool:

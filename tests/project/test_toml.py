@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,11 +13,14 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec import Meta
+from msgspec import Meta, inspect
 
 from restock.errors import ConfigError
+from restock.ingest.profile.profile import Profile
+from restock.replay.mixture.mixture import Mixture
 from restock.toml import Checked, parse_toml, read_toml, toml_value, typed, with_value
-from restock.train.dqn.config import apply_overrides, as_overrides
+from restock.train.dqn.config import TrainConfig, apply_overrides, as_overrides
+from restock.train.study.study import Study
 
 plain = st.recursive(
     st.booleans()
@@ -111,7 +116,8 @@ IN_FILES: list[tuple[dict[str, Any], str]] = [
     ({"inners": [{"nothing": 1}]}, "unknown key `inners[0].nothing`"),
     ({"share": "x"}, "`share`: Expected `float`, got `str`"),
     ({"share": True}, "`share`: Expected `float`, got `bool`"),
-    ({"either": "no"}, "`either`: Invalid enum value 'no'"),
+    ({"either": "no"}, "`either`: Invalid enum value 'no'; choose from \"auto\", a number"),
+    ({"either": []}, '`either`: Expected `float | str`, got `array`; choose from "auto", a number'),
 ]
 
 
@@ -133,6 +139,39 @@ def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: s
         typed(values, Config, where="config.toml", remedy="see the docs")
     assert str(refused.value) == f"config.toml: {message}\n  see the docs"
     assert refused.value.where == "config.toml"
+
+
+def misspelt(kind: inspect.Type) -> Iterator[tuple[Any, set[str]]]:
+    """Values that are wrong where a type has names to choose from, each with all names there."""
+    if isinstance(kind, inspect.UnionType):
+        found: dict[str, tuple[Any, set[str]]] = {}
+        for value, names in (one for option in kind.types for one in misspelt(option)):
+            found.setdefault(str(value), (value, set()))[1].update(names)
+        yield from found.values()
+    elif isinstance(kind, inspect.LiteralType):
+        yield "nonsense", set(map(str, kind.values))
+    elif isinstance(kind, inspect.StructType):
+        tag = {kind.tag_field: kind.tag} if kind.tag_field else {}
+        if kind.tag_field:
+            yield {kind.tag_field: "nonsense"}, {str(kind.tag)}
+        for field in kind.fields:
+            for value, names in misspelt(field.type):
+                yield tag | {field.encode_name: value}, names
+    elif isinstance(kind, inspect.VarTupleType | inspect.ListType):
+        yield from (([value], names) for value, names in misspelt(kind.item_type))
+    elif isinstance(kind, inspect.DictType):
+        yield from (({"a": value}, names) for value, names in misspelt(kind.value_type))
+
+
+@pytest.mark.parametrize("kind", [TrainConfig, Mixture, Profile, Study])
+def test_each_setting_with_names_to_choose_from_lists_them(kind: type) -> None:
+    wrong = list(misspelt(inspect.type_info(kind)))
+    assert wrong
+    for values, names in wrong:
+        with pytest.raises(ConfigError, match="nonsense") as refused:
+            typed(values, kind, where="config.toml")
+        listed = refused.value.what.partition("; choose from ")[2]
+        assert set(re.findall(r'"(.+?)"', listed)) == names, refused.value.what
 
 
 def test_errors_name_keys_below_a_prefix() -> None:
