@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import datetime
 from importlib.resources import files
 from pathlib import Path
@@ -40,6 +40,10 @@ class DoubtfulEvent:
     first_step: int
     last_step: int
     transition_id: int  # of its first step
+
+
+_COLUMNS = [field.name for field in fields(DoubtfulEvent) if field.name != "transition_id"]
+_COLUMNS += ["open", VERDICT]  # of a review file
 
 
 def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
@@ -89,7 +93,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
 def review_csv(rows: list[dict[str, Any]]) -> str:
     """A review file."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]) if rows else [VERDICT], lineterminator="\n")
+    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

@@ -10,9 +10,10 @@ import shutil
 import sys
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from support.paths import ROOT
-from support.stores import one
+from support.stores import one, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import LabelError
@@ -136,6 +137,28 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     # Verdicts may be in it: it is not written over.
     assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 2
     assert "may contain verdicts" in capsys.readouterr().err
+
+
+def test_a_list_without_events_is_a_header_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = recording_transitions(1, episodes=2)
+    for name, value in (("condition", "nominal"), ("conditions", []), ("probabilities", [])):
+        field = rows.schema.field(name)
+        values = pa.array([value] * len(rows), field.type)
+        rows = rows.set_column(rows.column_names.index(name), field, values)
+    store, file = write_store(tmp_path / "store", [rows]), tmp_path / "review.csv"
+    for more in ([], ["--json"]):
+        assert main(["label", str(store), "--review", "3", "--out", str(file), *more]) == 0
+        shown = capsys.readouterr()
+        told = " ".join((shown.err if more else shown.out).split())
+        assert "no uncertain event is left to review" in told
+        assert f"{file} has only a header" in told
+        assert not more or json.loads(shown.out) == []
+        # As with verdicts that are all empty, there is nothing to take from it.
+        assert main(["label", str(store), "--corrections", str(file)]) == 0
+        assert "contains no verdict" in " ".join(capsys.readouterr().out.split())
+        file.unlink()
 
 
 def fill(

@@ -38,11 +38,16 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
             ) from None
         except OSError as error:
             raise LabelError(f"cannot be written: {error.strerror}", where=str(out)) from error
+    nothing = "no uncertain event is left to review"
+    if out is not None:
+        nothing += f": {out} has only a header"
     if json:
         output.print_json(rows)
+        if not rows:
+            output.say(nothing)
         return ExitCode.OK
     if not rows:
-        output.stdout().print("no uncertain event is left to review")
+        output.stdout().print(nothing, markup=False, soft_wrap=True)
         return ExitCode.OK
     output.print_table([_line(row) for row in rows], title="events, the most uncertain first")
     output.say(f"to see the first: {rows[0]['open']}")
