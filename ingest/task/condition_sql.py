@@ -46,6 +46,11 @@ _GROWING = {
 # Of a zone that is given, or fixed as it is here.
 _OF_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
+# Aggregates that depend on the order of the rows, beside those that windows have by themselves.
+_OF_ORDER = {
+    *("any_value", "arbitrary", "list", "array_agg"),
+    *("string_agg", "group_concat", "listagg"),
+}
 _BACKWARD = {
     *("WINDOW_AGGREGATE", "WINDOW_LAG"),
     *("WINDOW_FIRST_VALUE", "WINDOW_LAST_VALUE", "WINDOW_NTH_VALUE"),
@@ -230,6 +235,14 @@ def not_repeatable(sql: str) -> str | None:
                 continue
         if name in _changing() - _OF_ZONES or (name == "age" and len(part["arguments"]) == 1):
             return f"{name}() may differ from one time to the next"
-        if kind == "WINDOW" and part["type"] != "WINDOW_AGGREGATE" and not part["orders"]:
+        if kind == "WINDOW" and not part["orders"] and _follows_order(part):
             return f"{name}() OVER (…) without ORDER BY depends on the order in which rows are read"
     return None
+
+
+def _follows_order(window: dict[str, Any]) -> bool:
+    """Whether a window without ORDER BY gives what the order of the rows makes of it."""
+    if any(window[edge].endswith("_ROWS") for edge in ("start", "end")):
+        return True
+    of_order = window["type"] != "WINDOW_AGGREGATE" or window["function_name"].lower() in _OF_ORDER
+    return of_order and not window["arg_orders"]  # first(x ORDER BY y)

@@ -155,6 +155,9 @@ def test_sql_that_only_fails_on_rows_is_named_too(transitions: pa.Table, sql: st
         ("age(make_timestamp_ns(stamp_ns)::TIMESTAMP) > INTERVAL 1 DAY", "age"),
         ("transition_id IN (SELECT 1 WHERE uuid() IS NOT NULL)", "uuid"),
         ("row_number() OVER (PARTITION BY episode_id) < 9", "without ORDER BY"),
+        ("any_value(zone) OVER (PARTITION BY episode_id) = 'aisle'", r"any_value\(\) .*without"),
+        ("(list(reward) OVER ())[1] > 0", r"list\(\) .*without ORDER BY"),
+        ("sum(reward) OVER (ROWS 3 PRECEDING) > 0", r"sum\(\) .*without ORDER BY"),
     ],
 )
 def test_sql_that_may_choose_other_rows_another_time_is_refused(
@@ -175,6 +178,10 @@ def test_sql_that_always_chooses_the_same_rows_is_taken(transitions: pa.Table) -
         "md5_number_lower(episode_id) % 10 < 9",
         "row_number() OVER (PARTITION BY episode_id ORDER BY transition_id) < 9",
         "sum(reward) OVER (PARTITION BY episode_id) > -1e9",
+        "count(*) OVER (ROWS BETWEEN UNBOUNDED PRECEDING AND UNBOUNDED FOLLOWING) > 1",
+        "first(reward ORDER BY transition_id) OVER (PARTITION BY episode_id) > -1e9",
+        "len(list(reward ORDER BY step_index) OVER (PARTITION BY episode_id)) > 1",
+        "arg_max(reward, step_index) OVER (PARTITION BY episode_id) > -1e9",
         "date_trunc('day', to_timestamp(stamp_ns / 1e9) AT TIME ZONE 'UTC') > '2020-01-01'",
         "CASE WHEN stamp_ns < 0 THEN error('bad') ELSE true END",
     )
