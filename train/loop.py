@@ -26,7 +26,7 @@ from restock.train.evaluation.evaluate import (
 )
 from restock.train.evaluation.off_policy.dataset import load_ope_dataset
 from restock.train.evaluation.offline_start import choose_start
-from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of
+from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of, notes_of
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
@@ -72,7 +72,8 @@ def train(
     Args:
         stop: asked between steps and while the policy is evaluated; True ends the run with a
             checkpoint. An evaluation under way is abandoned, and made by the run that goes on.
-        notify: told of every row of `progress`, every evaluation, and a teacher without opinions.
+        notify: told of every row of `progress`, every evaluation, a teacher without opinions, and
+            the notes of an off-policy evaluation on its logs.
 
     Raises:
         TrainingInterrupted: `stop` said so.
@@ -109,7 +110,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         if session.interval.updates:
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
-            _evaluate_off_policy(session, stop)  # on held-out logs, before it drives
+            _evaluate_off_policy(session, notify, stop)  # on held-out logs, before it drives
         if config.offline_start.choose:
             _choose_start(session, stop)
         _evaluate(session, notify, stop)
@@ -376,20 +377,22 @@ def _note_silence(session: Session, notify: Notify) -> None:
     notify("teacher", {"asked": teacher.asked, "answered": 0})
 
 
-def _evaluate_off_policy(session: Session, stop: Callable[[], bool]) -> None:
+def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
     """The policy as it is now, on held-out logs, into the table `off_policy`; none without any."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
     if session.run.table("off_policy").num_rows:  # before the run stopped
         return
     config, learner = session.config, session.learner
+    ope = OpeConfig(seed=config.seed)
     dataset = load_ope_dataset(session.logs.panel, session.task, seed=config.seed)
+    notify("off_policy", {"notes": notes_of(session.task, dataset, ope)})
     rows = evaluate_off_policy(
         clone(learner.policy).to("cpu"),
         dataset,
         discount=config.loss.discount,
         measures=measures_of(session.task, dataset),
-        config=OpeConfig(seed=config.seed),
+        config=ope,
         between=lambda: _interrupt(session, stop),
     )
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])

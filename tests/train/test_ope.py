@@ -225,7 +225,7 @@ def test_a_horizon_gives_an_answer_where_the_whole_was_refused(panel: Panel) -> 
 
 
 def test_training_evaluates_off_policy_before_it_drives(
-    panel: Panel, tmp_path: Path, quick_models: None
+    panel: Panel, tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "run"
     argv = ["train", "--panel", str(panel.path), "--out", str(path), "--env-steps", "0"]
@@ -235,3 +235,5 @@ def test_training_evaluates_off_policy_before_it_drives(
     rows = pq.read_table(path / "off_policy.parquet").to_pylist()
     assert {row["measure"] for row in rows} == {"return", "success"}
     assert {row["gradient_steps"] for row in rows} == {3}
+    said = " ".join(capsys.readouterr().err.split())  # as `restock eval --on-logs` does
+    assert "off-policy evaluation: the fitted model looks 2 steps ahead" in said

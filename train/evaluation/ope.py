@@ -110,8 +110,12 @@ def evaluate_run_off_policy(
         clocks = {"env_steps": None, "gradient_steps": steps}
         table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
         write_table(table, path / "eval" / FILE)
-    notes = dataset.notes + _beyond_the_model(task, dataset.evaluation, config.model.iterations)
-    return OpeResult(rows, notes, agent.version)
+    return OpeResult(rows, notes_of(task, dataset, config), agent.version)
+
+
+def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:
+    """What is worth saying of the logs, and of the model on them."""
+    return dataset.notes + _beyond_the_model(task, dataset.evaluation, config.model.iterations)
 
 
 def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...]:
@@ -270,5 +274,6 @@ __all__ = [
     "evaluate_off_policy",
     "evaluate_run_off_policy",
     "measures_of",
+    "notes_of",
     "padded_episodes",
 ]

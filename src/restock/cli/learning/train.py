@@ -132,6 +132,9 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     say(_guard_line(values))
                 elif event == "teacher":
                     say(_silence_line(values))
+                elif event == "off_policy":
+                    for note in values["notes"]:
+                        say(f"off-policy evaluation: {note}")
                 elif event == "progress":
                     advance(values["env_steps"] - seen, _progress_note(values))
                     seen = values["env_steps"]
