@@ -87,7 +87,12 @@ TABLES: dict[str, pa.Schema] = {
             "share of the logged rows that the mixture asks for; null without a quota",
         ),
         ("available_rows", _I, "number of rows in the panel, or now in the ring"),
-        ("available_share", _F, "share of the source's rows"),
+        (
+            "available_share",
+            _F,
+            "share of the source's rows; of the logs, those in the panel, after the caps of the "
+            "mixture, whose natural shares count the rows before them",
+        ),
         ("drawn_rows", _I, "number of rows drawn in the interval"),
         ("drawn_share", _F, "share of the source's drawn rows"),
         ("effective_share", _F, "the same share after importance weights"),
