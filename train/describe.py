@@ -41,6 +41,16 @@ def describe_run(prepared: Prepared) -> str:
         lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
     if config.teacher.filters:
         lines.append(_teacher(config.teacher, panel))
+    if panel is None or not panel.splits:
+        has = "there is no panel" if panel is None else "the panel holds out no rows"
+        lines += [
+            f"{name} has no effect: {has} ([evaluation_split] of a mixture)"
+            for name, asked in (
+                ("offline_start.choose", config.offline_start.choose),
+                ("evaluation.off_policy", config.evaluation.off_policy),
+            )
+            if asked
+        ]
     if config.env.twin:
         lines += _not_evaluated(document)
         lines += sealed(open_floors(config.env.layouts))

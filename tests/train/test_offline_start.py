@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from support.panels import panel_of
+from support.panels import EVERY, NO_SPLIT, panel_of
 from support.stores import recording_transitions, write_store
 
 from restock.cli import main
@@ -20,6 +20,7 @@ from restock.ingest.task.task import nearest_action
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.train import loop
+from restock.train.describe import describe_run
 from restock.train.dqn.behaviour import FilteredNetwork, ProposedNetwork
 from restock.train.dqn.config import OfflineStartConfig
 from restock.train.dqn.fitted_q import FittedQConfig
@@ -202,6 +203,25 @@ def test_a_run_begins_with_what_was_chosen_and_keeps_it_until_it_is_beaten(
 
 
 @pytest.mark.long
+def test_what_needs_held_out_logs_says_so_where_there_are_none(tmp_path: Path) -> None:
+    rows = recording_transitions(0, episodes=20, task=TASK)
+    whole, held = (
+        panel_of(rows, mixture, tmp_path / name, task=TASK)
+        for name, mixture in (("whole", EVERY + NO_SPLIT), ("held", MIXTURE))
+    )
+    asked = ["offline_start.choose=true", "evaluation.off_policy=true"]
+    for panel, settings, said in (
+        (None, asked, [f"{name.split('=')[0]} has no effect: there is no panel" for name in asked]),
+        (whole, asked[:1], ["offline_start.choose has no effect: the panel holds out no rows"]),
+        (whole, [], []),
+        (held, asked, []),
+    ):
+        path = None if panel is None else panel.path
+        lines = describe_run(prepare_new(tmp_path / "run", path, None, settings)).splitlines()
+        told = [line.split(" (")[0] for line in lines if "has no effect" in line]
+        assert told == said
+
+
 @pytest.mark.parametrize("during", ["off_policy", "offline_start"])
 def test_a_choice_is_abandoned_and_made_by_the_resumed_run(
     panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
