@@ -202,7 +202,6 @@ def test_a_run_begins_with_what_was_chosen_and_keeps_it_until_it_is_beaten(
     assert isinstance(load_agent(Run.open(path)).network, ProposedNetwork)
 
 
-@pytest.mark.long
 def test_what_needs_held_out_logs_says_so_where_there_are_none(tmp_path: Path) -> None:
     rows = recording_transitions(0, episodes=20, task=TASK)
     whole, held = (
@@ -222,6 +221,7 @@ def test_what_needs_held_out_logs_says_so_where_there_are_none(tmp_path: Path) -
         assert told == said
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("during", ["off_policy", "offline_start"])
 def test_a_choice_is_abandoned_and_made_by_the_resumed_run(
     panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, during: str
