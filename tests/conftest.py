@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import settings
 from support import s3_server as s3
-from support.stores import recording_transitions, write_store
+from support.stores import recording_transitions, summarised_once, write_store
 
 # Times are not asserted: on a loaded machine the first example of a property may take long.
 settings.register_profile("untimed", deadline=None)
@@ -45,6 +45,16 @@ def quick_models(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in (ope, loop):
         monkeypatch.setattr(module, "OpeConfig", partial(ope.OpeConfig, model=QUICK))
+
+
+@pytest.fixture(scope="module")
+def summaries_once() -> Iterator[None]:
+    """For files that write the same few recordings again and again: each is summarised once."""
+    from restock.ingest.store import writer
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer, "summarised", summarised_once)
+        yield
 
 
 @pytest.fixture(scope="session")

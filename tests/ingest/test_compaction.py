@@ -26,6 +26,8 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.audit import Finding, run_audits, shipped_audits
 from restock.replay.store.store import Store
 
+pytestmark = pytest.mark.usefixtures("summaries_once")
+
 
 def compacted_by_delta(path: Path) -> None:
     """As any tool that knows Delta does it, with the old files gone."""

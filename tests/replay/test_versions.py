@@ -17,6 +17,8 @@ from restock.ingest.store.lineage import _read
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 
+pytestmark = pytest.mark.usefixtures("summaries_once")
+
 VERBS = ("sql", "audit", "gaps", "drift", "mix", "export", "trace", "label")
 
 
