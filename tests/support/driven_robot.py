@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -187,9 +188,8 @@ def write_topics(
 ) -> Path:
     """Topics as (message type, columns), as a rosbag2 folder; other fields are zero or empty."""
     from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
 
-    types = get_typestore(Stores.ROS2_HUMBLE)
+    types = _humble()
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         lines = []
@@ -204,6 +204,14 @@ def write_topics(
         for log_time_ns, connection, data in sorted(lines, key=lambda line: line[0]):
             writer.write(connection, log_time_ns, data)
     return folder
+
+
+@cache
+def _humble() -> Any:
+    """The types of ROS 2 Humble, which compile how each is serialised when it is first written."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _blank(types: Any, name: str) -> Any:
