@@ -91,6 +91,7 @@ def test_a_damaged_recording_is_read_as_far_as_it_is_intact_where_that_is_asked_
     assert not (out / "floor.toml").exists()
 
 
+@pytest.mark.long
 def test_a_robot_larger_than_its_aisles_is_told_to_be_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,7 +71,9 @@ WHOLE = expected((1, "a", 0), (2, "b", 7), (3, "a", 0))
 
 
 @pytest.mark.parametrize("how", DAMAGES)
-@pytest.mark.parametrize("names", [[TRANSITIONS], [RECORDINGS], [TRANSITIONS, RECORDINGS]])
+@pytest.mark.parametrize(
+    "names", one_in(3, [[TRANSITIONS, RECORDINGS], [TRANSITIONS], [RECORDINGS]])
+)
 def test_a_damaged_file_is_joined_again_from_those_it_was_made_of(tmp_path, names, how):
     writer = joined(tmp_path / "s")
     before = writer.rows(f"{3:016x}", f"{3:016x}-a").to_pylist()

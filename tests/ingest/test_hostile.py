@@ -20,6 +20,7 @@ from mcap.writer import CompressionType, Writer
 from support.bag_samples import write_bag, write_mcap
 from support.driven_robot import Drive
 from support.driven_robot import write_bag as write_drive
+from support.long import one_in
 
 from restock.cli import main
 from restock.errors import RecordingError, visible
@@ -290,7 +291,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("name", one_in(3, HOSTILE))
 def test_little_memory_is_enough_for_hostile_files(name: str, tmp_path: Path) -> None:
     make, says = HOSTILE[name]
     path = tmp_path / "run.mcap"
@@ -411,7 +412,7 @@ def test_no_control_character_of_a_file_reaches_the_terminal(
     )
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("storage", one_in(2, ["mcap", "sqlite3"]))
 @pytest.mark.parametrize("name", [b"bad\xff", b"a\x1b[2J\nb\xe2\x80\xaec", b"[red]caf\xc3\xa9 [b]"])
 def test_any_name_of_a_file_is_ingested_and_escaped(
     name: bytes, storage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from support.long import one_in
 from support.panels import EVERY, NO_SPLIT
 from support.stores import recording_transitions, write_store
 
@@ -47,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", MIXTURES)
+@pytest.mark.parametrize("name", one_in(2, MIXTURES))
 def test_mix_packs_exactly_what_the_tables_say(folder: Path, tmp_path: Path, name: str) -> None:
     text, mixture = MIXTURES[name], name
     if text is not None:

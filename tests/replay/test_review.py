@@ -73,6 +73,7 @@ def true_verdict(event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]
     return f"{inside[0]}..{inside[-1]}" if inside else "no"
 
 
+@pytest.mark.long
 def test_doubtful_events_are_wrong_more_often_and_their_verdicts_mend_the_labels(
     monday: Path, tmp_path: Path
 ) -> None:

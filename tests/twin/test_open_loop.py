@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from support.long import one_in
 from support.paths import ROOT, SHARED
 
 from restock.ingest.pipeline import ingest
@@ -92,7 +93,7 @@ def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps)
     assert steps.followed[rows].all()
 
 
-@pytest.mark.parametrize("mapped", [True, False])
+@pytest.mark.parametrize("mapped", one_in(2, [True, False]))
 def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: bool) -> None:
     rows = log_segments(steps, 1.2).row[::3]
     warehouse = default_warehouse() if mapped else None
