@@ -65,6 +65,21 @@ def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     assert modules & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
 
 
+@pytest.mark.parametrize(
+    ("module", "slow"),
+    [
+        ("restock.report", {"torch"}),
+        ("restock.train.twin.env.vector_env", {"torch"}),
+        ("restock.train.loop", set()),
+    ],
+)
+def test_what_few_runs_use_is_not_imported_by_all(module: str, slow: set[str]) -> None:
+    """scipy.signal takes .6 s, scipy.stats .3 s and PyTorch more than 1 s."""
+    code = f"import sys, {module}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) & (slow | {"scipy.signal", "scipy.stats"}) == set()
+
+
 @pytest.mark.parametrize("order", ["import restock, gymnasium", "import gymnasium, restock"])
 def test_the_environment_is_registered_whichever_is_imported_first(order: str) -> None:
     code = f"{order}; print(gymnasium.spec('restock/Warehouse-v0').entry_point)"

@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 from mujoco import minimize
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from restock.arrays import F64
 from restock.ingest.task.signals import wrap_angle
@@ -230,6 +229,8 @@ class FitProblem:
 
 def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
     """The best (best, n) of the base and `points` points of a Sobol sequence."""
+    from scipy.stats import qmc  # here: it is slow to import
+
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)
     drawn = sampler.random(points) if points else np.zeros((0, len(problem.coordinates)))
     start = problem.coordinates.point(problem.coordinates.base)

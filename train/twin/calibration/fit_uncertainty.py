@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from restock.arrays import F64
 from restock.stats import cluster_counts
@@ -51,6 +50,8 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
     episodes are drawn; with fewer than 8 of them, segments. Each draw moves the parameters by one
     Gauss-Newton step of its own residuals; half widths are Student's t times the spread of that.
     """
+    from scipy.stats import t as student  # here: it is slow to import
+
     names = np.unique(episode)
     by_segment = len(names) < FEW_CLUSTERS
     key = np.arange(len(episode)) if by_segment else np.searchsorted(names, episode)

@@ -12,7 +12,6 @@ from restock.report.look.blocks import Drawing, Figure, Section, words
 from restock.report.look.charts import FONT
 from restock.report.look.floor_map import SCALE, Box, FloorMap
 from restock.report.run.facts import Facts
-from restock.train.evaluation.film import label_of
 from restock.train.run.measures import cell_name
 from restock.train.twin.floors.floors import open_floors
 from restock.words import counted
@@ -50,6 +49,8 @@ def films_section(facts: Facts) -> Section | None:
 
 
 def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
+    from restock.train.evaluation.film import label_of  # here: with it comes PyTorch
+
     floor = next(f for f in open_floors(film["layouts"]) if f.name == film["layout"])
     racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in floor.racks]
     plan = FloorMap(floor.width_m, floor.depth_m, racks)
