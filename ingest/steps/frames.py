@@ -96,26 +96,40 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
     children = topic.fields["transforms[].child_frame_id"]
     assert isinstance(children, Ragged)
     message = np.repeat(np.arange(len(children)), children.lengths)
-    names = np.array([plain(name) for name in np.asarray(children.values).tolist()], object)
+
+    def column(path: str) -> NDArray[Any]:
+        values = topic.fields[f"transforms[].{path}"]
+        assert isinstance(values, Ragged)
+        return np.asarray(values.values)
+
+    codes, names = _plain_codes(column("child_frame_id"))
+    order = np.argsort(codes, kind="stable")
+    stamp, transform = column("header.stamp"), {p: column(f"transform.{p}") for p in (*AXES, *TURN)}
+    parent_codes, parents = _plain_codes(column("header.frame_id"))
+    parent = np.array([*parents, None], object)[parent_codes]
     edges = {}
-    for name in sorted(set(names.tolist())):
-        rows = np.flatnonzero(names == name)
-
-        def column(path: str, rows: Ints = rows) -> NDArray[Any]:
-            values = topic.fields[f"transforms[].{path}"]
-            assert isinstance(values, Ragged)
-            return np.asarray(values.values)[rows]
-
-        parents = [plain(parent) for parent in column("header.frame_id").tolist()]
+    begins = np.searchsorted(codes[order], np.arange(len(names) + 1))
+    for name, begin, end in zip(names, begins[:-1].tolist(), begins[1:].tolist(), strict=True):
+        rows = order[begin:end]
         fields: dict[str, Any] = {
-            STAMP: column("header.stamp"),
-            PARENT: np.array([*parents, None], object)[:-1],
-            **{part: column(f"transform.{part}") for part in (*AXES, *TURN)},
+            STAMP: stamp[rows],
+            PARENT: parent[rows],
+            **{part: values[rows] for part, values in transform.items()},
         }
         edges[name] = TopicColumns(
             topic.log_time_ns[message[rows]], topic.publish_time_ns[message[rows]], fields
         )
     return edges
+
+
+def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
+    """Which of the plain names, sorted, each of these frames (N,) has; and the names."""
+    place: dict[str, int] = {}  # of each name as it is written, in the order they are met
+    met = [place.setdefault(name, len(place)) for name in frames.tolist()]
+    each = [plain(name) for name in place]
+    names = sorted(set(each))
+    number = {name: code for code, name in enumerate(names)}
+    return np.array([number[name] for name in each], np.int64)[np.array(met, np.int64)], names
 
 
 def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:

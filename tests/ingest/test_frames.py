@@ -6,6 +6,8 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from support.driven_robot import START_NS, Drive, columns
 from support.paths import ROOT, SHARED
 from support.profile_texts import framed
@@ -182,6 +184,20 @@ def test_a_slash_before_a_name_says_nothing():
     moving: list[Line] = [(0.0, "/map", "/base_link", 3, 0, 0, 0)]
     found = tree_of(Frames(), moving, []).place("base_link", at(0.1))
     assert found.translation_m[0, 0] == 3.0
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(*[st.sampled_from(["map", "/map", "odom", "/odom", "arm"])] * 2)))
+def test_each_frame_has_its_own_transforms_in_their_order(pairs: list[tuple[str, str]]) -> None:
+    lines: list[Line] = [(0.1 * n, *pair, n, 0, 0, 0) for n, pair in enumerate(pairs)]
+    edges = Edges.of(Frames(), {"/tf": transforms(lines)})
+    names = {child.strip("/") for _, child in pairs}
+    assert list(edges.topics) == [f"/tf {name}" for name in sorted(names)]
+    for name in names:
+        own = [n for n, (_, child) in enumerate(pairs) if child.strip("/") == name]
+        fields = edges.topics[f"/tf {name}"].fields
+        assert fields["translation.x"].tolist() == own
+        assert fields["parent"].tolist() == [pairs[n][0].strip("/") for n in own]
 
 
 def test_a_quaternion_of_no_length_is_not_finite():
