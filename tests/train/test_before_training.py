@@ -199,22 +199,36 @@ def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
     assert "profile" not in found[0].remedy
 
 
-def test_a_fault_of_one_robot_is_named_with_its_recording(logs: FedRows, twin: FedRows) -> None:
-    """Of all rows together a third is wrong, by less than what is allowed."""
-    fleet = replace(logs, recording=np.array([f"r{one % 3}" for one in logs.episode]))
-    assert diagnose_rows(fleet, twin).verdict == "HEALTHY"
+@pytest.mark.parametrize("kind", ["recordings", "robots"])
+def test_a_fault_of_one_robot_is_named_with_its_recording(
+    kind: str, logs: FedRows, twin: FedRows
+) -> None:
+    """Of all rows together a third is wrong, by less than what is allowed. A robot that logs a
+    recording a mission is known by its tag."""
+    third = np.array([f"r{one % 3}" for one in logs.episode])
+    fleet = replace(logs, recording=third)
+    if kind == "robots":
+        fleet = replace(logs, recording=logs.episode.astype(str), robot=third)
+    sound = diagnose_rows(fleet, twin)
+    assert sound.verdict == "HEALTHY"
+    (compared,) = [row for row in sound.comparisons if row.check == "recordings"]
+    several = len(np.unique(fleet.recording))
+    assert (
+        compared.note == f"3 {kind} with 500 rows were compared: {several} of {several} recordings"
+    )
     first, slip = map(logs.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
-    wrong = fleet.recording == "r2"
+    wrong = third == "r2"
+    part = "r2" if kind == "recordings" else "robot r2"
     made = [fleet.observation.copy(), fleet.next_observation.copy()]
     for held in made:
         held[wrong, slip] -= 0.5 * held[wrong, first]
         held[wrong, first] *= 1.5
     found = diagnose_rows(replace(fleet, observation=made[0], next_observation=made[1]), twin)
     assert [one.cause for one in found.findings] == ["SENSOR_SCALED"]
-    assert "in 1 of 3 recordings (r2): the scale of the logs' gyroscope is 1." in (
+    assert f"in 1 of 3 {kind} ({part}): the scale of the logs' gyroscope is 1." in (
         found.findings[0].text
     )
-    assert all(check.endswith(", r2") for check in found.findings[0].evidence)
+    assert all(check.endswith(f", {part}") for check in found.findings[0].evidence)
     assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
 
 

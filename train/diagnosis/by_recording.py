@@ -2,7 +2,8 @@
 
 A wrong sensor of one robot in four moves the figures of all rows by a quarter of what it does to
 its own: within what is allowed, or as if all robots were a little wrong. So each recording is
-compared by itself, too.
+compared by itself, too; short ones (a bag a mission) together with the other short ones of the
+robot that they are tagged with.
 """
 
 from __future__ import annotations
@@ -11,16 +12,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from restock.train.diagnosis.answers import Answer, TwinFits, answers
 from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows
 
-FEWEST_ROWS = 500  # of a recording that is compared by itself
-MOST = 40  # recordings, of the most rows
+FEWEST_ROWS = 500  # of a recording, or of a robot's short ones, that is compared by itself
+MOST = 40  # parts, of the most rows
 CHECK = "recordings"
-_SOME = 0.8  # of the recordings, at most: what is wrong in nearly all of them is wrong in all rows
+_SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wrong in all rows
 _NAMED = 3
 
 
@@ -28,18 +30,21 @@ def unlike_recordings(
     logs: FedRows, twin: FedRows | None, seed: int = 0
 ) -> tuple[list[Finding], list[Comparison]]:
     """What is wrong in some of the recordings alone, and the comparisons that say so."""
-    names, rows = np.unique(logs.recording, return_counts=True)
-    if len(names) < 2:
+    recordings = len(np.unique(logs.recording))
+    if recordings < 2:
         return [], []
+    part, kind = _parts(logs)
+    names, rows = np.unique(part[part != ""], return_counts=True)
     chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= FEWEST_ROWS).sum(), MOST)]
-    what = "each recording by itself"
+    what = f"each of the {kind} by itself"
     if not len(chosen):
-        return [], [not_run(CHECK, what, f"no recording has {FEWEST_ROWS} rows")]
+        why = f"no recording has {FEWEST_ROWS} rows, nor have those tagged with one robot together"
+        return [], [not_run(CHECK, what, why)]
     found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
     off: list[Comparison] = []
     of_twin: TwinFits = {}  # the same for every recording
     for name in chosen.tolist():
-        rows_of = logs.take(logs.recording == name)
+        rows_of = logs.take(part == name)
         own = [_named(one, name) for one in answers(rows_of, twin, seed, of_twin)]
         for one in findings(own, [], [], logs.task):
             found.setdefault(one.cause, []).append((name, one))
@@ -47,12 +52,26 @@ def unlike_recordings(
     some = list(found.values())
     if any(len(each) > _SOME * len(chosen) for each in some):
         some = []
+    inside = np.isin(part, chosen)
     compared = Comparison(
         CHECK, what, "recordings", "off" if some else "ok",
-        logs_rows=int(np.isin(logs.recording, chosen).sum()),
-        note=f"{len(chosen)} of {len(names)} have {FEWEST_ROWS} rows and were compared",
+        logs_rows=int(inside.sum()),
+        note=f"{len(chosen)} {kind} with {FEWEST_ROWS} rows were compared:"
+        f" {len(np.unique(logs.recording[inside]))} of {recordings} recordings",
     )  # fmt: skip
-    return [_joined(each, len(chosen)) for each in some], [compared, *(off if some else [])]
+    return [_joined(each, len(chosen), kind) for each in some], [compared, *(off if some else [])]
+
+
+def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
+    """Which part each row (N,) is compared with, "" for none; and what the parts are called."""
+    place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
+    is_short = (rows < FEWEST_ROWS)[place.reshape(-1)]
+    tagged = is_short & (logs.robot != "")
+    by_robot = np.char.add("robot ", logs.robot)
+    part = np.where(is_short, np.where(tagged, by_robot, ""), logs.recording)
+    if not tagged.any():
+        return part, "recordings"
+    return part, "robots" if is_short.all() else "recordings and robots"
 
 
 def _named(answer: Answer, recording: str) -> Answer:
@@ -61,16 +80,16 @@ def _named(answer: Answer, recording: str) -> Answer:
     return replace(answer, comparisons=tuple(rows))
 
 
-def _joined(each: Sequence[tuple[str, Finding]], compared: int) -> Finding:
-    """One finding of those of several recordings, in the words of the first."""
+def _joined(each: Sequence[tuple[str, Finding]], compared: int, kind: str) -> Finding:
+    """One finding of those of several parts, in the words of the first."""
     names = ", ".join(name for name, _ in each[:_NAMED])
     more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
     first = each[0][1]
     return replace(
         first,
-        text=f"in {len(each)} of {compared} recordings ({names}{more}): {first.text}",
-        remedy="for these recordings alone (the store's `recordings` view has their files and"
-        f" tags): {first.remedy}",
+        text=f"in {len(each)} of {compared} {kind} ({names}{more}): {first.text}",
+        remedy="for their recordings alone (the store's `recordings` view has the files and tags):"
+        f" {first.remedy}",
         evidence=tuple(check for _, one in each for check in one.evidence),
     )
 

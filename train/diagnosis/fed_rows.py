@@ -23,8 +23,8 @@ from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
 _COLUMNS = (
-    *("transition_id", "episode_id", "step_index", "recording_id", "condition", "action", "reward"),
-    *("terminated", "truncated", "observation", "next_observation"),
+    *("transition_id", "episode_id", "step_index", "recording_id", "robot", "condition", "action"),
+    *("reward", "terminated", "truncated", "observation", "next_observation"),
 )
 FEW_EPISODES = 20  # fewer than these are drawn in stretches of
 BLOCK_STEPS = 50  # steps: longer than what a step still shows of those before it
@@ -45,6 +45,7 @@ class FedRows:
     episode: Ints  # (N,) codes, rising
     step: Ints  # (N,) in its episode
     recording: NDArray[np.str_]  # (N,)
+    robot: NDArray[np.str_]  # (N,) as the recording is tagged; "" where it is not
     condition: NDArray[np.str_]  # (N,)
     transition_id: Ints  # (N,)
     left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
@@ -222,6 +223,9 @@ def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
         "episode": episode.astype(np.int64),
         "step": _numbers(table, "step_index")[order].astype(np.int64),
         "recording": _text(table, "recording_id")[order],
+        "robot": _text(table, "robot")[order]
+        if "robot" in table.column_names  # panels of an older Restock have none
+        else np.full(len(order), ""),
         "condition": _text(table, "condition")[order],
     }
 

@@ -107,6 +107,7 @@ def _rows(
         episode=episode,
         step=step.astype(np.int64),
         recording=np.full(len(episode), "twin"),
+        robot=np.full(len(episode), ""),
         condition=_labels(conditions, chosen, episode, step),
         transition_id=np.arange(len(episode), dtype=np.int64),
     )
