@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.driven_robot import Drive, columns, typed_topics, write_topics
+from support.driven_robot import Drive, columns, ragged, typed_topics, write_topics
 from support.paths import ROOT
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.profile import parse_profile
+from restock.ingest.propose.evidence.footprint import footprint_of
+from restock.ingest.propose.evidence.robot_lines import propose_robot
+from restock.ingest.propose.evidence.roles import robots_in
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.urdf.described_robot import DescribedRobot, described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
@@ -370,6 +374,107 @@ def test_the_description_of_an_arm_does_not_hide_that_of_its_base(tmp_path: Path
     own = parse_profile(proposed.toml, where="proposed").robot
     assert own is not None
     assert (own.track_m, own.origin_of("track_m")) == (0.44, "robot_description")
+
+
+STRING = "std_msgs/msg/String"
+SMALL = wheels((0.2, 0.22), (0.2, -0.22))
+
+
+def said(text: str) -> tuple[str, TopicColumns]:
+    data = {"data": np.array([text], object)}
+    return STRING, columns(np.array([0.01]), data, stamped=False)
+
+
+def polygon(length_m: float, width_m: float) -> tuple[str, TopicColumns]:
+    x, y = np.array([[1], [1], [-1], [-1]]), np.array([[1], [-1], [-1], [1]])
+    fields: dict[str, FieldColumn] = {
+        "polygon.points[].x": ragged([*(x * length_m / 2)]),
+        "polygon.points[].y": ragged([*(y * width_m / 2)]),
+    }
+    return "geometry_msgs/msg/PolygonStamped", columns(np.array([0.02]), fields)
+
+
+def parameters(*radii_m: tuple[str, float]) -> tuple[str, TopicColumns]:
+    fields: dict[str, FieldColumn] = {
+        "node": np.array([node for node, _ in radii_m], object),
+        "new_parameters[].name": ragged([np.array(["robot_radius"] * len(radii_m), object)]),
+        "new_parameters[].value.double_value": ragged([np.array([size for _, size in radii_m])]),
+    }
+    at = np.linspace(0.01, 0.02, len(radii_m))
+    return "rcl_interfaces/msg/ParameterEvent", columns(at, fields, stamped=False)
+
+
+SHARED_BY_ALL = "; /robot2 has none of its own that can be used: CHECK THAT IT IS OF THIS ROBOT"
+
+
+@pytest.mark.parametrize(
+    ("said_of", "length_m", "width_m", "source", "track_m"),
+    [
+        # Its own description, not the one that comes first.
+        (
+            {
+                "/robot1/robot_description": said(robot(wheels((0.3, 0.32), (0.3, -0.32)))),
+                "/robot2/robot_description": said(robot(SMALL).replace("0.8 0.5", "0.6 0.4")),
+                "/robot_description": said(robot()),
+            },
+            *(0.6, 0.64, "shapes of 3 links in /robot2/robot_description", 0.44),
+        ),
+        # Its own costmap's polygon, before a description of no robot in particular.
+        (
+            {
+                "/robot1/robot_description": said(robot(SMALL)),
+                "/robot1/footprint": polygon(0.9, 0.7),
+                "/robot2/footprint": polygon(0.7, 0.3),
+                "/robot_description": said(robot(SMALL)),
+            },
+            *(0.7, 0.3, "the polygon of /robot2/footprint; its longer side ahead", 0.44),
+        ),
+        # Parameters are of the node that announced them.
+        (
+            {
+                "/parameter_events": parameters(
+                    ("/robot1/local_costmap/local_costmap", 0.9),
+                    ("/robot2/local_costmap/local_costmap", 0.2),
+                ),
+            },
+            *(0.4, 0.4, "the parameter robot_radius in /parameter_events", None),
+        ),
+        # One of no robot in particular, where it has none of its own.
+        (
+            {
+                "/robot1/robot_description": said(robot(wheels((0.3, 0.32), (0.3, -0.32)))),
+                "/robot_description": said(robot(SMALL)),
+            },
+            *(0.8, 0.64, f"shapes of 3 links in /robot_description{SHARED_BY_ALL}", 0.44),
+        ),
+        ({"/robot1/robot_description": said(robot(SMALL))}, None, None, None, None),
+    ],
+)
+def test_of_two_robots_in_a_recording_each_has_its_own_outline_and_description(
+    said_of: dict[str, tuple[str, TopicColumns]],
+    length_m: float | None,
+    width_m: float | None,
+    source: str | None,
+    track_m: float | None,
+    tmp_path: Path,
+) -> None:
+    short, whole = typed_topics(Drive(duration_s=1.0)), typed_topics(Drive(duration_s=2.0))
+    used = ("/cmd_vel", "/amcl_pose", "/odom")
+    topics = {f"/robot1{name}": short[name] for name in used}
+    topics |= {f"/robot2{name}": whole[name] for name in used} | said_of
+    with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
+        assert robots_in(recording) == ["/robot2", "/robot1"]
+        found, notes = footprint_of(recording)
+        own = propose_robot(recording, None, "", None)
+    assert notes == []
+    assert own.values.get("track_m") == track_m
+    if found is None:
+        assert length_m is None
+        return
+    assert (found.length_m, found.width_m) == pytest.approx((length_m, width_m))
+    assert found.source == source
+    shared = [note for note in own.notes if note.startswith("/robot_description: ")]
+    assert len(shared) == ("/robot2/robot_description" not in said_of and track_m is not None)
 
 
 def test_a_file_that_is_no_robot_is_refused(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ ITEMS = {  # of lists: what they hold
     "poses": "geometry_msgs/msg/PoseStamped",
     "polygon.points": "geometry_msgs/msg/Point32",
     "transforms": "geometry_msgs/msg/TransformStamped",
+    "new_parameters": "rcl_interfaces/msg/Parameter",
 }
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
+from restock.ingest.propose.evidence.roles import own_first, shared
 from restock.ingest.urdf.description import Description, Place, extent, read_description
 
 F64 = NDArray[np.float64]
@@ -75,22 +76,32 @@ def parse_footprint(text: str) -> Footprint:
 
 
 def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint | None, list[str]]:
-    """The footprint that the recording holds, or None; and what was found and is of no use."""
+    """The footprint that the recording holds of its robot, or None; and what was found and is of
+    no use.
+
+    Of several robots in the recording, the one to propose for.
+    """
     notes: list[str] = []
-    for found in (
+    all_found = [
         *_descriptions(recording, scan_frame, notes),
         *_polygons(recording),
         *_parameters(recording),
-    ):
+    ]
+    for place, found in own_first(recording, all_found):
         if found.sane:
-            return found, notes
+            why = shared(recording, place)
+            return replace(found, source=f"{found.source}; {why}") if why else found, notes
         notes.append(f"{found.source}: {found.length_m:.3g} x {found.width_m:.3g} m, no robot")
     return None, notes
 
 
 def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
-    """The topics of robots' descriptions, and the last text of each."""
-    for name, topic in recording.topics.items():
+    """The topics of the robot's descriptions, and the last text of each.
+
+    Of several robots in the recording, those of the one to propose for, then those of none in
+    particular.
+    """
+    for name, topic in own_first(recording, recording.topics.items()):
         if topic.skipped or not topic.expected or topic.type != "std_msgs/msg/String":
             continue
         if name.split("/")[-1] != "robot_description":
@@ -99,16 +110,19 @@ def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
         yield from ((name, str(text)) for text in texts[-1:])
 
 
-def _descriptions(recording: Recording, frame: str, notes: list[str]) -> Iterator[Footprint]:
+_Found = tuple[str, Footprint]  # by the topic that says it, or the node
+
+
+def _descriptions(recording: Recording, frame: str, notes: list[str]) -> Iterator[_Found]:
     for name, text in descriptions(recording):
         found = of_urdf(text, frame, source=name)
         if isinstance(found, str):
             notes.append(f"{name}: {found}")
         else:
-            yield found
+            yield name, found
 
 
-def _polygons(recording: Recording) -> Iterator[Footprint]:
+def _polygons(recording: Recording) -> Iterator[_Found]:
     named = [t for t in recording.topics.values() if "footprint" in t.name and not t.skipped]
     for topic in named:
         if topic.type not in _POLYGONS or not topic.expected:
@@ -118,27 +132,32 @@ def _polygons(recording: Recording) -> Iterator[Footprint]:
         x, y = (fields[path + axis][-1] for axis in "xy")
         points = np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
         if found := of_polygon(points, f"the polygon of {topic.name}; its longer side ahead"):
-            yield found
+            yield topic.name, found
 
 
-def _parameters(recording: Recording) -> Iterator[Footprint]:
+def _parameters(recording: Recording) -> Iterator[_Found]:
     """`footprint` and `robot_radius` among the parameters that nodes announced."""
     for topic in recording.topics.values():
         if topic.type != "rcl_interfaces/msg/ParameterEvent" or topic.skipped:
             continue
         for group in ("new_parameters[].", "changed_parameters[]."):
             paths = [group + p for p in ("name", "value.double_value", "value.string_value")]
-            if not topic.expected or not set(paths) <= set(recording.leaves(topic.name)):
+            if not topic.expected or not {"node", *paths} <= set(recording.leaves(topic.name)):
                 continue
-            fields = recording.read({topic.name: paths})[topic.name].fields
+            fields = recording.read({topic.name: ["node", *paths]})[topic.name].fields
+            named = fields[paths[0]]
+            assert isinstance(named, Ragged)
+            nodes = np.repeat(np.asarray(fields["node"], object), named.lengths)
             columns = [f.values if isinstance(f, Ragged) else f for f in map(fields.get, paths)]
-            for name, number, text in zip(*(np.asarray(c, object) for c in columns), strict=True):
+            for node, name, number, text in zip(
+                nodes, *(np.asarray(c, object) for c in columns), strict=True
+            ):
                 source = f"the parameter {name} in {topic.name}"
                 if str(name).split(".")[-1] == "robot_radius" and float(number) > 0:
-                    yield Footprint(2 * float(number), 2 * float(number), source)
-                named = str(name).split(".")[-1] == "footprint"
-                if named and (found := of_text(str(text), source)):
-                    yield found
+                    yield str(node), Footprint(2 * float(number), 2 * float(number), source)
+                polygon = str(name).split(".")[-1] == "footprint"
+                if polygon and (found := of_text(str(text), source)):
+                    yield str(node), found
 
 
 def of_text(text: str, source: str) -> Footprint | None:

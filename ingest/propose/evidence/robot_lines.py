@@ -15,6 +15,7 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
+from restock.ingest.propose.evidence.roles import shared
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
@@ -175,6 +176,8 @@ def propose_robot(
             unfit.append(f"{source}: {found.problem}")  # an arm's, say, beside that of its base
             continue
         kind = "robot_description" if urdf is None else "urdf"
+        if urdf is None and (why := shared(recording, source)):
+            notes.append(f"{source}: {why}")
         values = _sound(found.values, notes)
         origin = dict.fromkeys(values, kind)
         notes += [f"{source}: {note}" for note in found.notes]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
@@ -11,6 +12,8 @@ from restock.ingest.live.node_topics import ACTION, LIMITER, PROPOSAL, SHADOW, T
 from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.frames import FIELDS, Edges, upward
 from restock.ingest.urdf.description import BASE_FRAMES
+
+T = TypeVar("T")
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
 _POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
@@ -254,6 +257,22 @@ def other_robots_topics(recording: Recording) -> set[str]:
     """The topics of a recording's other robots than the one to propose for."""
     others = tuple(f"{robot}/" for robot in robots_in(recording)[1:])
     return {name for name in recording.topics if name.startswith(others)}
+
+
+def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> list[tuple[str, T]]:
+    """What was found at these topics or nodes without what is of other robots than the one to
+    propose for, and what is of no robot in particular last."""
+    robots = [f"{robot}/" for robot in robots_in(recording)]
+    kept = [one for one in found if not one[0].startswith(tuple(robots[1:]))]
+    return sorted(kept, key=lambda one: not one[0].startswith(tuple(robots[:1])))
+
+
+def shared(recording: Recording, place: str) -> str:
+    """What is to be said of a topic's or node's word on the robot to propose for; "": nothing."""
+    robots = robots_in(recording)[:1]
+    if not robots or place.startswith(f"{robots[0]}/"):
+        return ""
+    return f"{robots[0]} has none of its own that can be used: CHECK THAT IT IS OF THIS ROBOT"
 
 
 def node_topics(recording: Recording) -> dict[str, str]:
