@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +83,10 @@ def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint 
     Of several robots in the recording, the one to propose for.
     """
     notes: list[str] = []
-    all_found = [
-        *_descriptions(recording, scan_frame, notes),
-        *_polygons(recording),
-        *_parameters(recording),
-    ]
-    for place, found in own_first(recording, all_found):
+    found_in_turn = chain(  # read as far as it is asked for
+        _descriptions(recording, scan_frame, notes), _polygons(recording), _parameters(recording)
+    )
+    for place, found in own_first(recording, found_in_turn):
         if found.sane:
             why = shared(recording, place)
             return replace(found, source=f"{found.source}; {why}") if why else found, notes

@@ -259,12 +259,14 @@ def other_robots_topics(recording: Recording) -> set[str]:
     return {name for name in recording.topics if name.startswith(others)}
 
 
-def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> list[tuple[str, T]]:
+def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[tuple[str, T]]:
     """What was found at these topics or nodes without what is of other robots than the one to
-    propose for, and what is of no robot in particular last."""
+    propose for, and what is of no robot in particular last. Of one robot, as it is found."""
     robots = [f"{robot}/" for robot in robots_in(recording)]
+    if not robots:
+        return found
     kept = [one for one in found if not one[0].startswith(tuple(robots[1:]))]
-    return sorted(kept, key=lambda one: not one[0].startswith(tuple(robots[:1])))
+    return sorted(kept, key=lambda one: not one[0].startswith(robots[0]))
 
 
 def shared(recording: Recording, place: str) -> str:
