@@ -1,10 +1,8 @@
 -- What drift is looked for in: one value an episode of each signal, and the steps that it is from: none
 -- where the robot has no such sensor. What tells of the robot leaves slipping steps out. Over
 -- `transitions` and `recordings`. Part of two statements: the view that scans, and the summary that a
--- recording's manifest keeps.
-WITH own_signals AS (
-    -- include: custom_signals.sql
-), tasks AS (
+-- recording's manifest keeps. A profile's own signals are in measured_custom_signals.sql.
+WITH tasks AS (
     SELECT
         task_hash,
         len(commands) AS actions,
@@ -206,33 +204,6 @@ WITH own_signals AS (
     FROM flagged
     LEFT JOIN silent USING (episode_id)
     GROUP BY recording_id, episode_id
-    UNION ALL BY NAME
-    SELECT
-        recording_id,
-        episode_id,
-        signal,
-        avg(value) AS value,
-        count(value) AS steps
-    FROM (
-        SELECT
-            recording_id,
-            episode_id,
-            signal,
-            -- A flag is 0 or 1; texts are no numbers.
-            coalesce(
-                TRY_CAST(told AS DOUBLE), CASE told WHEN 'true' THEN 1 WHEN 'false' THEN 0 END
-            ) AS value
-        FROM (
-            SELECT
-                recording_id,
-                episode_id,
-                signal,
-                json_extract_string(to_json(rows), '$."' || signal || '"') AS told
-            FROM (SELECT * EXCLUDE (observation, next_observation) FROM transitions) AS rows
-            CROSS JOIN own_signals
-        )
-    )
-    GROUP BY recording_id, episode_id, signal
 )
 SELECT recording_id, episode_id, signal, value, steps
 FROM summed

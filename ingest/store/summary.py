@@ -135,7 +135,7 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     with _database().cursor() as connection:  # with temporary tables of its own
         connection.register("recordings", manifest)
         rows = _complete(rows)
-        tables |= _of_episodes(connection, rows)
+        tables |= _of_episodes(connection, rows, custom=_has_custom_signals(manifest))
         connection.register("transitions", rows.drop_columns(list(WIDE)))
         connection.execute(_definitions())
         tables |= {n: connection.table(n).to_arrow_table() for n in TABLES.keys() - tables.keys()}
@@ -157,7 +157,14 @@ def _complete(rows: pa.Table) -> pa.Table:
     return rows
 
 
-def _of_episodes(connection: duckdb.DuckDBPyConnection, rows: pa.Table) -> dict[str, pa.Table]:
+def _has_custom_signals(manifest: pa.Table) -> bool:
+    """Whether its profile has signals of its own. An older Restock's has no such column."""
+    return "signals" in manifest.column_names and any(manifest["signals"].to_pylist())
+
+
+def _of_episodes(
+    connection: duckdb.DuckDBPyConnection, rows: pa.Table, *, custom: bool
+) -> dict[str, pa.Table]:
     """The tables BY_EPISODE, which are made some whole episodes at a time: an episode's rows of
     them depend on its own steps alone. A window over all steps would hold them all twice."""
     for number, (first, stop) in enumerate(_whole_episodes(rows)):
@@ -165,6 +172,9 @@ def _of_episodes(connection: duckdb.DuckDBPyConnection, rows: pa.Table) -> dict[
         for name in BY_EPISODE:
             into = f"INSERT INTO {name}" if number else f"CREATE TEMP TABLE {name} AS"
             connection.execute(f"{into}\n{_query(name)}")
+        if custom:
+            added = _query("measured_custom_signals")
+            connection.execute(f"INSERT INTO measured_signals\n{added}")
         connection.unregister("transitions")  # its copies go before the next are made
     return {
         name: connection.sql(f"FROM {name} ORDER BY {order}").to_arrow_table()

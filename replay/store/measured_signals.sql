@@ -3,8 +3,13 @@
 
 -- One value an episode of each signal.
 CREATE OR REPLACE VIEW measured_signals AS
--- include: measured_signals.sql
-;
+(
+    -- include: measured_signals.sql
+)
+UNION ALL BY NAME
+(
+    -- include: measured_custom_signals.sql
+);
 
 -- Steps of each episode by zone.
 CREATE OR REPLACE VIEW zone_steps AS
