@@ -64,13 +64,15 @@ class CustomColumn:
             has = self.values.lengths[message] > 0
             values = every[np.where(has, self.values.offsets[message], -1)]
             return pa.array(values, NUMBER, mask=~known | ~np.isfinite(values))
-        rows = self.values.take(message)
         if self.signal.length is not None:
             known = known & self.whole[message]
+        rows = self.values.take(message[known])
         values = np.asarray(rows.values, np.float32)
         flat = pa.array(values, pa.float32(), mask=~np.isfinite(values))
-        offsets = pa.array(rows.offsets, pa.int32())
-        return pa.ListArray.from_arrays(offsets, flat, type=LIST, mask=pa.array(~known))
+        offsets = np.zeros(len(message) + 1, np.int32)  # of no length where null: else Parquet may
+        offsets[1:][known] = rows.lengths  # not be written
+        offsets = np.cumsum(offsets, dtype=np.int32)
+        return pa.ListArray.from_arrays(pa.array(offsets), flat, type=LIST, mask=pa.array(~known))
 
 
 def custom_reduction(signals: Mapping[str, CustomSignal]) -> Reduction:

@@ -183,6 +183,6 @@ def _by_appearance(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
     dictionary = pa.array(names, pa.string()).take(pa.array(order))
     if (np.diff(order) == 1).all():  # as they are
         return pa.DictionaryArray.from_arrays(codes, dictionary)
-    new = np.empty(len(order), codes.type.to_pandas_dtype())
+    new = np.empty(len(order), np.int64)
     new[order] = np.arange(len(order))
-    return pa.DictionaryArray.from_arrays(pa.array(new).take(codes), dictionary)
+    return pa.DictionaryArray.from_arrays(pa.array(new, codes.type).take(codes), dictionary)

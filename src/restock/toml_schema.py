@@ -26,6 +26,8 @@ def json_schema(kind: type, title: str) -> str:
         definition["properties"] = {
             key: _without_null(value) for key, value in definition.get("properties", {}).items()
         }
+        if "description" in definition:  # a docstring, which keeps its indent before Python 3.13
+            definition["description"] = inspect.cleandoc(definition["description"])
         if (struct := structs.get(name)) is None:
             continue
         names = {field.name: field.encode_name for field in msgspec.structs.fields(struct)}
