@@ -12,6 +12,9 @@ The limits were fixed on the types of TUNED and on healthy logs; those of LEFT_O
 once, when the limits stood, and those of LATER once, when it was changed what rows on ice count.
 
 `--unchanged` records the UNCHANGED logs, which nothing is planted in, and judges those.
+`--missions` takes each mission for a recording of its own, as of a fleet that logs so, and the
+recordings that they are from for its robots: `tagged`; `untagged`, one robot after the other; or
+`mixed`, untagged and in random order.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from unittest.mock import patch
@@ -38,6 +42,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.signals import Signals
 from restock.train.diagnosis.before_training import diagnose_rows, open_rows
 from restock.train.diagnosis.causes import Finding
+from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.diagnosis.twin_rows import drive_twin
 
 PROFILE = load_profile("warehouse_amr")
@@ -293,6 +298,7 @@ UNCHANGED = {  # name: arguments of `restock record`
     "payload": ("25", 746, ("--perturbation", "payload")),
     "friction": ("25", 747, ("--perturbation", "friction")),
 }
+MISSIONS = ("tagged", "untagged", "mixed")
 OUTCOMES = ("named", "named otherwise", "UNDETERMINED", "HEALTHY")
 
 
@@ -367,6 +373,17 @@ def unchanged(out: Path) -> list[Path]:
     return paths
 
 
+def by_mission(rows: FedRows, how: str) -> FedRows:
+    """Each mission as a recording."""
+    pairs = zip(rows.recording.tolist(), rows.episode.tolist(), strict=True)
+    missions = np.array([f"{recording}-{episode:04d}" for recording, episode in pairs])
+    robot = rows.recording if how == "tagged" else np.full(len(rows), "")
+    order = np.arange(int(rows.episode.max()) + 1)
+    if how == "mixed":
+        order = np.random.default_rng(3).permutation(order)
+    return replace(rows, recording=missions, robot=robot, logged_ns=order[rows.episode])
+
+
 def outcome(fault: Fault, verdict: str, findings: list[Finding]) -> str:
     if verdict != "BUFFER":
         return verdict
@@ -382,6 +399,7 @@ def main() -> int:
     parser.add_argument("--sets", default=",".join(SETS), help="of healthy, tuned, left out")
     parser.add_argument("--types", default="", help="only those with this in their name")
     parser.add_argument("--unchanged", action="store_true", help="only unchanged logs, and more")
+    parser.add_argument("--missions", choices=MISSIONS, help="each as a recording")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if options.unchanged:
@@ -394,7 +412,10 @@ def main() -> int:
         for fault in (one for one in SETS[name] if options.types in one.type):
             for logs in options.logs:
                 opened = open_rows(plant(logs, fault, options.out))
-                found = diagnose_rows(opened.rows, twin, more=opened.comparisons)
+                rows = opened.rows
+                if options.missions:
+                    rows = by_mission(rows, options.missions)
+                found = diagnose_rows(rows, twin, more=opened.comparisons)
                 what = outcome(fault, found.verdict, found.findings)
                 table.setdefault((fault.type, fault.dose), Counter())[what] += 1
                 said = [f"{one.cause}: {one.text}" for one in found.findings]

@@ -34,6 +34,7 @@ from restock.train.comparison.windows import Cause
 from restock.train.diagnosis import twin_rows
 from restock.train.diagnosis.answers import GAIN, Answer
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
+from restock.train.diagnosis.by_recording import unlike_recordings
 from restock.train.diagnosis.causes import findings
 from restock.train.diagnosis.evidence import judged
 from restock.train.diagnosis.fed_rows import FedRows
@@ -199,16 +200,25 @@ def test_actions_changed_after_ingest_are_no_fault_of_the_profile(
     assert "profile" not in found[0].remedy
 
 
-@pytest.mark.parametrize("kind", ["recordings", "robots"])
+@pytest.mark.parametrize(
+    ("kind", "tagged", "part"),
+    [
+        ("recordings", False, "r2"),
+        ("robots", True, "robot r2"),
+        ("groups of recordings", False, "m28 and the next 10"),
+    ],
+)
 def test_a_fault_of_one_robot_is_named_with_its_recording(
-    kind: str, logs: FedRows, twin: FedRows
+    kind: str, tagged: bool, part: str, logs: FedRows, twin: FedRows
 ) -> None:
     """Of all rows together a third is wrong, by less than what is allowed. A robot that logs a
-    recording a mission is known by its tag."""
-    third = np.array([f"r{one % 3}" for one in logs.episode])
-    fleet = replace(logs, recording=third)
-    if kind == "robots":
-        fleet = replace(logs, recording=logs.episode.astype(str), robot=third)
+    recording a mission is known by its tag; without it, by when it drove."""
+    owner = logs.episode % 3
+    third = np.array([f"r{one}" for one in owner])
+    fleet = replace(logs, recording=third, logged_ns=1_000 * owner + logs.episode)
+    if kind != "recordings":
+        robot = third if tagged else np.full(len(logs), "")
+        fleet = replace(fleet, recording=np.array([f"m{e:02}" for e in logs.episode]), robot=robot)
     sound = diagnose_rows(fleet, twin)
     assert sound.verdict == "HEALTHY"
     (compared,) = [row for row in sound.comparisons if row.check == "recordings"]
@@ -218,7 +228,6 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(
     )
     first, slip = map(logs.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
     wrong = third == "r2"
-    part = "r2" if kind == "recordings" else "robot r2"
     made = [fleet.observation.copy(), fleet.next_observation.copy()]
     for held in made:
         held[wrong, slip] -= 0.5 * held[wrong, first]
@@ -230,6 +239,14 @@ def test_a_fault_of_one_robot_is_named_with_its_recording(
     )
     assert all(check.endswith(f", {part}") for check in found.findings[0].evidence)
     assert {row.check for row in found.comparisons if row.off} >= {*_named(found), "recordings"}
+
+
+def test_short_recordings_of_one_group_are_not_compared_with_all_rows(logs: FedRows) -> None:
+    some = logs.take(logs.episode < 4)
+    few = replace(some, recording=some.episode.astype(str))
+    found, (compared,) = unlike_recordings(few, None)
+    assert (found, compared.status) == ([], "not run")
+    assert compared.note == "there are no two groups of recordings with 500 rows"
 
 
 def test_a_lidar_whose_ranges_are_scaled_is_named(logs: FedRows, twin: FedRows) -> None:
@@ -357,6 +374,7 @@ def test_labels_and_ends_are_computed_again_from_the_stored_signals(tmp_path: Pa
     logs, store = ROOT / "sample_logs/amr_tuesday", StoreWriter(tmp_path / "store")
     ingest(logs, load_profile("warehouse_amr"), store=store)
     as_stored = open_rows(tmp_path / "store")
+    assert _is_in_order(as_stored.rows)
     compared = {row.check: row for row in as_stored.comparisons}
     assert len(compared) > 3
     assert {row.status for row in compared.values()} <= {"ok", "not run"}
@@ -390,6 +408,7 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     meta = panel.meta
     _rewrite(panel, condition=["blocked_aisle"] * len(meta))
     opened = open_rows(panel.path)
+    assert _is_in_order(opened.rows)
     found = diagnose_rows(opened.rows, None, "there is none", more=opened.comparisons).findings
     (finding,) = [one for one in found if one.cause.startswith("LABELS_")]
     assert finding.cause == "LABELS_CHANGED"
@@ -398,6 +417,11 @@ def test_a_panel_is_held_against_the_store_it_was_made_of(tmp_path: Path) -> Non
     _rewrite(panel, action=[99, *meta["action"].to_pylist()[1:]])
     with pytest.raises(PanelError, match=r"has action 99, and the task has actions 0 to \d"):
         open_rows(panel.path)
+
+
+def _is_in_order(rows: FedRows) -> bool:
+    """Whether each step of an episode was logged after the one before."""
+    return bool((np.diff(rows.logged_ns)[rows.joined[1:]] > 0).all())
 
 
 def _rewrite(panel: Panel, **columns: list[Any]) -> None:

@@ -3,13 +3,14 @@
 A wrong sensor of one robot in four moves the figures of all rows by a quarter of what it does to
 its own: within what is allowed, or as if all robots were a little wrong. So each recording is
 compared by itself, too; short ones (a bag a mission) together with the other short ones of the
-robot that they are tagged with.
+robot that they are tagged with, or without a tag with those that were recorded before and after.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows
 
-FEWEST_ROWS = 500  # of a recording, or of a robot's short ones, that is compared by itself
+FEWEST_ROWS = 500  # of a recording, or of several short ones, that are compared by themselves
 MOST = 40  # parts, of the most rows
 CHECK = "recordings"
 _SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wrong in all rows
@@ -34,12 +35,11 @@ def unlike_recordings(
     if recordings < 2:
         return [], []
     part, kind = _parts(logs)
-    names, rows = np.unique(part[part != ""], return_counts=True)
+    names, rows = np.unique(part, return_counts=True)
     chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= FEWEST_ROWS).sum(), MOST)]
     what = f"each of the {kind} by itself"
-    if not len(chosen):
-        why = f"no recording has {FEWEST_ROWS} rows, nor have those tagged with one robot together"
-        return [], [not_run(CHECK, what, why)]
+    if len(chosen) < 2:
+        return [], [not_run(CHECK, what, f"there are no two {kind} with {FEWEST_ROWS} rows")]
     found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
     off: list[Comparison] = []
     of_twin: TwinFits = {}  # the same for every recording
@@ -63,15 +63,34 @@ def unlike_recordings(
 
 
 def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
-    """Which part each row (N,) is compared with, "" for none; and what the parts are called."""
+    """Which part each row (N,) is compared with, and what the parts are called."""
     place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
     is_short = (rows < FEWEST_ROWS)[place.reshape(-1)]
     tagged = is_short & (logs.robot != "")
-    by_robot = np.char.add("robot ", logs.robot)
-    part = np.where(is_short, np.where(tagged, by_robot, ""), logs.recording)
-    if not tagged.any():
-        return part, "recordings"
-    return part, "robots" if is_short.all() else "recordings and robots"
+    part = np.where(tagged, np.char.add("robot ", logs.robot), logs.recording).astype(object)
+    untagged = is_short & ~tagged
+    if untagged.any():
+        part[untagged] = _by_start(logs.take(untagged))
+        return part.astype(np.str_), "groups of recordings"
+    kind = "recordings" if not tagged.any() else "robots" if is_short.all() else ""
+    return part.astype(np.str_), kind or "recordings and robots"
+
+
+def _by_start(logs: FedRows) -> NDArray[np.str_]:
+    """The group of each row (N,): recordings that started one after the other, in groups of
+    `FEWEST_ROWS` rows at least, as many as let `MOST` groups hold all."""
+    names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    start = np.full(len(names), np.iinfo(np.int64).max)
+    np.minimum.at(start, place, logs.logged_ns)
+    order = np.argsort(start, kind="stable")
+    middle = np.cumsum(rows[order]) - rows[order] / 2
+    groups = np.clip(len(logs) // (FEWEST_ROWS + rows.max()), 1, MOST)  # each loses half of two
+    begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
+    named = np.empty(len(names), object)
+    for first, end in pairwise(begins.tolist()):
+        named[order[first:end]] = f"{names[order[first]]} and the next {end - first - 1}"
+    return np.asarray(named[place], np.str_)
 
 
 def _named(answer: Answer, recording: str) -> Answer:

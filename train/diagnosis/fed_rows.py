@@ -23,8 +23,9 @@ from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
 _COLUMNS = (
-    *("transition_id", "episode_id", "step_index", "recording_id", "robot", "condition", "action"),
-    *("reward", "terminated", "truncated", "observation", "next_observation"),
+    *("transition_id", "episode_id", "step_index", "recording_id", "robot", "logged_ns"),
+    *("condition", "action", "reward", "terminated", "truncated", "observation"),
+    "next_observation",
 )
 FEW_EPISODES = 20  # fewer than these are drawn in stretches of
 BLOCK_STEPS = 50  # steps: longer than what a step still shows of those before it
@@ -46,6 +47,7 @@ class FedRows:
     step: Ints  # (N,) in its episode
     recording: NDArray[np.str_]  # (N,)
     robot: NDArray[np.str_]  # (N,) as the recording is tagged; "" where it is not
+    logged_ns: Ints  # (N,)
     condition: NDArray[np.str_]  # (N,)
     transition_id: Ints  # (N,)
     left_out: dict[str, int] = field(default_factory=dict)  # rows, by reason
@@ -217,7 +219,7 @@ def _columns(table: pa.Table, order: Ints) -> dict[str, Any]:
     """What a store and a panel's `meta` have by the same names, as `FedRows` has it."""
     episode = np.unique(_text(table, "episode_id")[order], return_inverse=True)[1].reshape(-1)
     kinds: dict[str, Any] = {"action": np.int64, "reward": np.float64, "transition_id": np.int64}
-    kinds |= {"terminated": np.bool_, "truncated": np.bool_}
+    kinds |= {"terminated": np.bool_, "truncated": np.bool_, "logged_ns": np.int64}
     found = {name: _numbers(table, name)[order].astype(kind) for name, kind in kinds.items()}
     return found | {
         "episode": episode.astype(np.int64),

@@ -108,6 +108,7 @@ def _rows(
         step=step.astype(np.int64),
         recording=np.full(len(episode), "twin"),
         robot=np.full(len(episode), ""),
+        logged_ns=np.zeros(len(episode), np.int64),
         condition=_labels(conditions, chosen, episode, step),
         transition_id=np.arange(len(episode), dtype=np.int64),
     )
