@@ -16,9 +16,9 @@ from restock.ingest.profile.inputs import (
 )
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Kind, label_with_probabilities
-from restock.ingest.task.hindsight import GoalRules
 from restock.ingest.task.robot import beyond_limits
 from restock.ingest.task.schema import steps_schema
+from restock.toml import changed
 
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
@@ -150,14 +150,20 @@ def _check_goal(profile: Profile, where: str) -> None:
 
 
 def refuse_unused_goal_rules(profile: Profile, where: str) -> None:
-    """Raises ConfigError where `[goal]` says how goals are found in hindsight, and none are."""
-    rules, default = profile.goal, GoalRules()
-    for key in rules.__struct_fields__:
-        if rules.source == "logged" and getattr(rules, key) != getattr(default, key):
+    """Raises ConfigError where a profile says how goals are found, and they are not found so."""
+    source, rule = profile.goal.source, changed(profile.goal)
+    limit = changed(profile.episodes, ("goal_moved_m", "plan_goal_tolerance_m"))
+    unused = (  # key, its table, what decides that it is not used, as it is and as it should be
+        (source == "logged" and rule, "goal", "goal.source", source, "hindsight"),
+        (source == "hindsight" and limit, "episodes", "goal.source", source, "logged"),
+        (profile.task.goal == "none" and limit, "episodes", "task.goal", "none", "route"),
+    )
+    for key, table, decides, now, instead in unused:
+        if key:
             raise ConfigError(
-                f"`goal.{key}` is given, and `goal.source` is 'logged': it would not be used",
+                f"`{table}.{key}` is given, and `{decides}` is {now!r}: it would not be used",
                 where=where,
-                remedy=f'leave goal.{key} out, or set goal.source = "hindsight"',
+                remedy=f'leave {table}.{key} out, or set {decides} = "{instead}"',
             )
 
 

@@ -14,7 +14,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -355,4 +355,14 @@ def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield prefix + key, value
 
 
-__all__ = ["Checked", "by_path", "parse_toml", "read_toml", "toml_value", "typed"]
+def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> str | None:
+    """The first setting (all, or those of these names) that is not at its default, or None.
+
+    `default`: what else the defaults are.
+    """
+    usual = type(settings)(**default)
+    named = names or settings.__struct_fields__
+    return next((key for key in named if getattr(settings, key) != getattr(usual, key)), None)
+
+
+__all__ = ["Checked", "by_path", "changed", "parse_toml", "read_toml", "toml_value", "typed"]

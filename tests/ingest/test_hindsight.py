@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
@@ -16,6 +17,7 @@ from restock.errors import ConfigError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.tables import Episodes
 from restock.ingest.task.hindsight import GoalRules, missions
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
@@ -180,6 +182,23 @@ def test_rules_of_hindsight_are_refused_where_goals_are_logged(tmp_path) -> None
         load_profile(unused)
     # A store that an older Restock wrote is still read.
     assert parse_profile(unused.read_text(), where="store").goal.still_s == 5.0
+
+
+@pytest.mark.parametrize("key", ["goal_moved_m", "plan_goal_tolerance_m"])
+@pytest.mark.parametrize("goals", ["goal.source", "task.goal"])
+def test_limits_of_logged_goals_are_refused_where_no_goals_are_logged(tmp_path, key, goals) -> None:
+    logged = load_profile("warehouse_amr")
+    inputs = replace(logged.inputs, goal=None, plan=None)
+    if goals == "goal.source":
+        found = replace(logged, inputs=inputs, goal=GoalRules(source="hindsight"))
+    else:
+        found = replace(logged, inputs=inputs, task=replace(logged.task, goal="none"))
+    file = tmp_path / "robot.toml"
+    file.write_text(profile_toml(found))
+    load_profile(file)
+    file.write_text(profile_toml(replace(found, episodes=Episodes(**{key: 0.7}))))
+    with pytest.raises(ConfigError, match=rf"`episodes\.{key}` is given, and `{goals}` is"):
+        load_profile(file)
 
 
 def test_a_running_robot_has_no_hindsight(tmp_path, capsys) -> None:
