@@ -7,6 +7,7 @@ from typing import Any
 from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.panel import Panel
+from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.feed.cloned_rows import cloned
 from restock.train.feed.practice import MOVING
@@ -15,6 +16,8 @@ from restock.train.prepare import Prepared, rows_by_policy
 from restock.train.session import Session
 from restock.train.twin.env.floor_report import sealed
 from restock.train.twin.floors.floors import open_floors
+
+_OF_LOGS = ("policies", "successes", "logs_share", "offline_updates")  # of a teacher's settings
 
 
 def describe_run(prepared: Prepared) -> str:
@@ -41,6 +44,12 @@ def describe_run(prepared: Prepared) -> str:
         lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
     if config.teacher.filters:
         lines.append(_teacher(config.teacher, panel))
+    if panel is None and config.teacher.asks:
+        resolved = {"successes": False, "offline_updates": config.schedule.offline_updates}
+        lines += [
+            f"teacher.{key} has no effect: there is no panel"
+            for key in changed(config.teacher, _OF_LOGS, **resolved)
+        ]
     if panel is None or not panel.splits:
         has = "there is no panel" if panel is None else "the panel holds out no rows"
         lines += [

@@ -12,7 +12,8 @@ from itertools import pairwise
 from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.train.dqn.config import EnvConfig, PracticeConfig, TrainConfig
+from restock.toml import changed
+from restock.train.dqn.config import TrainConfig
 from restock.train.feed.logs import check_terms
 from restock.train.ring_capacity import row_bytes
 
@@ -34,16 +35,14 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
 
 
 def _refuse_no_effect(config: TrainConfig) -> None:
-    practice, default = config.practice, PracticeConfig()
-    if practice.rule == "natural":
-        for key in _NATURAL:
-            if getattr(practice, key) != getattr(default, key):
-                raise ConfigError(
-                    f'has no effect under the rule "{practice.rule}"',
-                    where=f"practice.{key}",
-                    remedy="leave it out, or set practice.rule",
-                )
-    if config.env.missions is None and config.env.missions_share != EnvConfig().missions_share:
+    practice = config.practice
+    if practice.rule == "natural" and (keys := changed(practice, _NATURAL)):
+        raise ConfigError(
+            f'has no effect under the rule "{practice.rule}"',
+            where=f"practice.{keys[0]}",
+            remedy="leave it out, or set practice.rule",
+        )
+    if config.env.missions is None and changed(config.env, ("missions_share",)):
         raise ConfigError(
             "has no effect without missions",
             where="env.missions_share",

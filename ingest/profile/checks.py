@@ -151,19 +151,20 @@ def _check_goal(profile: Profile, where: str) -> None:
 
 def refuse_unused_goal_rules(profile: Profile, where: str) -> None:
     """Raises ConfigError where a profile says how goals are found, and they are not found so."""
-    source, rule = profile.goal.source, changed(profile.goal)
-    limit = changed(profile.episodes, ("goal_moved_m", "plan_goal_tolerance_m"))
-    unused = (  # key, its table, what decides that it is not used, as it is and as it should be
-        (source == "logged" and rule, "goal", "goal.source", source, "hindsight"),
-        (source == "hindsight" and limit, "episodes", "goal.source", source, "logged"),
-        (profile.task.goal == "none" and limit, "episodes", "task.goal", "none", "route"),
-    )
-    for key, table, decides, now, instead in unused:
-        if key:
+    goal, source = profile.task.goal, profile.goal.source
+    rules = [f"goal.{key}" for key in changed(profile.goal)]
+    limits = changed(profile.episodes, ("goal_moved_m", "plan_goal_tolerance_m"))
+    limits = [f"episodes.{key}" for key in limits]
+    for unused, keys, decides, now, instead in (
+        (source == "logged", rules, "goal.source", source, "hindsight"),
+        (source == "hindsight", limits, "goal.source", source, "logged"),
+        (goal == "none", limits, "task.goal", goal, "route"),
+    ):
+        if unused and keys:
             raise ConfigError(
-                f"`{table}.{key}` is given, and `{decides}` is {now!r}: it would not be used",
+                f"`{keys[0]}` is given, and `{decides}` is {now!r}: it would not be used",
                 where=where,
-                remedy=f'leave {table}.{key} out, or set {decides} = "{instead}"',
+                remedy=f'leave {keys[0]} out, or set {decides} = "{instead}"',
             )
 
 

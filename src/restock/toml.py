@@ -355,14 +355,14 @@ def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield prefix + key, value
 
 
-def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> str | None:
-    """The first setting (all, or those of these names) that is not at its default, or None.
+def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> list[str]:
+    """The settings (of all, or of these names) that are not at their defaults.
 
-    `default`: what else the defaults are.
+    `default`: those that are not the struct's own.
     """
     usual = type(settings)(**default)
     named = names or settings.__struct_fields__
-    return next((key for key in named if getattr(settings, key) != getattr(usual, key)), None)
+    return [name for name in named if getattr(settings, name) != getattr(usual, name)]
 
 
 __all__ = ["Checked", "by_path", "changed", "parse_toml", "read_toml", "toml_value", "typed"]

@@ -209,8 +209,14 @@ def test_what_needs_held_out_logs_says_so_where_there_are_none(tmp_path: Path) -
         for name, mixture in (("whole", EVERY + NO_SPLIT), ("held", MIXTURE))
     )
     asked = ["offline_start.choose=true", "evaluation.off_policy=true"]
+    cloning = [
+        *("teacher.policies=['planner']", "teacher.successes=true", "teacher.logs_share=0.5"),
+        "teacher.offline_updates=7",
+    ]
+    no_panel = "has no effect: there is no panel"
     for panel, settings, said in (
-        (None, asked, [f"{name.split('=')[0]} has no effect: there is no panel" for name in asked]),
+        (None, cloning + asked, [f"{name.split('=')[0]} {no_panel}" for name in cloning + asked]),
+        (None, ["teacher.hidden=[8]"], []),
         (whole, asked[:1], ["offline_start.choose has no effect: the panel holds out no rows"]),
         (whole, [], []),
         (held, asked, []),

@@ -20,7 +20,7 @@ from msgspec import Meta
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.replay.mixture.schedules import Portion
-from restock.toml import Checked, read_toml, toml_value, typed
+from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.dqn.removed_settings import refuse_removed, without_removed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
@@ -280,16 +280,12 @@ class TrainConfig(Checked, frozen=True):
 
 def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
     """Raises ConfigError where a setting of the teacher is given, but nobody teaches."""
-    if teacher.source != "none":
-        return
-    default = TeacherConfig(source="none")
-    for key in teacher.__struct_fields__:
-        if getattr(teacher, key) != getattr(default, key):
-            raise ConfigError(
-                'has no effect where teacher.source is "none"',
-                where=f"{within}teacher.{key}",
-                remedy="leave it out, or set teacher.source",
-            )
+    if teacher.source == "none" and (keys := changed(teacher, source="none")):
+        raise ConfigError(
+            'has no effect where teacher.source is "none"',
+            where=f"{within}teacher.{keys[0]}",
+            remedy="leave it out, or set teacher.source",
+        )
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:
@@ -307,10 +303,10 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
 
 def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """A copy of plain values with `key.path=value` applied; values are TOML, or bare strings."""
-    changed = copy.deepcopy(dict(document))
+    applied = copy.deepcopy(dict(document))
     for override in overrides:
-        _apply(changed, override)
-    return changed
+        _apply(applied, override)
+    return applied
 
 
 def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
