@@ -98,6 +98,7 @@ class Recording:
         self.path, self.format, self.files, self.distro = path, format, tuple(files), distro
         self.accounts: dict[str, Account] = {}
         self.watch: Watch = unwatched  # is told how far a long read is
+        self.robot: str | None = None  # the namespace of the one that is meant, of several in it
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)

@@ -35,10 +35,9 @@ def in_one_recording(robots: Sequence[str]) -> str:
     """Whose profile it is, where a recording is of several robots."""
     others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
     return (
-        f"of the robot {robots[0]}, one of {len(robots)} in the recording: for {others} write that "
-        f"in place of {robots[0]} in every topic, correct the outline and [robot] if it is of "
-        "another kind, and ingest into another store, as a store keeps one set of rows of a "
-        "recording"
+        f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new "
+        f"--robot NAME` proposes another profile, for {others}; ingest with it into another store, "
+        "as a store keeps one set of rows of a recording"
     )
 
 

@@ -34,6 +34,7 @@ from restock.ingest.propose.evidence.commands import (
     read_turns,
 )
 from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
+from restock.ingest.propose.evidence.frame_guess import FrameGuess, transform_frames
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.motion_choice import (
     MotionChoice,
@@ -49,12 +50,10 @@ from restock.ingest.propose.evidence.roles import (
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,
-    FrameGuess,
     Roles,
     node_topics,
     other_robots_topics,
     topics_for,
-    transform_frames,
     usable_topics,
 )
 from restock.ingest.propose.evidence.scanned_outline import (

@@ -14,7 +14,8 @@ import numpy as np
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.tables import Clock, Frames
-from restock.ingest.propose.evidence.roles import FIX, FIX_FIELDS, FrameGuess, Roles
+from restock.ingest.propose.evidence.frame_guess import FrameGuess
+from restock.ingest.propose.evidence.roles import FIX, FIX_FIELDS, Roles
 from restock.ingest.steps.align import align
 from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.steps.frames import FIELDS, Edges, Tree

@@ -1,17 +1,16 @@
-"""What a topic and a frame may be for: guesses by message types and names."""
+"""What a topic may be for, and of which robot: guesses by message types and names."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
+from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.live.node_topics import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
-from restock.ingest.profile.tables import Frames
-from restock.ingest.steps.frames import FIELDS, Edges, upward
-from restock.ingest.urdf.description import BASE_FRAMES
 
 T = TypeVar("T")
 
@@ -194,7 +193,6 @@ _KIND_OF = {
     for kind in KINDS[role]
 }
 REQUIRED = ("command", "pose")
-FIXED_FRAMES = ("map", "odom", "world")  # best first
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
 # Of Restock's own node: what a policy would have driven is no command of the robot.
 NODE_TOPICS = frozenset((PROPOSAL, SHADOW, ACTION, LIMITER, TAKEOVER))
@@ -214,43 +212,83 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
     }
 
 
+@dataclass
+class _Namespace:
+    """What a namespace holds of what robots have."""
+
+    kinds: set[str] = field(default_factory=set)
+    shared: set[str] = field(default_factory=set)  # of topics that one beside it has by that name
+    messages: int = 0
+
+
 def robots_in(recording: Recording) -> list[str]:
     """The namespaces of a recording's robots, where it has several; first the one to propose for:
-    with a command, and topics of most kinds.
+    the chosen one, or one with a command, and topics of most kinds.
 
     Robots' namespaces lie side by side, and topics of two kinds at least have the same name in
     more than one of them: `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one
-    robot.
+    robot. Beside one that was chosen, a command by the same name or topics of two kinds are enough.
     """
-    inside: dict[str, list[tuple[str, str, TopicInfo]]] = {}  # namespace -> the rest, kind, topic
-    where: dict[tuple[str, str, str], set[str]] = {}  # what is beside it, the rest, kind -> those
+    found, chosen = _namespaces(recording), recording.robot
+    robots = [name for name, one in found.items() if len(one.shared) > 1]
+    if chosen is not None:
+        robots = [
+            name
+            for name, one in found.items()
+            if name.rpartition("/")[0] == chosen.rpartition("/")[0]
+            and ("command" in one.shared or len(one.kinds) > 1)
+        ]
+    elif not any("command" in found[robot].kinds for robot in robots):
+        return []
+    return sorted(
+        robots if len(robots) > 1 else [],
+        key=lambda one: (
+            one != chosen,
+            "command" not in found[one].kinds,
+            -len(found[one].kinds - {"imu"}),  # which everything can do without
+            -found[one].messages,
+            one,
+        ),
+    )
+
+
+def choose_robot(recording: Recording, name: str) -> None:
+    """Propose for the robot of this namespace, of several in the recording.
+
+    Raises:
+        ConfigError: the namespace does not hold topics of two kinds; names those that do.
+    """
+    found, chosen = _namespaces(recording), f"/{name.strip('/')}"
+    if chosen not in found or len(found[chosen].kinds) < 2:
+        robots = ", ".join(sorted(robots_in(recording)))
+        held = [n for n, one in found.items() if "command" in one.kinds and len(one.kinds) > 1]
+        raise ConfigError(
+            f"there is no robot {chosen} in the recording",
+            where=str(recording.path),
+            remedy=f"its robots are {robots}"
+            if robots
+            else "it seems to be of one robot: name none"
+            + (f", or a namespace with a command: {', '.join(sorted(held))}" if held else ""),
+        )
+    recording.robot = chosen
+
+
+def _namespaces(recording: Recording) -> dict[str, _Namespace]:
+    found: defaultdict[str, _Namespace] = defaultdict(_Namespace)
+    where: defaultdict[tuple[str, str, str], set[str]] = defaultdict(set)  # beside, the rest, kind
     for name, topic in _readable(recording):
         if (kind := _KIND_OF.get(topic.type)) is None:
             continue
         parts = name.strip("/").split("/")
         for place in range(1, len(parts)):
             namespace, rest = "/" + "/".join(parts[:place]), "/".join(parts[place:])
-            inside.setdefault(namespace, []).append((rest, kind, topic))
-            where.setdefault((namespace.rpartition("/")[0], rest, kind), set()).add(namespace)
-    robots = []
-    for namespace, topics in inside.items():
-        beside = namespace.rpartition("/")[0]
-        shared = {kind for rest, kind, _ in topics if len(where[beside, rest, kind]) > 1}
-        if len(shared) > 1:
-            robots.append(namespace)
-    kinds = {robot: {kind for _, kind, _ in inside[robot]} for robot in robots}
-    if len(robots) < 2 or not any("command" in found for found in kinds.values()):
-        return []
-    messages = {robot: sum(topic.expected for *_, topic in inside[robot]) for robot in robots}
-    return sorted(
-        robots,
-        key=lambda one: (
-            "command" not in kinds[one],
-            -len(kinds[one] - {"imu"}),  # which everything can do without
-            -messages[one],
-            one,
-        ),
-    )
+            found[namespace].kinds.add(kind)
+            found[namespace].messages += topic.expected
+            where[namespace.rpartition("/")[0], rest, kind].add(namespace)
+    for (_, _, kind), beside in where.items():
+        for namespace in beside if len(beside) > 1 else ():
+            found[namespace].shared.add(kind)
+    return dict(found)
 
 
 def other_robots_topics(recording: Recording) -> set[str]:
@@ -318,66 +356,3 @@ def several_commands(topics: dict[str, TopicInfo]) -> list[str]:
         and not any(word in topic.name.lower() for word in kind.rather)
     ]
     return named if len(named) > 1 else []
-
-
-@dataclass(frozen=True)
-class FrameGuess:
-    """Two frames that transforms join, and all that there are."""
-
-    fixed: str
-    base: str
-    chain: str
-    localised: bool  # it leads to a map
-
-    def lines(self, *, used: bool) -> list[str]:
-        """The `[frames]` of a profile, commented out where it is not `used`."""
-        mark = "" if used else "# "
-        why = "poses from /tf and /tf_static" if used else "instead of inputs.pose, from /tf"
-        return [
-            f"{mark}[frames]  # {why}: {self.chain}",
-            f'{mark}fixed = "{self.fixed}"',
-            f'{mark}base = "{self.base}"',
-            f"{mark}max_age_s = 0.5",
-            "",
-        ]
-
-
-def transform_edges(recording: Recording) -> Edges:
-    """The transforms of /tf and /tf_static; none where it has no such topics."""
-    usual = Frames()
-    wanted = {
-        name: list(FIELDS)
-        for name in (usual.topic, usual.static_topic)
-        if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
-    }
-    return Edges.of(usual, recording.read(wanted) if wanted else {})
-
-
-def transform_frames(recording: Recording) -> FrameGuess | None:
-    """The map's and the robot's frame, or None where no transforms join any such two."""
-    edges = transform_edges(recording)
-    frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
-    others = {robot.rpartition("/")[2] for robot in robots_in(recording)[1:]}
-    frames = {frame for frame in frames if frame.split("/")[0] not in others}
-    for fixed in named_frames(FIXED_FRAMES, frames):
-        for base in named_frames(BASE_FRAMES, frames):
-            if fixed in upward(base, edges.parents):
-                chain = " -> ".join(_chain(base, fixed, edges))
-                return FrameGuess(fixed, base, chain, fixed.split("/")[-1] == "map")
-    return None
-
-
-def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
-    """The frames of these names, a robot's prefix before them or not; best first."""
-    return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
-
-
-def _chain(base: str, fixed: str, edges: Edges) -> list[str]:
-    """The frames from the fixed one down to the base."""
-    way = [base]
-    while way[-1] != fixed:
-        ups = [up for up in edges.parents[way[-1]] if fixed in upward(up, edges.parents)]
-        if not ups or ups[0] in way:
-            break
-        way.append(ups[0])
-    return way[::-1]

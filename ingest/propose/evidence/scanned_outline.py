@@ -19,7 +19,7 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.roles import named_frames, transform_edges
+from restock.ingest.propose.evidence.frame_guess import named_frames, transform_edges
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries

@@ -17,12 +17,12 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Frames
+from restock.ingest.propose.evidence.frame_guess import transform_frames
 from restock.ingest.propose.evidence.roles import (
     FIX,
     FIX_FIELDS,
     KINDS,
     topics_for,
-    transform_frames,
     usable_topics,
 )
 from restock.ingest.steps.clocks import STAMP

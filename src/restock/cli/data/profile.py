@@ -58,6 +58,9 @@ class ProfileCommand:
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """For `new`: the robot's URDF, for outline, wheels, mass and lidar. It replaces the recording's
     /robot_description. Convert xacro to URDF first; meshes are not read. See docs/robot.md."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """For `new`: which robot the profile is for, if the recordings are of several: its namespace,
+    for example /robot2. Default: the one with most topics. The proposal lists all of them."""
     odometry_as_command: bool = False
     """For `new`: use odometry as the command if no command was recorded: the measured motion then
     stands for the commanded motion."""
@@ -204,12 +207,19 @@ class ProfileCommand:
         from restock.cli import output
         from restock.ingest.containers.open_recording import open_recording
         from restock.ingest.containers.storage import unwatched
+        from restock.ingest.propose.evidence.roles import choose_robot
 
         with output.progress(f"opening {Path(path).name}", None) as advance:
             recording = open_recording(
                 path, typestore=self._typestore, salvage=self.salvage, watch=advance.part
             )
         recording.watch = unwatched  # the bar is over
+        if self.robot is not None:
+            try:
+                choose_robot(recording, self.robot)
+            except ConfigError:
+                recording.close()
+                raise
         return recording
 
     def _check(self) -> int:

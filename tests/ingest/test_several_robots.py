@@ -1,0 +1,79 @@
+"""Several robots in one recording: `restock profile new --robot` says whose profile it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.driven_robot import Drive, typed_topics, write_topics
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.propose.evidence.roles import choose_robot, robots_in, usable_topics
+
+NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")
+
+
+def write_fleet(folder: Path, own: str = "") -> Path:
+    """`/robot2` drives longer and has a lidar; `/robot1` has none, and names with `own` in them."""
+    short, whole = typed_topics(Drive(duration_s=2.0)), typed_topics(Drive(duration_s=3.0))
+    topics = {f"/robot1{own}{name}": short[name] for name in NEEDED}
+    topics |= {f"/robot2{name}": whole[name] for name in (*NEEDED, "/scan")}
+    return write_topics(topics | {"/front/scan": short["/scan"]}, folder / "fleet")
+
+
+@pytest.mark.parametrize(
+    ("flags", "robot", "other"),
+    [
+        ([], "/robot2", "/robot1"),
+        (["--robot", "robot1"], "/robot1", "/robot2"),
+        (["--robot", "/robot2/"], "/robot2", "/robot1"),
+    ],
+)
+def test_the_profile_is_of_the_robot_that_was_named(
+    flags: list[str], robot: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["profile", "new", str(write_fleet(tmp_path)), *flags, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    inputs = parse_profile(document["toml"], where="proposed").inputs
+    used = (inputs.command, inputs.pose, inputs.wheels)
+    assert [one.topic for one in used if one is not None] == [f"{robot}{name}" for name in NEEDED]
+    assert inputs.scan is not None
+    assert inputs.scan.topic == ("/robot2/scan" if robot == "/robot2" else "/front/scan")
+    assert document["transitions"] > 5
+    said = next(one["text"] for one in document["advice"] if one["key"] == "inputs")
+    assert said.startswith(f"of the robot {robot}, one of 2 in the recording: ")
+    assert f"`restock profile new --robot NAME` proposes another profile, for {other};" in said
+
+
+def test_a_robot_whose_topics_have_names_of_their_own_can_be_named(tmp_path: Path) -> None:
+    with open_recording(write_fleet(tmp_path, own="/base")) as recording:
+        assert robots_in(recording) == []
+        choose_robot(recording, "robot1")
+        assert robots_in(recording) == ["/robot1", "/robot2"]
+        assert list(usable_topics(recording)) == [
+            *("/front/scan", "/robot1/base/amcl_pose", "/robot1/base/cmd_vel"),
+            "/robot1/base/odom",
+        ]
+
+
+def test_of_one_robot_its_namespace_changes_nothing(tmp_path: Path) -> None:
+    topics = typed_topics(Drive(duration_s=1.0))
+    bag = write_topics({f"/robot1{name}": topics[name] for name in NEEDED}, tmp_path / "bag")
+    with open_recording(bag) as recording:
+        choose_robot(recording, "robot1")
+        assert robots_in(recording) == []
+
+
+@pytest.mark.parametrize("name", ["robot3", "front", "/", "robot1/cmd_vel"])
+def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, out = write_fleet(tmp_path), tmp_path / "robot.toml"
+    assert main(["profile", "new", str(bag), "--robot", name, "--out", str(out)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"fleet: there is no robot /{name.strip('/')} in the recording" in said
+    assert "its robots are /robot1, /robot2" in said
+    assert not out.exists()
