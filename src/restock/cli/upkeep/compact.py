@@ -28,7 +28,8 @@ class CompactCommand:
     readable for 7 days. Until then the disk holds both the old and the new files; afterwards
     `restock ingest` removes the old ones.
 
-    Exit codes: 0 done, 2 nothing was written, 3 --drop-damaged lost rows or manifests.
+    Exit codes: 0 done, 2 refused or stopped at a damaged file (what was joined before it stays
+    joined), 3 --drop-damaged lost rows or manifests.
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
