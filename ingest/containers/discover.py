@@ -26,6 +26,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROS1_MAGIC = b"#ROSBAG V"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
+LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
 LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
 ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
@@ -43,6 +44,22 @@ def recordings_in(path: Path | str) -> list[Path]:
             remedy='is a variable of the shell not set? "." is the working directory',
         )
     path = Path(path)
+    try:
+        return _found(path)
+    except OSError as error:  # the folder itself; one within it is named as a recording would be
+        raise cannot_be_read(error, path) from error
+
+
+def cannot_be_read(error: OSError, path: Path) -> RecordingError:
+    """What the file system refuses: permissions, a folder that is not mounted any more, …"""
+    return RecordingError(
+        f"cannot be read: {error.strerror or error}",
+        where=str(error.filename or path),
+        remedy="check its permissions, and that its disk is mounted",
+    )
+
+
+def _found(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     _refuse_special(path)
@@ -84,22 +101,30 @@ def _refuse_special(path: Path) -> None:
 
 def _matched(match: Path) -> list[Path]:
     if match.is_dir():
-        return _in_folder(match)
-    return [match] if match.is_file() and is_storage_name(match) else []
+        return _within(match)
+    return [match] if is_storage_name(match) else []
 
 
 def _in_folder(folder: Path) -> list[Path]:
+    """Its recordings, and what cannot be looked at: opening that says why, and costs it alone."""
     if is_bag(folder):
         return [folder]
     recordings = []
     for item in sorted(folder.iterdir()):
-        if item.name.startswith("."):
+        if item.name.startswith(".") or item.name == LOST_AND_FOUND:
             continue
-        if item.is_dir() and not item.is_symlink():
-            recordings += _in_folder(item)
-        elif item.is_file() and is_storage_name(item):
+        if item.is_dir():
+            recordings += [] if item.is_symlink() else _within(item)
+        elif is_storage_name(item):  # a link into nowhere, or a pipe, too
             recordings.append(item)
     return recordings
+
+
+def _within(folder: Path) -> list[Path]:
+    try:
+        return _in_folder(folder)
+    except OSError:
+        return [folder]
 
 
 def is_storage_name(path: Path) -> bool:

@@ -107,9 +107,19 @@ class _Opening:
         return self._files()[0]
 
     def _files(self) -> tuple[list[Path], BagMetadata]:
-        if self.path.is_dir():
-            return self._bag()
-        if not self.path.exists():
+        try:
+            if self.path.is_dir():
+                return self._bag()
+            there = self.path.exists()
+        except OSError as error:
+            raise discover.cannot_be_read(error, self.path) from error
+        if not there and self.path.is_symlink():
+            raise RecordingError(
+                f"a link to {self.path.readlink()}, which is not there",
+                where=str(self.path),
+                remedy="is its disk mounted? Otherwise remove the link",
+            )
+        if not there:
             raise RecordingError("no such file or folder", where=str(self.path))
         return [self.path], BagMetadata()
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import shutil
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +26,7 @@ from support.bag_samples import (
 from support.paths import SHARED
 
 from restock.cli import main
-from restock.errors import RecordingError
+from restock.errors import ExitCode, RecordingError
 from restock.ingest.containers.open_recording import (
     Recording,
     TopicColumns,
@@ -244,6 +247,34 @@ def test_links_to_folders_are_not_followed_and_said(tmp_path: Path) -> None:
     (tmp_path / "bags" / "a").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RecordingError, match=r"links to folders \(1 in it\) are not followed"):
         recordings_in(tmp_path / "bags")
+
+
+def test_what_cannot_be_looked_at_costs_itself_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder that is somebody else's, and a link to a disk that is not mounted any more."""
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    (tmp_path / "lost+found").mkdir()
+    write_mcap(tmp_path / "good.mcap", 2)
+    (tmp_path / "gone.mcap").symlink_to("/not/mounted/gone.mcap")
+    listed = Path.iterdir
+
+    def refused(folder: Path) -> Iterator[Path]:  # root, who may run the tests, is refused nothing
+        if folder.name in ("locked", "lost+found"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    assert main(["info", str(tmp_path), "--json"]) == ExitCode.USAGE
+    out, err = capsys.readouterr()
+    shown = [Path(one["path"]).name for one in json.loads(out)["recordings"]]
+    assert shown == ["good.mcap"]
+    assert f"{locked}: cannot be read: Permission denied" in err
+    assert "gone.mcap: a link to /not/mounted/gone.mcap, which is not there" in err
+    assert "lost+found" not in err
+    with pytest.raises(RecordingError, match="Permission denied"):
+        recordings_in(locked)
 
 
 # -- bad input ------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ def test_a_pipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["info", str(pipe)]) == 2
     assert "a pipe, a socket or a device" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "*.mcap")]) == 2
-    assert "is a recording" in capsys.readouterr().err
+    assert "run.mcap: a pipe, a socket or a device" in capsys.readouterr().err
     with pytest.raises(RecordingError, match="a pipe"):
         open_recording(pipe)
 
