@@ -101,11 +101,17 @@ def _refusal(
         return error
     if found is None:
         return None
-    return RecordingError(
-        str(found),
-        where=one.result.path,
-        remedy="leave it out, or use --repeated keep to ingest it anyway",
-    )
+    remedy = "leave it out, or use --repeated keep to ingest it anyway"
+    if found.the_less:  # as of a recording that was still being written, or salvaged
+        remedy = (
+            f"this one holds more of the drive: {_removal(store, found.recording_id)} takes that"
+            " one out; then ingest this one again, or keep both with --repeated keep"
+        )
+    return RecordingError(str(found), where=one.result.path, remedy=remedy)
+
+
+def _removal(store: StoreWriter, recording_id: str) -> str:
+    return f"`restock remove {shlex.quote(str(store.path))} {recording_id}`"
 
 
 def _commit(
@@ -150,10 +156,12 @@ def _finished(
             return error
     notes = list(one.result.notes)
     if repeats is not None:
-        notes.append(
-            f"{repeats}; the audit `repeated_steps` fails until one of them is removed: `restock"
-            f" remove {shlex.quote(str(store.path))} {staged.recording_id}` takes this one out"
-        )
+        until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
+        if repeats.the_less:
+            how = f"{_removal(store, repeats.recording_id)} takes out that one, which holds less"
+        else:
+            how = f"{_removal(store, staged.recording_id)} takes this one out"
+        notes.append(f"{until} {how}")
     return replace(one.result, version=version, repeats=repeats, notes=notes)
 
 

@@ -42,6 +42,11 @@ class RepeatedDrive:
     share: float  # of the new recording's rows
     share_of_other: float  # of its own rows
 
+    @property
+    def the_less(self) -> bool:
+        """Whether it holds less of the drive than the new one: a part of it, or a cut of it."""
+        return self.share_of_other > self.share
+
     def __str__(self) -> str:
         return (
             f"{self.rows:,} transitions ({self.share:.0%}) are also in {self.source_file} "

@@ -147,6 +147,24 @@ def test_the_same_drive_twice_in_a_group_is_found_as_one_after_the_other(tmp_pat
     assert len(shown(tmp_path / "s")) == (2 if repeated == "refuse" else 3)
 
 
+@pytest.mark.parametrize("repeated", ["refuse", "keep"])
+def test_of_a_part_and_the_whole_it_is_the_part_that_is_to_go(tmp_path, repeated):
+    """As of a bag that the night before was still being written."""
+    store = StoreWriter(tmp_path / "s")
+    rows = recording_transitions(2, episodes=5)
+    part = replaced(rows.slice(0, len(rows) // 2), {"recording_id": f"{7:016x}", "ingest_id": "z"})
+    group = CommitGroup(store, clock=lambda: 0.0)
+    group.add(0, waiting(store, (manifest(part), part), repeated))
+    group.add(1, waiting(store, (manifest(rows), rows), repeated))
+    group.commit()
+    result, removal = group.results[1], f"`restock remove {tmp_path / 's'} {7:016x}` takes"
+    if isinstance(result, IngestResult):
+        assert f"{removal} out that one, which holds less" in result.notes[-1]
+    else:
+        assert f"{removal} that one out; then ingest this one again" in str(result)
+    assert isinstance(result, IngestResult) == (repeated == "keep")
+
+
 def test_a_recording_that_is_given_twice_is_unchanged_the_second_time(tmp_path):
     for number in (1, 2):
         write_bag(Drive(duration_s=3.0 + number, truth="nominal"), tmp_path / f"bag{number}")

@@ -52,7 +52,9 @@ def test_the_whole_after_a_part_is_said(
         "share": first["transitions"] / whole["transitions"],
         "share_of_other": 1.0,
     }
-    assert any(str(part) in note and "same drive twice" in note for note in whole["notes"])
+    (note,) = (note for note in whole["notes"] if "same drive twice" in note)
+    assert str(part) in note
+    assert f"`restock remove {store} {first['recording_id']}` takes out that one" in note
 
 
 @pytest.mark.long
