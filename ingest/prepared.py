@@ -18,6 +18,7 @@ from restock.ingest.store.lineage import Ingest
 from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.label_scores import LabelScore
+from restock.ingest.task.tags import in_words
 
 GROUP_S = 5.0
 MOST = 64
@@ -177,17 +178,31 @@ class CommitGroup:
         self.store, self.clock = store, clock
         self.results: dict[int, IngestResult | RestockError] = {}
         self.waiting: dict[int, Prepared] = {}
+        self._first: dict[str, IngestResult] = {}  # of each recording, by id, in this ingest
         self._last_s: float | None = None  # when the last commit was done
 
     def add(self, place: int, one: Prepared | RestockError) -> None:
         """Take in what was made of a recording; commit where it is time."""
         if isinstance(one, RestockError):
             self.results[place] = one
+        elif self.store is not None and (copy := self._copy(one.result)) is not None:
+            self.store.discard([one.staged] if one.staged else [])
+            self.results[place] = copy
         elif one.staged is None:
             self.results[place] = one.result
         else:
             self.waiting[place] = one
         self.commit_if_due()
+
+    def _copy(self, result: IngestResult) -> IngestResult | None:
+        """What becomes of a recording that came before under another path, by which it has other
+        tags: those stay. Else each ingest of the two paths would change them, in turn."""
+        first = self._first.setdefault(result.manifest.get("recording_id", ""), result)
+        tags = first.manifest.get("tags") or {}
+        if (result.manifest.get("tags") or {}) == tags:
+            return None
+        note = f"the same recording as {first.path}, whose tags it keeps: {in_words(tags)}"
+        return IngestResult(result.path, "unchanged", first.manifest, notes=[note])
 
     def due_in_s(self) -> float | None:
         """How long until what waits is to be committed; None where nothing does."""

@@ -271,6 +271,15 @@ def test_an_ingest_by_the_path_writes_all_or_nothing(driven, tmp_path, capsys, m
     assert not (tmp_path / "store").exists()
     monkeypatch.chdir(driven.parent)  # the path as it is given says nothing of the site
     assert main(["ingest", "monday", *options]) == 0
+    # A copy under another path is the same recording: it does not take the tags along.
+    copy = shutil.copytree(driven, tmp_path / "old" / "backup" / "monday")
+    capsys.readouterr()
+    assert main(["ingest", "monday", str(copy), *options, "--json"]) == 0
+    kept, copied = json.loads(capsys.readouterr().out)["recordings"]
+    assert [kept["status"], copied["status"]] == ["unchanged", "unchanged"]
+    assert copied["notes"] == [
+        "the same recording as monday, whose tags it keeps: robot=amr-07, site=oslo"
+    ]
     with Store(tmp_path / "store") as store:
         found = store.sql("SELECT DISTINCT robot, site FROM episodes").fetchall()
     assert found == [("amr-07", "oslo")]

@@ -207,7 +207,8 @@ def show(outcome: IngestResult) -> None:
             markup=False,
             soft_wrap=True,
         )
-        console.print("\n".join(map(visible, outcome.notes)), markup=False, soft_wrap=True)
+        notes = "\n".join([*map(visible, outcome.notes), ""])
+        console.print(notes, markup=False, soft_wrap=True)
         return
     into = f"{outcome.status}: {episodes}, profile {row['profile']} {row['profile_hash']}"
     console.print(into + (f", store version {outcome.version}" if outcome.version else ""))
