@@ -325,6 +325,12 @@ class _Ingest:
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *self.told.notes, *steps.notes]
+        if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
+            notes.append(
+                f"in place of its {self.before['transitions']:,} transitions by the profile"
+                f" {other!r}: a store keeps one set of rows of a recording (those of another robot"
+                " in it: in another --store)"
+            )
         if clock.pace is not None:
             notes.append(
                 f"clock: header stamps run at {clock.pace:.1%} of log time; mapped piece by piece"

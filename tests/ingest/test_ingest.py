@@ -93,9 +93,15 @@ def test_unchanged_is_left_alone_and_changed_is_replaced(bag, tmp_path, run):
     assert (code, said["recordings"][0]["status"]) == (0, "written")
     text = WAREHOUSE
     other = tmp_path / "other.toml"
-    other.write_text(text.replace("time_limit_steps = 240", "time_limit_steps = 5"))
+    text = text.replace("time_limit_steps = 240", "time_limit_steps = 5")
+    other.write_text(text.replace('name = "warehouse_amr"', 'name = "other"'))
     code, said, _ = run(bag, "--store", store, "--profile", other)
     assert (code, said["recordings"][0]["status"]) == (0, "written")
+    # As where a recording holds several robots, each with its profile.
+    replaced = (
+        "in place of its 29 transitions by the profile 'warehouse_amr': a store keeps one set"
+    )
+    assert [note for note in said["recordings"][0]["notes"] if note.startswith(replaced)]
     with Store(store) as opened:
         ((rows, hashes),) = opened.sql(
             "SELECT count(*), count(DISTINCT profile_hash) FROM transitions"
