@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import count
 from typing import Any, TypeVar
 
 import duckdb
@@ -145,6 +146,8 @@ def fetch(
 ) -> tuple[list[str], list[tuple[Any, ...]], int]:
     """Column names, rows (the first `at_most`), and how many there are; Ctrl-C stops it.
 
+    Of several columns of a name, as a join gives, the later ones are `name_1`, `name_2`, …
+
     Raises:
         QueryError: as `query` does, also for what goes wrong while it runs.
         KeyboardInterrupt: the query was stopped.
@@ -155,14 +158,24 @@ def fetch(
         try:
             if at_most is None:
                 rows = values(relation)
-                return relation.columns, rows, len(rows)
+                return _distinct(relation.columns), rows, len(rows)
             rows = values(relation.limit(at_most + 1))
             count = len(rows) if len(rows) <= at_most else len(relation)
-            return relation.columns, rows[:at_most], count
+            return _distinct(relation.columns), rows[:at_most], count
         except duckdb.Error as error:
             raise _translated(error, where) from error
 
     return interruptible(connection, run)
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """As DuckDB names the columns of a table that is made of them."""
+    given: list[str] = []
+    for name in names:
+        free = (f"{name}_{number}" for number in count(1))
+        taken = {*given, *names}
+        given.append(next(one for one in free if one not in taken) if name in given else name)
+    return given
 
 
 def found(

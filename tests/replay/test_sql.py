@@ -56,6 +56,20 @@ def test_json_is_a_list_of_row_objects(
     ]
 
 
+def test_decimals_are_numbers_and_columns_of_one_name_keep_their_values(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A script would compare "278.2" as text; and of two columns `a`, both were the second's."""
+    query = "SELECT 2782 * 0.1 AS s, 2.50 * 2 AS whole, 1 AS a, 2 AS a_1, 3 AS a, 4 AS a"
+    rows = json.loads(out_of(capsys, str(store_path), query, "--json"))
+    assert rows == [{"s": 278.2, "whole": 5, "a": 1, "a_1": 2, "a_2": 3, "a_3": 4}]
+    text = out_of(capsys, str(store_path), query, "--csv")
+    assert text == "s,whole,a,a_1,a_2,a_3\n278.2,5.00,1,2,3,4\n"
+    lines = out_of(capsys, str(store_path), "SELECT 1 a, 2 a, 1234567.8::DOUBLE b, -6e5::DOUBLE c")
+    assert lines.splitlines()[0].split() == ["a", "a_1", "b", "c"]
+    assert lines.splitlines()[2].split() == ["1", "2", "1,234,568", "-600,000"]
+
+
 def test_times_with_a_zone_are_text_in_utc(
     store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
+    if isinstance(value, Decimal):  # which a script would compare as text
+        return int(value) if value == value.to_integral_value() else float(value)
     if isinstance(value, bytes):
         return value.hex()
     return str(value)
@@ -96,7 +99,10 @@ def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None
     names = list(columns if columns is not None else rows[0] if rows else ())
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(names)
-    writer.writerows([plain(row[name]) for name in names] for row in rows)
+    writer.writerows(
+        [row[name] if isinstance(row[name], Decimal) else plain(row[name]) for name in names]
+        for row in rows
+    )
 
 
 def print_skipped(reasons: Mapping[str, str | None]) -> None:
