@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
 
 NEARLY = 0.8  # of a name's letters: /plan is not /scan
+MOST_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording
 
 
 def read_topics(
@@ -63,6 +64,16 @@ def read_topics(
     return columns
 
 
+def _told(profile: Profile, available: Mapping[str, Any]) -> str:
+    """The topics of a recording; of very many, those that the profile could use."""
+    types = {source.type for source in profile.sources.values()}
+    usable = [topic for topic in sorted(available) if available[topic].type in types]
+    topics = sorted(available) if len(available) <= MOST_TOLD else usable[:MOST_TOLD]
+    others = len(available) - len(topics)
+    more = [f"{others:,} others, which `restock info` lists"] if others else []
+    return ", ".join([*topics, *more]) or "none"
+
+
 def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
     """The profile as a recording with these topics is read by it, `available` as `wanted_fields`
     has it: without a lidar where its scan is optional and there is no message of it, so that rows
@@ -87,11 +98,11 @@ def wanted_fields(
             its messages have no such field.
     """
     if problems := input_problems(profile, available, leaves):
-        have = ", ".join(sorted(available)) or "none"
         raise RecordingError(
             f"does not fit the profile {profile.name!r}: {'; '.join(problems)}",
-            remedy=f"its topics are {have}; choose another --profile, or let `restock profile new"
-            " RECORDING` propose one (`restock start RECORDING` does so, and goes on from there)",
+            remedy=f"its topics are {_told(profile, available)}; choose another --profile, or let"
+            " `restock profile new RECORDING` propose one (`restock start RECORDING` does so, and"
+            " goes on from there)",
         )
     wanted: dict[str, list[str]] = {}
     optional = {FRAME_ID}

@@ -42,3 +42,13 @@ def test_a_recording_that_does_not_fit_is_told_how_to_go_on() -> None:
     assert "did you mean" not in str(error.value)
     assert "`restock profile new RECORDING`" in str(error.value)
     assert "`restock start RECORDING" in str(error.value)
+    assert "its topics are /scan; choose" in str(error.value)
+
+
+def test_of_very_many_topics_those_that_could_be_used_are_named() -> None:
+    sensors = {f"sensor_{number}": "std_msgs/msg/Float64" for number in range(200)}
+    with pytest.raises(RecordingError) as error:
+        wanted_fields(load_profile("warehouse_amr"), topics(lidar=SCAN, **sensors), {})
+    assert "its topics are /lidar, 200 others, which `restock info` lists; choose" in str(
+        error.value
+    )
