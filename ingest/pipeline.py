@@ -10,7 +10,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import split, why_none
-from restock.ingest.steps.needs import as_recorded, read_topics
+from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.store.corrections import (
     correction_rows,
@@ -117,6 +117,7 @@ def prepare(
     with open_recording(
         path, typestore=how.typestore, salvage=how.salvage, watch=watch
     ) as recording:
+        renamed = renamed_inputs(profile, recording.topics)
         profile = as_recorded(profile, recording.topics)
         settle(recording.recording_id)
         before = _before(store, recording)
@@ -137,6 +138,7 @@ def prepare(
             result = IngestResult(str(path), "tagged", before | new, notes=told.notes)
             return Prepared(result, staged)
         try:
+            told = replace(told, notes=[*told.notes, *renamed])
             return _Ingest(str(path), recording, profile, told, how.repeated, before).run(store)
         except RecordingError as error:
             if error.where:

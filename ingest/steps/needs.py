@@ -211,6 +211,21 @@ def input_problems(
     return lacking + fields + _transform_problems(profile, available, leaves or {})
 
 
+def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
+    """The optional inputs without their topic where a topic of their type is not used: of one
+    robot, or after an update, it may have another name. Plain texts and numbers may be anything.
+    """
+    used = profile.topics
+    found = []
+    for name, source in profile.sources.items():
+        if not source.optional or source.topic in available or source.type.startswith("std_msgs/"):
+            continue
+        alike = {topic: info for topic, info in available.items() if info.type == source.type}
+        if hint := near(source.topic, {t: alike[t] for t in alike if t not in used}, source.type):
+            found.append(f"{name}: no topic {source.topic} in this recording: {hint}")
+    return found
+
+
 def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> str:
     """A question about a topic that may be the one that is missing, or "": one that is spelled
     nearly like it, or the one of its type, `kind`, that is spelled most like it."""

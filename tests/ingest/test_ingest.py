@@ -202,6 +202,18 @@ def test_the_wrong_profile_says_what_is_missing_and_what_is_there(bag, tmp_path,
     assert not (tmp_path / "s").exists()
 
 
+def test_an_optional_topic_of_another_name_is_asked_after(bag, tmp_path, run):
+    """As of the one robot whose driver was updated: else its rows say it had no such sensor."""
+    other = tmp_path / "other.toml"
+    other.write_text(WAREHOUSE.replace('topic = "/imu"', 'optional = true\ntopic = "/front/imu"'))
+    code, said, _ = run(bag, "--dry-run", "--profile", other)
+    notes = said["recordings"][0]["notes"]
+    assert code == 0
+    assert "imu: no topic /front/imu in this recording: did you mean /imu?" in notes
+    # Of the texts that it has, none is taken for one that it lacks.
+    assert len([note for note in notes if "did you mean" in note]) == 1
+
+
 def test_no_usable_step_is_an_error_with_the_reasons(tmp_path, run):
     drive = write_bag(Drive(goals=[(0.0, 1.2, 1.0)]), tmp_path / "bag")  # there already
     code, _, err = run(drive, "--store", tmp_path / "s")
