@@ -48,6 +48,7 @@ DEFAULT_REGION = "us-east-1"  # servers that are not Amazon's have none, and are
 _S3 = re.compile(r"s3a?:/{1,2}(?P<bucket>[^/]+)/?(?P<prefix>.*)")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
 _ENCODED = re.compile(r"%[0-9A-Fa-f]{2}")
+_DENIED = re.compile(r"(?s)(?:operation on (?P<file>/[^\n\x1b]*).*)?Permission denied")  # delta-rs
 # What a server or a client says -> what it means, and what to do.
 _MEANINGS = (
     ("NoSuchBucket|Bucket .* not found", "this bucket does not exist",
@@ -330,7 +331,8 @@ class Location:
 
     @contextmanager
     def translate_errors(self) -> Iterator[None]:
-        """Turn what goes wrong on the way to S3 into a StoreError that says what to do.
+        """Turn what goes wrong on the way to S3 into a StoreError that says what to do; likewise
+        of a folder, where delta-rs may not read it.
 
         What Delta says of its tables passes, and so do conflicts of writers and missing files.
         """
@@ -340,6 +342,13 @@ class Location:
             raise
         except (OSError, DeltaError) as error:
             text = str(error)
+            denied = _DENIED.search(text) if self.folder is not None else None
+            if denied and not getattr(error, "errno", None):  # or Python's own, which says it well
+                raise StoreError(
+                    f"permission denied: {denied['file'] or 'its files'} cannot be read",
+                    where=self.text,
+                    remedy="let this user read the store, and to ingest also write in it",
+                ) from error
             if self.folder is not None or not re.search("S3|AWS", text):
                 raise
             for pattern, meaning, remedy in _MEANINGS:

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from deltalake import DeltaTable
-from deltalake.exceptions import CommitFailedError
+from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction
 from support.long import one_in
 from support.s3_server import files_of
@@ -331,3 +331,19 @@ def test_floats_are_split_by_byte_and_compressed(tmp_path):
     assert {column.compression for column in columns.values()} == {"ZSTD"}
     assert "BYTE_STREAM_SPLIT" in columns["observation.list.element"].encodings
     assert "BYTE_STREAM_SPLIT" in columns["pose_x_m"].encodings
+
+
+def test_a_store_that_may_not_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+    """Root, who may run the tests, may read all: this is what delta-rs says to others."""
+    said = "Generic LocalFileSystem error\n ↳ IO error for operation on /s/_delta_log\x1b[0m\n ↳ "
+    for error in (
+        OSError(f"{said}Permission denied (os error 13)"),
+        DeltaError("Permission denied"),
+    ):
+        with pytest.raises(StoreError) as caught, Location.of(tmp_path).translate_errors():
+            raise error
+        assert caught.value.what.startswith("permission denied: ")
+        assert ("/s/_delta_log cannot" in caught.value.what) == isinstance(error, OSError)
+    own = PermissionError(13, "Permission denied", "/s/x")
+    with pytest.raises(PermissionError), Location.of(tmp_path).translate_errors():
+        raise own
