@@ -73,6 +73,13 @@ class IngestJob:
             return out_of_memory(path)
         except Exception as error:  # noqa: BLE001  (a defect costs its recording, not all of them)
             print_traceback(error)
+            if isinstance(error, OSError) and error.strerror:  # a disk's or a network's, not ours
+                return RecordingError(
+                    f"cannot be read or written: {error.strerror}",
+                    where=str(path if error.filename is None else error.filename),
+                    remedy="check its disk and the free space; this recording was not added to the "
+                    "store, the others were",
+                )
             at = traceback.extract_tb(error.__traceback__)[-1]
             return RecordingError(
                 f"a bug in Restock: {type(error).__name__}: {error}"

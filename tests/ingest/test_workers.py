@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import multiprocessing
 import os
@@ -17,6 +18,7 @@ from support.driven_robot import write_bags
 from support.long import one_in
 
 from restock.cli import main
+from restock.errors import RecordingError
 from restock.ingest.batch import IngestJob, ingest_all, side_by_side
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store, is_store
@@ -113,6 +115,19 @@ def test_what_nobody_foresaw_costs_its_recording_only(bags, tmp_path, monkeypatc
     results = dict(ingest_all(sorted(bags.iterdir()), job))
     assert said in str(results.pop(bags / "drive1"))
     assert {result.status for result in results.values()} == {"written"}
+
+
+def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
+    """As a network's file system does in the middle of a night."""
+    from restock.ingest import pipeline
+
+    def failing(*args, **kwargs):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(pipeline, "prepare", failing)
+    failed = IngestJob(load_profile("warehouse_amr"), None).prepare(Path("nas/run.mcap"))
+    assert isinstance(failed, RecordingError)
+    assert "nas/run.mcap: cannot be read or written: Input/output error\n  check" in str(failed)
 
 
 def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
