@@ -127,14 +127,12 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
     for at in _recognised(file, cut + 1):
         if at < cut:
             continue  # within what was walked since
-        lost.append(
-            f"{at - cut:,} bytes from byte {cut:,} on are lost: reading goes on at the next chunk"
-        )
         if contents.cut_chunk is not None:  # it ends where the next begins, at the latest
             contents.cut_chunk = cut_chunk_at(file, contents.cut_chunk.at, at)
-            if contents.cut_chunk is not None:
-                contents.chunks.append(contents.cut_chunk)
-                contents.cut_chunk = None
+        lost.append(f"{_lost(contents, cut, at)}: reading goes on at the next chunk")
+        if contents.cut_chunk is not None:
+            contents.chunks.append(contents.cut_chunk)
+            contents.cut_chunk = None
         try:
             for opcode, start, stop in walk(file, at, len(file)):
                 cut = stop
@@ -145,7 +143,16 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
         except Malformed as next_cut:
             cut = next_cut.at
             contents.cut_chunk = cut_chunk_at(file, cut, len(file))
-    return [*lost, f"{len(file) - cut:,} bytes from byte {cut:,} on are lost"]
+    return [*lost, _lost(contents, cut, len(file))] if cut < len(file) else lost
+
+
+def _lost(contents: Contents, cut: int, until: int) -> str:
+    """What is lost between two places, in words; a chunk that begins at the first is read as far
+    as it goes."""
+    at = f"{until - cut:,} bytes from byte {cut:,} on"
+    if contents.cut_chunk is None or contents.cut_chunk.at != cut:
+        return f"{at} are lost"
+    return f"{at} are a part of a chunk: only the messages that are whole in it are read"
 
 
 def _recognised(file: FileBytes, start: int) -> Iterator[int]:

@@ -113,6 +113,16 @@ def test_twice_damaged_without_a_summary(tmp_path: Path) -> None:
     assert sum("bytes from byte" in loss for loss in reasons) == 3  # and what is left at the end
 
 
+def test_of_a_chunk_that_is_cut_what_is_read_is_not_called_lost(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", compression=CompressionType.NONE, chunk_size=1 << 20)
+    ((start, stop),) = chunks_of(path)
+    path.write_bytes(path.read_bytes()[: (start + stop) // 2])
+    decoded, reasons, _ = read(path)
+    assert 0 < decoded < COUNT
+    assert f"from byte {start:,} on are a part of a chunk: only the messages" in reasons[1]
+    assert not any("are lost" in reason for reason in reasons)
+
+
 def test_a_chunk_that_only_looks_like_one(tmp_path: Path) -> None:
     """Bytes that name a compression within a message are no chunk."""
     path = write_mcap(tmp_path / "run.mcap", compression=CompressionType.NONE, use_chunking=False)
