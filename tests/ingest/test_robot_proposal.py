@@ -18,6 +18,7 @@ from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.footprint import footprint_of
 from restock.ingest.propose.evidence.robot_lines import propose_robot
 from restock.ingest.propose.evidence.roles import robots_in
+from restock.ingest.propose.proposal_lines import in_one_recording
 from restock.ingest.propose.propose import propose_profile
 from restock.ingest.urdf.described_robot import DescribedRobot, described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
@@ -463,7 +464,10 @@ def test_of_two_robots_in_a_recording_each_has_its_own_outline_and_description(
     topics = {f"/robot1{name}": short[name] for name in used}
     topics |= {f"/robot2{name}": whole[name] for name in used} | said_of
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
-        assert robots_in(recording) == ["/robot2", "/robot1"]
+        assert (robots := robots_in(recording)) == ["/robot2", "/robot1"]
+        # Of one name and other topics, the audit stale_labels would take the two for versions.
+        assert "for /robot1;" in (told := in_one_recording(robots))
+        assert "another name" in told
         found, notes = footprint_of(recording)
         own = propose_robot(recording, None, "", None)
     assert notes == []
