@@ -94,6 +94,12 @@ class AuditCommand:
             _refuse_with(self, "--reward", "panel", "run_dir", "rows")
             if (Path(self.store) / RUN_CONFIG).is_file():
                 _refuse_with(self, "the --reward of a run", "memory_limit")
+        if self.rows < 0:
+            raise ConfigError(
+                f"must be 0 or more, got {self.rows}",
+                where="--rows",
+                remedy="0 shows no rows; `restock sql` shows all",
+            )
         refuse_folder(self.junit, "--junit")
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
