@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo site test test-long test-docs test-slow neighbours lint notebook sample-logs clean
+.PHONY: demo site test test-long test-docs test-slow test-lowest neighbours lint notebook sample-logs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -12,6 +12,7 @@ help:
 	@echo "make test-long    the tests that take longer, or show in full what a shorter one shows"
 	@echo "make site         the documentation as a site, build/site/index.html; a broken link fails"
 	@echo "make test-docs    run every block of the documentation as it is printed"
+	@echo "make test-lowest  the tests with the oldest releases of libraries that Restock runs with"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
 	@echo "make notebook     run docs/tutorial.md, and write its outputs and docs/tutorial.ipynb"
@@ -34,10 +35,10 @@ demo: $(VENV)/.runtime
 
 # A process a core, each with whole files: fixtures of a module are made once. Each computes on one
 # thread: threads of several processes on the same cores wait for each other at full load.
-test test-long test-docs: export OMP_NUM_THREADS = 1
+test test-long test-docs test-lowest: export OMP_NUM_THREADS = 1
 # Many tests start Restock in a process of its own: where the environment forbids files of bytecode,
 # each would compile it again, and each of these targets all tests.
-test test-long test-docs: export PYTHONDONTWRITEBYTECODE =
+test test-long test-docs test-lowest: export PYTHONDONTWRITEBYTECODE =
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
@@ -53,6 +54,16 @@ site: $(VENV)/.dev
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m ''
+
+# With the oldest releases that pyproject.toml allows, in a Python of their own.
+test-lowest: .venv-lowest/.ready
+	.venv-lowest/bin/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+.venv-lowest/.ready: pyproject.toml $(VENV)/.runtime
+	$(PYTHON) -m venv .venv-lowest
+	PYTHONPATH=tests $(BIN)/python -m support.lowest > .venv-lowest/constraints.txt
+	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test]'
+	@touch $@
 
 # d3rlpy pins an old gymnasium and lerobot a CUDA torch: the tests that read exports back with the
 # real libraries use a Python of their own, where there is one.
@@ -78,4 +89,4 @@ sample-logs: $(VENV)/.runtime
 	$(BIN)/python sample_logs/make.py
 
 clean:
-	rm -rf $(VENV) .venv-neighbours build dist *.egg-info
+	rm -rf $(VENV) .venv-neighbours .venv-lowest build dist *.egg-info

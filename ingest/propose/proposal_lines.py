@@ -36,8 +36,8 @@ def in_one_recording(robots: Sequence[str]) -> str:
     others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
     return (
         f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new "
-        f"--robot NAME` proposes another profile, for {others}; give it another name, and ingest "
-        "with it into another store, as a store keeps one set of rows of a recording"
+        f"--robot NAME` proposes another profile, for {others}, of another name; ingest with it "
+        "into another store, as a store keeps one set of rows of a recording"
     )
 
 

@@ -109,6 +109,8 @@ class ProfileCommand:
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
+        if self.out is None and self.robot is not None:  # of one name, they would be two versions
+            stem += f"_{self.robot.strip('/')}"
         paths = list(dict.fromkeys(r for path in self.paths for r in recordings_in(path)))
         drives, unreadable = self._drives(paths)
         chosen = paths if drives is None else [drives.paths[one] for one in drives.read]
