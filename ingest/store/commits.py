@@ -31,6 +31,8 @@ from restock.ingest.task.schema import recording_schema
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
 _JITTER = random.SystemRandom()
+# What else of Restock's a folder may be, by the file that tells it.
+_OTHERS = {"panel.json": "a panel", "config.json": "the folder of a run"}
 T = TypeVar("T")
 
 
@@ -64,9 +66,19 @@ class TableCommits(StoreReader):
         self.again_on_conflict(create)
 
     def expect_folder(self) -> None:
-        """Raises StoreError where there is a file in place of the store."""
-        if self.path.folder is not None and self.path.folder.is_file():
+        """Raises StoreError where there is a file, a panel or a run in place of the store."""
+        folder = self.path.folder
+        if folder is None or not folder.exists():
+            return
+        if folder.is_file():
             raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
+        for file, kind in _OTHERS.items():
+            if (folder / file).is_file() and not self.path.has_table(TRANSITIONS):
+                raise StoreError(
+                    f"is {kind}, not a store",
+                    where=str(self.path),
+                    remedy="give the folder of a store, or of a new one",
+                )
 
     def expect_store(self) -> None:
         """Raises StoreError where there is no store, or not all of it."""

@@ -295,6 +295,23 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("file", "said"),
+    [("panel.json", "is a panel, not a store"), ("config.json", "is the folder of a run")],
+)
+def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, file, said):
+    (tmp_path / file).write_text("{}")
+    with pytest.raises(StoreError, match=said):
+        StoreWriter(tmp_path).write(*one(1))
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+def test_a_store_with_such_a_file_beside_its_tables_is_one(tmp_path):
+    StoreWriter(tmp_path).write(*one(1))
+    (tmp_path / "config.json").write_text("{}")
+    assert StoreWriter(tmp_path).write(*one(2)) == 2
+
+
+@pytest.mark.parametrize(
     ("place", "said"),
     [
         ("", "the name of the store is empty"),

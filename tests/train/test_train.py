@@ -327,6 +327,7 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
         (["train", "--resume", "{missing}"], "no config.json"),
         (["train", "--resume", "{trained}", "--seed", "3"], "own panel, config and seed"),
         (["train", "--out", "{new}", "--panel", "{panel}", "--set", "loss.discount=0.9"], "0.99"),
+        (["train", "--out", "{new}", "--flush-fresh", "{panel}"], "is a panel, not a store"),
         (["eval", "{missing}"], "no config.json"),
         (["eval", "{trained}", "--policies", "nobody"], "there is no 'nobody'"),
         (["eval", "{trained}", "--perturbations", "rain"], "choose from none, friction"),

@@ -70,6 +70,10 @@ class TrainCommand:
         from restock.errors import RestockError
         from restock.train.prepare import prepare_new, prepare_resumed
 
+        if self.flush_fresh is not None:  # refused before the training, not after it
+            from restock.ingest.store.writer import StoreWriter
+
+            StoreWriter(self.flush_fresh).expect_folder()
         given = {
             "schedule.env_steps": self.env_steps,
             "schedule.seconds": self.seconds,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.errors import ExitCode, StoreError
+from restock.errors import ExitCode
 from restock.words import counted
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class CompactCommand:
         from restock.ingest.store.writer import StoreWriter
 
         store = StoreWriter(self.store)
-        expect_store(store)
+        store.expect_store()
         if self.drop_damaged:
             return self._drop_damaged(store)
         done = compact(store, dry_run=self.dry_run)
@@ -106,18 +106,3 @@ class CompactCommand:
             unnamed = counted(done.unnamed_transitions, "transition")
             output.say(f"{unnamed} more were of recordings that no manifest names")
         return ExitCode.LOSSY if done.dropped else ExitCode.OK
-
-
-def expect_store(store: StoreWriter) -> None:
-    """Raises StoreError where the place is another of Restock's."""
-    folder = store.path.folder
-    if folder is None or store.path.has_table("transitions"):
-        return
-    from restock.replay.panel.panel import HEADER
-    from restock.replay.places import RUN_CONFIG
-
-    for file, kind in ((HEADER, "a panel"), (RUN_CONFIG, "the folder of a run")):
-        if (folder / file).is_file():
-            raise StoreError(
-                f"is {kind}, not a store", where=str(folder), remedy="give the folder of a store"
-            )

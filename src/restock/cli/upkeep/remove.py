@@ -52,12 +52,11 @@ class RemoveCommand:
     def run(self) -> ExitCode:
         """Remove, and say what was removed and how to get it back."""
         from restock.cli import output
-        from restock.cli.upkeep.compact import expect_store
         from restock.ingest.remove import remove_recordings
         from restock.ingest.store.writer import StoreWriter
 
         store = StoreWriter(self.store)
-        expect_store(store)
+        store.expect_store()
         if not self.recordings:
             raise ConfigError(
                 "names no recording to remove",
