@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from signal import SIGINT, pthread_kill
+from threading import Event, main_thread
+from time import sleep
 
 import pytest
 
@@ -261,6 +264,44 @@ def test_an_interrupted_study_says_how_to_continue(tmp_path: Path, capsys, monke
     assert "continue with the same command" in said
 
 
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_after_a_run_failed_none_is_begun_and_those_that_run_can_be_interrupted(
+    tmp_path: Path, capsys, monkeypatch, interrupted: bool
+) -> None:
+    begun, running, ended = [], Event(), Event()
+
+    def job(plan, job, say):
+        begun.append(job.path.name)
+        if job.arm.name == "plain":
+            assert running.wait(30)
+            raise RunError("ran out of disk", where="here")
+        running.set()
+        for _ in range(3000):  # until the failure is said
+            if "waiting for what runs" in "".join(said):
+                break
+            sleep(0.01)
+        if interrupted:
+            pthread_kill(main_thread().ident, SIGINT)
+            assert ended.wait(30)
+
+    said: list[str] = []
+    monkeypatch.setattr("restock.cli.output.say", said.append)
+    monkeypatch.setattr(study_run, "run_job", job)
+    monkeypatch.setattr(study_run, "interrupt_running", ended.set)
+    (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 1]"))
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--workers", "2"]
+    assert main(argv) == (130 if interrupted else 2)
+    assert ended.is_set() is interrupted
+    assert sorted(begun) == ["dueling-0", "plain-0"]
+    assert "here: ran out of disk" in said
+
+
+def test_a_panel_that_is_not_there_is_refused_before_the_runs(tmp_path: Path, capsys) -> None:
+    (tmp_path / "s.toml").write_text(f"{TWO}panel = 'p'\n")
+    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path), "--dry-run"]) == 2
+    assert "p: arm 'b': there is no panel here" in capsys.readouterr().err
+
+
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
     (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')
@@ -296,6 +337,11 @@ def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
             '[evaluation]\nepisodes = 0\n[[arms]]\nname = "a"\n[[arms]]\nname = "b"',
             "evaluation.episodes must be at least 1, got 0",
         ),
+        (f"{TWO}[evaluation]\nperturbations = ['ice']", r"perturbations: there is no 'ice'"),
+        (f"{TWO}[evaluation]\nperturbations = []", "perturbations: names nothing"),
+        (f"{TWO}[evaluation]\nperturbations = ['no.toml']", "no.toml: cannot be read"),
+        (f"{TWO}[evaluation]\nreferences = ['me']", "evaluation.references: there is no 'me'"),
+        ('[[arms]]\nname = ".."\n[[arms]]\nname = "b"', "must begin with a letter or a digit"),
         ("arms = [", "is not TOML"),
         (f"{TWO}[settings]\nnetwork.hiden = [3]", "unknown key `network.hiden`"),
         (f"{TWO}[evaluation]\nepisodes = {{ slip = 3 }}", "episodes: there is no 'slip'"),

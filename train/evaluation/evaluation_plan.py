@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -137,19 +137,8 @@ def plan_evaluation(
     """
     run = Run.open(path)
     config = parse_config(run.document["config"], where=str(path / "config.json"))
-    known = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
-    for flag, names, choices in (
-        ("--policies", policies, ["agent", *REFERENCES, CLONED]),
-        ("--perturbations", perturbations, known),
-    ):
-        unknown = [name for name in names if name not in choices and not _is_path(flag, name)]
-        if unknown or not names:
-            raise ConfigError(
-                f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
-                where=flag,
-                remedy=f"choose from {', '.join(choices)}"
-                + (_PATHS if flag == "--policies" else ", FILE.toml"),
-            )
+    refuse_unknown("policies", policies, where="--policies")
+    refuse_unknown("perturbations", perturbations, where="--perturbations")
     of_kind = episodes_of_kind(episodes)
     if wrong := wrong_seed(first_seed, max(of_kind.values())):
         raise ConfigError(wrong, where="--seed")
@@ -172,9 +161,30 @@ def plan_evaluation(
     for name in plan.policies:
         if is_cloned(name):
             cloned_panel(run, name)
-        elif name == "agent" or _is_path("--policies", name):
+        elif name == "agent" or _is_path("policies", name):
             make_policy(name, plan)  # refused before anything is driven
     return plan
+
+
+def refuse_unknown(
+    what: Literal["policies", "perturbations"], names: Sequence[str], *, where: str
+) -> None:
+    """Raises ConfigError where `restock eval` does not know a name, or there are no names."""
+    if what == "policies":
+        choices, paths = ["agent", *REFERENCES, CLONED], _PATHS
+    else:
+        choices = [CLEAN, *(name for name in PERTURBATIONS if name != "nominal")]
+        paths = ", FILE.toml"
+    unknown = [name for name in names if name not in choices and not _is_path(what, name)]
+    if unknown or not names:
+        raise ConfigError(
+            f"there is no {', '.join(map(repr, unknown))}" if unknown else "names nothing",
+            where=where,
+            remedy=f"choose from {', '.join(choices)}{paths}",
+        )
+    if what == "perturbations":
+        for name in names:
+            _perturb(name)
 
 
 def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
@@ -207,8 +217,8 @@ def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
     return dict(asked)
 
 
-def _is_path(flag: str, name: str) -> bool:
-    if flag == "--policies":
+def _is_path(what: str, name: str) -> bool:
+    if what == "policies":
         kind, _, path = name.partition(":")
         return kind in ("onnx", "run", CLONED) and bool(path)
     return name.endswith(".toml")

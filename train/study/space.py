@@ -22,6 +22,7 @@ from restock.train.study.study import (
     StudyEvaluation,
     check_seeds,
     refuse_judging_by_the_choice,
+    refuse_unknown_names,
 )
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -122,6 +123,7 @@ def load_search(path: Path) -> Search:
     """
     remedy = "docs/tune.md lists every key with its meaning"
     search = typed(read_toml(path), Search, where=str(path), remedy=remedy)
+    refuse_unknown_names(search.evaluation, str(path))
     for name, parameter in search.parameters.items():
         values = parameter.choices or (parameter.low, parameter.high)
         for value in () if name == MIXTURE else values:

@@ -44,6 +44,8 @@ class ArmConfig(Checked, frozen=True):
     def check(self) -> None:
         if not self.name or not all(c.isalnum() or c in "._-" for c in self.name):
             raise ValueError(f"name must be letters, digits, . _ or -, got {self.name!r}")
+        if not self.name[0].isalnum():  # "..", a hidden folder, an option
+            raise ValueError(f"name must begin with a letter or a digit, got {self.name!r}")
         if self.mixture is not None and self.panel is not None:
             raise ValueError("panel must not be given beside mixture: choose one")
         if self.library is None and self.arguments:
@@ -204,6 +206,7 @@ def load_study(path: Path) -> Study:
     """
     remedy = "docs/study.md lists every key with its meaning"
     study = typed(read_toml(path), Study, where=str(path), remedy=remedy)
+    refuse_unknown_names(study.evaluation, str(path))
     for arm in study.arms:
         sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
         config = parse_config(apply_overrides({}, sets), where=str(path))
@@ -229,6 +232,16 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
         where=where,
         remedy="set schedule.env_steps above schedule.warmup_env_steps",
     )
+
+
+def refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
+    """Raises ConfigError where a run could not be evaluated, which would be found once trained."""
+    from restock.train.evaluation.evaluation_plan import refuse_unknown
+
+    names = evaluation.perturbations
+    refuse_unknown("perturbations", names, where=f"{where}: evaluation.perturbations")
+    if names := evaluation.references:  # none at all are not driven
+        refuse_unknown("policies", names, where=f"{where}: evaluation.references")
 
 
 def refuse_judging_by_the_choice(
@@ -312,9 +325,16 @@ class StudyPlan:
 
 
 def refuse_changed(plan: StudyPlan) -> None:
-    """Raises RunError where a finished run was made as the study does not ask any more."""
+    """Raises RunError where a finished run was made as the study does not ask any more; ConfigError
+    where one that is still to do has no panel, which would be found after those before it."""
     for job in plan.jobs:
         if not job.done.exists():
+            if job.arm.panel and not (plan.folder / job.arm.panel / "panel.json").is_file():
+                raise ConfigError(
+                    f"arm {job.arm.name!r}: there is no panel here",
+                    where=str(plan.folder / job.arm.panel),
+                    remedy="give a panel that `restock mix` made: paths are relative to the file",
+                )
             continue
         made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
         asked = json.loads(plan.fingerprint(job))

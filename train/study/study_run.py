@@ -12,8 +12,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 import msgspec
@@ -77,16 +78,45 @@ def _compare(plan: StudyPlan, pair: Pair) -> Comparison | RunError:
 
 
 def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        futures = [pool.submit(run_job, plan, job, say) for job in todo]
+    """Train and evaluate; after a failure nothing more is begun, and what runs is waited for."""
+    failed = Event()
+
+    def run(job: StudyJob) -> None:
+        if failed.is_set():
+            return
         try:
-            for future in futures:
-                future.result()
-        except BaseException as stop:  # nothing more is begun
-            pool.shutdown(wait=False, cancel_futures=True)
-            if isinstance(stop, KeyboardInterrupt):  # what runs checkpoints and ends
-                interrupt_running()
+            run_job(plan, job, say)
+        except BaseException:
+            failed.set()
             raise
+
+    pool = ThreadPoolExecutor(max_workers=workers)
+    try:
+        futures = [pool.submit(run, job) for job in todo]
+        for future in as_completed(futures):
+            if (error := future.exception()) is None:
+                continue
+            if isinstance(error, RestockError) and not all(one.done() for one in futures):
+                say(str(error).splitlines()[0])
+                say("nothing more is begun; waiting for what runs (Ctrl-C checkpoints it)")
+            raise error
+    except BaseException as stop:
+        pool.shutdown(wait=False, cancel_futures=True)
+        if isinstance(stop, KeyboardInterrupt):  # what runs checkpoints and ends
+            interrupt_running()
+        raise
+    finally:
+        _wait(pool)
+
+
+def _wait(pool: ThreadPoolExecutor) -> None:
+    """Until what runs has ended, or is interrupted."""
+    try:
+        pool.shutdown()
+    except KeyboardInterrupt:
+        interrupt_running()
+        pool.shutdown()
+        raise
 
 
 def _run_on_ray(plan: StudyPlan, jobs: Sequence[StudyJob], workers: int, say: Say) -> None:
