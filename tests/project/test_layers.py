@@ -132,7 +132,7 @@ MAY_IMPORT = {
         " replay/mixture replay/panel replay/trace train/dqn train/evaluation train/run"
         " train/twin/env train/twin/floors"
     ),
-    "cli/upkeep": "cli ingest ingest/store replay replay/panel",
+    "cli/upkeep": "cli ingest ingest/store",
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"
         " ingest/store ingest/task replay/fleet replay/store train/evaluation"
