@@ -208,6 +208,7 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     young = str(Run.create(tmp_path / "young", document(1)).path)
     for words, said in (
         ([*first], "needs two runs, got 3"),
+        (["--against", *first], "needs the runs of the first method, too"),
         ([first[0], other, "--against", first[1]], "differs from"),
         ([first[0], first[0], "--against", first[1]], "is given twice"),
         ([first[0], young], "has no record of the episodes it sampled"),

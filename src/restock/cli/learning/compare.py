@@ -50,6 +50,12 @@ class CompareCommand:
         from restock.train.comparison.compare import compare
 
         first, second = self.runs, self.against
+        if second and not first:
+            raise ConfigError(
+                "needs the runs of the first method, too",
+                where="restock compare",
+                remedy="give them before --against: RUN RUN --against RUN RUN",
+            )
         if not second:
             if len(first) != 2:
                 raise ConfigError(
