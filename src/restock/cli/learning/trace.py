@@ -75,6 +75,10 @@ class TraceCommand:
         from restock.replay.trace.trace import TracePlaces, audited_rows, trace_row
 
         self._check_view()
+        if self.rows < 1:
+            from restock.errors import ConfigError
+
+            raise ConfigError(f"must be at least 1, got {self.rows}", where="--rows")
         if self.row is None:
             listed = audited_rows(self.place, self.rows)
             if self.json:
