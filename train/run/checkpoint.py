@@ -61,7 +61,8 @@ def load(path: Path) -> dict[str, Any]:
         raise RunError(
             "there is no checkpoint",
             where=str(path),
-            remedy="the run may have stopped before its first one",
+            remedy="a run that stopped before its first one has nothing to continue from: remove"
+            " it, and train again",
         )
     try:
         with safe_open(path, framework="pt") as opened:
