@@ -69,6 +69,30 @@ def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["target.every=9"], '`target.every` is a setting of target.rule = "hard", the rule is'),
+        (["target.rule=hard", "target.tau=0.1"], '`target.tau` is a setting of target.rule = "po'),
+    ],
+)
+def test_a_setting_of_the_other_target_rule_says_which_rule_has_it(
+    overrides: list[str], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load_config(None, overrides)
+
+
+def test_what_is_wrong_is_looked_for_in_the_file_and_in_the_options(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("seed = 1\n")
+    with pytest.raises(ConfigError, match=r"a\.toml and --set: seed must be in"):
+        load_config(file, ["seed=-1"])
+    file.write_text("seed = -1\n")
+    with pytest.raises(ConfigError, match=r"a\.toml: seed must be in"):
+        load_config(file)
+
+
+@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("replay.ring_capacity=99999999999", r"of them for replay\.ring_capacity; this machine"),

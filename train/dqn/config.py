@@ -298,7 +298,10 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     if path is not None:
         document = read_toml(path, remedy="give the path of a TOML file with --config")
     document = apply_overrides(document, overrides)
-    return parse_config(document, where=str(path) if path is not None else "--set")
+    places = ([] if path is None else [str(path)]) + (
+        ["--set"] if overrides or path is None else []
+    )
+    return parse_config(document, where=" and ".join(places))
 
 
 def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -329,8 +332,22 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """
     document = without_removed(document)
     refuse_removed(document, where=where)
+    _refuse_other_rule(document.get("target"), where)
     remedy = "docs/train.md lists every key with its meaning"
     return typed(document, TrainConfig, where=where, remedy=remedy, renamed=RENAMED)
+
+
+def _refuse_other_rule(target: Any, where: str) -> None:
+    """Raises ConfigError where a setting of one target rule stands under the other."""
+    if not isinstance(target, Mapping):
+        return
+    for key, rule, other in (("every", "hard", "polyak"), ("tau", "polyak", "hard")):
+        if key in target and target.get("rule") == other:
+            raise ConfigError(
+                f'`target.{key}` is a setting of target.rule = "{rule}", the rule is "{other}"',
+                where=where,
+                remedy=f'set target.rule = "{rule}" too, or leave it out',
+            )
 
 
 def _apply(document: dict[str, Any], override: str) -> None:
