@@ -567,6 +567,10 @@ def test_the_replay_card_names_the_teacher(taught: Any) -> None:
     known["config"] = {"config": msgspec.to_builtins(taught.config)}
     known["teacher"] = taught.run.table("teacher").to_pylist()[-1:]
     card = replay_card(Facts(**known))
+    assert "given; no logged rows to clone; an action is plausible" in as_markdown(card)
+    drawn = {"source": "logs", "behaviour_policy": "operator", "rows": 9, "share": 1.0}
+    known["policies"] = [drawn]
+    card = replay_card(Facts(**known))
     assert card["teacher"]["source"] == "given"
     page = as_markdown(card)
     assert "given; logged rows of operator cloned; an action is plausible from 0.5 of" in page

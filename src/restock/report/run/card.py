@@ -69,7 +69,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
         "teacher": {
             **{
                 name: teacher.get(name)
-                for name in ("source", "ratio", "target", "policies", "mirror")
+                for name in ("source", "ratio", "target", "policies", "successes", "mirror")
             },
             "states": _columns(
                 facts.teacher,
@@ -194,7 +194,7 @@ def as_markdown(card: dict[str, Any]) -> str:
         "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
         f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"
         f" {sampling['logs'] or 'rule unknown'}; fresh: {sampling['fresh'] or 'none'}",
-        "Teacher": _teacher(card["teacher"]),
+        "Teacher": _teacher(card["teacher"], card["behaviour_policies"]),
         "Practice": f"missions by the rule {card['practice']['rule']}",
         "Returns": f"{_or_none(sampling['n_step']['logs'])}-step in the logs,"
         f" {_or_none(sampling['n_step']['fresh'])}-step fresh",
@@ -220,16 +220,19 @@ def as_markdown(card: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _teacher(teacher: dict[str, Any] | None) -> str:
-    """Who says what is plausible."""
+def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> str:
+    """Who says what is plausible; `sampled` are the behaviour policies of the rows drawn."""
     if teacher is None:
         return "none: every action may be chosen"
     ratio = teacher["ratio"]
     ratio = f"{ratio:g}" if isinstance(ratio, int | float) else f"a schedule ({_words(ratio)})"
-    cloned = ", ".join(teacher["policies"]) or "nobody"
+    drawn = {row["behaviour_policy"] for row in sampled if row["source"] == "logs"}
+    names = [name for name in teacher["policies"] if name in drawn]
+    names += ["other drivers that reached their goal"] if drawn and teacher["successes"] else []
+    cloned = f"logged rows of {', '.join(names)} cloned" if names else "no logged rows to clone"
     mirrored = ", half of its rows mirrored" if teacher["mirror"] else ""
     return (
-        f"{teacher['source']}; logged rows of {cloned} cloned{mirrored}; an action is plausible"
+        f"{teacher['source']}; {cloned}{mirrored}; an action is plausible"
         f" from {ratio} of the likeliest's probability on; the target looks at"
         f" {teacher['target']} actions"
     )
