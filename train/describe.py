@@ -105,12 +105,16 @@ def nothing_to_do(session: Session) -> str | None:
 
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
-    """Why a run has learnt nothing; None where it has made an update."""
-    if outcome.gradient_steps:
+    """Why a run has learnt nothing, or nothing in the twin; None where it has."""
+    if not outcome.gradient_steps:
+        learnt = "as random as at the beginning"
+    elif outcome.env_steps and outcome.gradient_steps <= config.schedule.offline_updates:
+        learnt = f"that of the {outcome.gradient_steps:,} updates on the logs alone"
+    else:
         return None
     return (
-        f"no update was made in {outcome.env_steps:,} environment steps, so the policy is as random"
-        " as at the beginning; online updates begin after"
+        f"no update was made in {outcome.env_steps:,} environment steps, so the policy is {learnt};"
+        " online updates begin after"
         f" schedule.warmup_env_steps={config.schedule.warmup_env_steps:,}, once there are"
         f" replay.batch_size={config.replay.batch_size:,} rows: give more --env-steps"
     )

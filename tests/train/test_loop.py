@@ -448,6 +448,19 @@ def test_warmup_collects_without_learning_and_a_run_of_nothing_else_says_so(
     assert "schedule.warmup_env_steps=400" in said
 
 
+def test_a_run_whose_updates_were_all_on_the_logs_says_so(tmp_path: Path) -> None:
+    settings = config(schedule={"env_steps": 40, "warmup_env_steps": 400, "offline_updates": 5})
+    live = session(tmp_path / "a", settings, logs=logs())
+    outcome = train(live)
+    live.close()
+    assert outcome.gradient_steps == 5
+    said = no_update(outcome, settings)
+    assert said is not None
+    assert said.startswith("no update was made in 40 environment steps, so the policy is that of")
+    assert no_update(dataclasses.replace(outcome, gradient_steps=6), settings) is None
+    assert no_update(dataclasses.replace(outcome, env_steps=0), settings) is None
+
+
 def test_a_run_whose_budget_is_used_up_says_so_when_it_is_resumed(
     undisturbed: Session, tmp_path: Path
 ) -> None:
