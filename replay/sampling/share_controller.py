@@ -306,7 +306,9 @@ class ShareController(Stateful):
             raise MixtureError(
                 f"the offline phase draws {offline:,.0f} rows of {source.name}, which its"
                 f" {source.rows.sum():,} rows do not allow at {self.max_replays} draws each",
-                remedy="lower schedule.offline_updates, raise max_replays_per_row, or ingest more",
+                remedy="lower schedule.offline_updates to"
+                f" {np.floor(1000 * fill / offline) / 10:g}% of what it is, raise"
+                " max_replays_per_row, or ingest more",
             )
         online = ahead - offline
         filled = plan.scale if online <= 0 else min(max(fill - offline, 0.0) / online, 1.0)

@@ -27,7 +27,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
-from restock.train.feed.logs import Logs, LogTerms
+from restock.train.feed.logs import Coded, Logs, LogTerms
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import earlier, go_back
@@ -624,6 +624,15 @@ def test_terms_that_the_logs_cannot_serve_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         session(tmp_path / "r", config(loss=loss))
+
+
+def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
+    shelf = logs()
+    nobody = Coded(np.zeros(len(shelf), np.int32), ["unknown", "unknown"])  # named so by a profile
+    shelf = dataclasses.replace(shelf, behaviour_policy=nobody)
+    loss = config(loss={"margin": 1.0}).loss
+    with pytest.raises(ConfigError, match=r"choose from what they have: unknown$"):
+        LogTerms.of(loss, shelf, torch.device("cpu"))
 
 
 @pytest.mark.long

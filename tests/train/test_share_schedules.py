@@ -53,8 +53,11 @@ def test_the_cap_is_reckoned_with_the_runs_own_draws() -> None:
     plan = controller(text, [300, 100], PlannedDraws(10_000, 100_000, 0, 1000))
     np.testing.assert_allclose(plan.shares, [0.75, 0.25])
     assert plan.logs_share == pytest.approx(0.1)
-    with pytest.raises(MixtureError, match=r"offline phase draws 30,000 rows of logs.*400 rows"):
+    said = r"offline phase draws 30,000 rows of logs.*400 rows"
+    with pytest.raises(MixtureError, match=said) as raised:
         controller(text, [300, 100], PlannedDraws(30_000, 100_000, 0, 1000))
+    assert "lower schedule.offline_updates to 66.6% of what it is" in str(raised.value)
+    controller(text, [300, 100], PlannedDraws(19_980, 100_000, 0, 1000))
     with pytest.raises(MixtureError, match=r"rare wants 50\.0% of 50,000 draws, its 100 rows"):
         controller(
             "shortfall = 'refuse'\n" + text, [10_000, 100], PlannedDraws(0, 100_000, 0, 1000)

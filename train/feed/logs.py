@@ -231,5 +231,6 @@ def _known(key: str, names: tuple[str, ...], known: list[str]) -> None:
     for name in names:
         if name not in known:
             raise ConfigError(
-                f"{key}: the logs have no {name!r}", remedy=f"they have {', '.join(known)}"
+                f"{key}: the logs have no {name!r}",
+                remedy=f"choose from what they have: {', '.join(dict.fromkeys(known))}",
             )
