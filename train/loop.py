@@ -7,6 +7,7 @@ arXiv:2412.07762). Read `_train` from top to bottom: it is the whole of it.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -86,7 +87,9 @@ def train(
     except TeacherFailed as error:
         _save(session)
         session.write_held()
-        again = f"; then continue with `restock train --resume {session.run.path}`"
+        again = (
+            f"; then continue with `restock train --resume {shlex.quote(str(session.run.path))}`"
+        )
         raise TeacherFailed(
             f"{error.what}; a checkpoint was written",
             where=error.where,
@@ -488,5 +491,5 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
             where=str(session.run.path),
-            remedy=f"continue with `restock train --resume {session.run.path}`",
+            remedy=f"continue with `restock train --resume {shlex.quote(str(session.run.path))}`",
         )

@@ -109,6 +109,9 @@ def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
     Run.create(tmp_path / "a", {})
     with pytest.raises(RunError, match=r"already exists\n.*--resume"):
         Run.create(tmp_path / "a", {})
+    Run.create(tmp_path / "a b", {})
+    with pytest.raises(RunError, match=r"`restock train --resume '.*a b'`"):  # to be pasted
+        Run.create(tmp_path / "a b", {})
     (tmp_path / "empty").mkdir()
     Run.create(tmp_path / "empty", {})  # an empty directory is free
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -77,7 +78,7 @@ def load_agent(run: Run) -> GreedyPolicy:
         raise RunError(
             "has not kept a policy yet: it stopped before its first evaluation",
             where=str(run.path),
-            remedy=f"continue it with `restock train --resume {run.path}`",
+            remedy=f"continue it with `restock train --resume {shlex.quote(str(run.path))}`",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     state = load_kept(run)

@@ -11,6 +11,7 @@ eval/                  what `restock eval` measured
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -216,7 +217,7 @@ def check_free(path: Path) -> None:
             "already exists",
             where=str(path),
             remedy="choose another --out, remove it, or continue it with"
-            f" `restock train --resume {path}`",
+            f" `restock train --resume {shlex.quote(str(path))}`",
         )
 
 

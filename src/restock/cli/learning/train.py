@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -153,7 +154,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     if kept
                     else "ended at once, before its first checkpoint",
                     where=str(path),
-                    remedy=f"continue with `restock train --resume {path}`"
+                    remedy=f"continue with `restock train --resume {shlex.quote(str(path))}`"
                     if kept
                     else "remove it, and train again",
                 ) from None
@@ -264,5 +265,6 @@ def _print(
         )
     say(
         f"{outcome.env_steps:,} environment steps and {outcome.gradient_steps:,} updates in"
-        f" {outcome.wall_s:.0f} s\nnext: restock eval {path}{'' if rows else ' --on-logs own'}"
+        f" {outcome.wall_s:.0f} s\nnext: restock eval {shlex.quote(path)}"
+        + ("" if rows else " --on-logs own")
     )
