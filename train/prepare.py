@@ -39,6 +39,7 @@ from restock.train.new_run import check_new_run
 from restock.train.resolve import mirrors, planned_draws, resolve_config, resolve_teacher
 from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
+from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.run.run_lock import RunLock
 from restock.train.run.run_profile import (
@@ -273,15 +274,9 @@ def prepare_resumed(
         )
     if config.teacher.mirror:
         mirrors(config.teacher, profile.task)
-    panel = None
-    if (fed := run.document["panel"]) is not None:
-        panel = open_panel(Path(fed["path"]), config, profile)
-        if panel.id != fed["id"]:
-            raise RunError(
-                f"was fed panel {fed['id']}, but {fed['path']} is now panel {panel.id}",
-                where=str(path),
-                remedy="put the old panel back, or start a new run",
-            )
+    panel = run_panel(run.document)  # refused where it is gone, or another is there
+    if panel is not None:
+        panel = open_panel(panel.path, config, profile)
     if from_env_steps is not None:
         check_earlier(run.latest, from_env_steps)
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)

@@ -25,5 +25,5 @@ def test_another_panel_in_its_place_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PanelError, match=f"is panel {other.id}, the run was fed {fed.id}"):
         run_panel(document)
     out.rename(tmp_path / "moved")
-    with pytest.raises(PanelError, match=rf"the run was fed {fed.id}\n  move it back, or mix it"):
+    with pytest.raises(PanelError, match=rf"the run was fed {fed.id}\n  move it back, put a link"):
         run_panel(document)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -351,6 +352,21 @@ def test_wrong_input_gives_one_clear_message_and_writes_nothing(
     assert complaint in said
     assert "Traceback" not in said
     assert not (tmp_path / "new").exists()
+
+
+def test_a_run_whose_panel_was_moved_is_resumed_by_a_link(
+    trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    shutil.copytree(trained, run)
+    text = (run / "config.json").read_text().replace(str(panel), str(tmp_path / "panel"))
+    (run / "config.json").write_text(text)
+    shutil.copytree(panel, moved)
+    resume = ["train", "--resume", str(run), "--dry-run"]
+    assert main(resume) == 2
+    assert "there is no panel here any more" in capsys.readouterr().err
+    (tmp_path / "panel").symlink_to(moved)
+    assert main(resume) == 0
 
 
 def test_a_panel_of_a_task_that_no_profile_has_is_refused(

@@ -23,7 +23,8 @@ def run_panel(document: Mapping[str, Any]) -> Panel | None:
         raise PanelError(
             f"there is no panel here any more; the run was fed {fed.get('id', 'it')}",
             where=str(path),
-            remedy="move it back, or mix it there again from the same store version and mixture",
+            remedy="move it back, put a link to it there, or mix it there again from the same store"
+            " version and mixture",
         )
     panel = Panel.open(path)
     if panel.id != fed.get("id", panel.id):
