@@ -14,7 +14,8 @@ from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.contact import NO_PATCH, PATCHES, friction_at
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, no_pallets
 from restock.train.twin.physics.model import build_model
-from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.perturbation import RANGES, Perturbation
+from restock.train.twin.physics.robot import base_controller
 from restock.train.twin.physics.robot_model import (
     ACCEL_LIMIT,
     CASTER_RADIUS_M,
@@ -280,6 +281,21 @@ def test_latency_delays_the_wheels_by_what_it_says() -> None:
             sim.controller.command(np.array([[1.0, 0.0]]))
             rows += [sim.controller.controls(block * BLOCK_S)[0] for block in range(2)]
         assert int((np.concatenate(rows)[:, 0] == 0).sum()) == still
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2])
+def test_the_longest_latency_holds_at_every_control_period(period_s: float) -> None:
+    robot, longest = stand_in(load_profile("warehouse_amr").task.body), RANGES["latency_s"][1]
+    substeps = round(min(period_s, BLOCK_S) / 0.01)
+    controller = base_controller(1, robot, period_s, 0.01, substeps)
+    controller.latency_s[:] = longest
+    moved = []
+    for tick in range(round(0.8 / period_s)):
+        controller.command(np.array([[1.0, 0.0]]))
+        for block in range(round(period_s / 0.01 / substeps)):
+            wheels = controller.controls(block * BLOCK_S)[0, :, 0]
+            moved += [tick * period_s + block * BLOCK_S + 0.01 * n for n in np.flatnonzero(wheels)]
+    assert moved[0] == pytest.approx(longest)
 
 
 @pytest.mark.parametrize("friction", [0.8, 0.1, 0.03])

@@ -6,6 +6,7 @@ body has a payload, wheels and the pull of a slope.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import mujoco
@@ -14,11 +15,11 @@ import numpy as np
 from restock.arrays import F64, Ints
 from restock.state import Stateful
 from restock.train.twin.physics.model import Handles
-from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.perturbation import RANGES, Perturbation
 from restock.train.twin.physics.robot_model import RobotModel
 
 GRAVITY_MPS2 = 9.81
-_HISTORY = 5  # commands kept: enough for the longest latency at the shortest period
+_HISTORY = 5  # commands kept, or as many more as the longest latency takes
 
 
 class BaseController(Stateful):
@@ -35,7 +36,8 @@ class BaseController(Stateful):
         self.robot = robot
         self._accel_limit, self._speed_limit = map(np.array, (robot.accel_limit, robot.speed_limit))
         self._period_s, self._timestep_s, self._substeps = period_s, timestep_s, substeps
-        self.commands = np.zeros((num_envs, _HISTORY, 2))  # speed, yaw rate; newest first
+        history = max(_HISTORY, math.ceil(RANGES["latency_s"][1] / period_s - 1e-9) + 1)
+        self.commands = np.zeros((num_envs, history, 2))  # speed, yaw rate; newest first
         self.set_point = np.zeros((num_envs, 2))
         self.latency_s = np.zeros(num_envs)
         self.gain = np.ones(num_envs)
@@ -74,7 +76,7 @@ class BaseController(Stateful):
         of the change: within a block there is at most one."""
         step = np.arange(self._substeps)
         age_s = since_s + step * self._timestep_s - self.latency_s[:, None] + 1e-9
-        age = np.clip(-np.floor(age_s / self._period_s), 0, _HISTORY - 1)
+        age = np.clip(-np.floor(age_s / self._period_s), 0, self.commands.shape[1] - 1)
         age = age.astype(np.int64)  # (N, S) how many periods old the command in force is
         first, last = age[:, 0], age[:, -1]
         rows = np.arange(len(age))
