@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -18,8 +19,10 @@ from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.layout import default_warehouse
-from restock.train.twin.physics.episode import Episode, EpisodeSpec
+from restock.train.twin.floors.layout import AisleSegment, Rect, Warehouse, default_warehouse
+from restock.train.twin.floors.planner import Planner
+from restock.train.twin.floors.state_lattice import floor_gap, rectangle
+from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode, with_room
 from restock.train.twin.physics.model import build_model
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import stand_in
@@ -228,3 +231,54 @@ def test_a_profile_carries_its_robot() -> None:
 def test_a_robot_that_is_wrong_is_refused_by_its_key(old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         amr_with(ROBOT_TOML.replace(old, new, 1))
+
+
+@pytest.mark.parametrize("axle_x_m", [0.0, -0.4])
+def test_a_long_robot_does_not_start_in_a_rack(axle_x_m: float) -> None:
+    floor, outline = default_warehouse(), rectangle(1.2, 0.8, axle_x_m, 25)
+    planner, turned = Planner(floor), 0
+    for seed in range(25):
+        drawn = draw_episode(EpisodeSpec("nominal", seed), floor, planner)
+        fitted = with_room(drawn, floor, outline)
+        assert room_m(fitted, floor, outline) > 0
+        assert fitted.start[:2] == drawn.start[:2]  # these aisles are wide enough
+        turned += fitted.start != drawn.start
+        if room_m(drawn, floor, outline) > 0:
+            assert fitted.start == drawn.start
+        assert with_room(drawn, floor, rectangle(0.7, 0.5, points=15)).start == drawn.start
+    assert turned
+
+
+def room_m(episode: Episode, floor: Warehouse, outline_m: NDArray[np.float64]) -> float:
+    x, y, yaw = episode.start
+    ahead, aside = outline_m.T
+    points = (
+        x + ahead * np.cos(yaw) - aside * np.sin(yaw),
+        y + ahead * np.sin(yaw) + aside * np.cos(yaw),
+    )
+    return float(floor_gap(floor, *points).min())
+
+
+def test_the_twin_starts_a_long_robot_where_it_has_room() -> None:
+    task = msgspec.structs.replace(AMR.task, body=Body(1.2, 0.8))
+    env = WarehouseVectorEnv(12, task=task)
+    env.set_episodes([EpisodeSpec("nominal", seed) for seed in range(12)])
+    env.reset()
+    *_, info = env.step(np.zeros(12, np.int64))
+    assert not info["bumps"].any()
+
+
+def test_in_a_narrow_aisle_a_wide_robot_starts_in_the_middle() -> None:
+    aisle = Rect(2.0, 0.0, 6.0, 1.2)
+    racks = (Rect(2.0, 1.2, 6.0, 2.0),)
+    floor = replace(
+        default_warehouse(),
+        racks=racks,
+        segments=(AisleSegment("aisle", 0, aisle, "x"),),
+    )
+    start = (4.0, 0.45, 1.0)
+    way = np.linspace((4.0, 0.45), (1.0, 0.6), 48)
+    episode = Episode(EpisodeSpec("nominal", 0), start, (1.0, 0.6), way)
+    x, y, yaw = with_room(episode, floor, rectangle(1.0, 1.0, points=21)).start
+    assert (x, y) == (4.0, 0.6)
+    assert abs(math.sin(yaw)) < 0.1

@@ -54,7 +54,7 @@ from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.env.truth import Truth
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, with_room
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
@@ -269,6 +269,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
             )
         floor = self.queue.floor_of(spec)
         episode = draw_episode(spec, self.floors[floor], self.navigation.planners[floor])
+        episode = with_room(episode, self.floors[floor], self.simulation.outline_m)
         self.specs[env] = spec
         self.layout[env] = floor
         self.simulation.reset(env, episode, perturbation, floor)

@@ -12,7 +12,7 @@ in a table, and looked at again. Kinds of episode:
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
+from restock.train.twin.floors.state_lattice import floor_gap
 from restock.train.twin.physics.contact import NO_PATCH, PATCHES
 from restock.train.twin.physics.model import PALLET_HALF_M, PALLETS, PARKED_M
 from restock.train.twin.physics.perturbation import Perturbation
@@ -108,6 +109,35 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
+
+
+def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode:
+    """The episode, its robot turned where as drawn its outline would stand in a rack or wall.
+
+    `outline_m` (K, 2) are points on the outline, about the pose. Drawn are starts for the twin's
+    own robot: a longer one is turned along its way or the aisle, and where that is not enough
+    stands in the aisle's middle. A place with room for none of that is left as it is, and so is
+    a start that was asked for.
+    """
+    if episode.spec.way is not None:
+        return episode
+    x, y, yaw = episode.start
+    along = point_along(episode.plan_m, 1.0) - episode.plan_m[0]
+    ahead = float(np.arctan2(along[1], along[0]))
+    square = np.arange(4) * (np.pi / 2)
+    square = square[np.argsort(-np.cos(square - ahead), kind="stable")]
+    places = [(x, y)]
+    if (segment := int(warehouse.segment_of(np.array([x]), np.array([y]))[0])) >= 0:
+        aisle = warehouse.segments[segment]
+        middle = aisle.area.center
+        places.append((x, middle[1]) if aisle.along == "x" else (middle[0], y))
+    for place in places:
+        for heading in (yaw, ahead, *square.tolist()):
+            cos, sin = np.cos(heading), np.sin(heading)
+            points = outline_m @ np.array([[cos, sin], [-sin, cos]]) + place
+            if floor_gap(warehouse, *points.T).min() > 0:
+                return replace(episode, start=(*place, heading))
+    return episode
 
 
 def _draw_way(

@@ -23,6 +23,7 @@ from restock.errors import ConfigError
 from restock.ingest.task.task import Task
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.state_lattice import rectangle
 from restock.train.twin.physics.contact import FLOOR_FRICTION, FloorFriction
 from restock.train.twin.physics.episode import Episode
 from restock.train.twin.physics.lidar import Lidar
@@ -35,6 +36,7 @@ from restock.train.twin.physics.scenery import Scenery, quaternion, rotated
 Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
 BLOCK_S = 0.1
+OUTLINE_STEP_M = 0.05  # at most, between points on a robot's outline
 _CONTROLLED = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS)
 
 
@@ -117,7 +119,10 @@ class Simulation(Stateful):
         self._actuators = self.model.nu
         width = self._actuators + 3 * self.model.nmocap
         self._control = np.zeros((num_envs, self.substeps, width))
-        half_m = task.body.length_m / 2, task.body.width_m / 2
+        length_m, width_m = task.body.length_m, task.body.width_m
+        points = math.ceil(max(length_m, width_m) / OUTLINE_STEP_M) + 1
+        self.outline_m = rectangle(length_m, width_m, robot.axle_x_m, points)  # (K, 2) of the pose
+        half_m = length_m / 2, width_m / 2
         self.scenery = Scenery(
             self.batch, self.handles, floors, slots, half_m, self._control[:, :, self._actuators :]
         )
