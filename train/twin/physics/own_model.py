@@ -8,6 +8,7 @@ floor's friction under them, and the physics steps as the twin does.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +29,7 @@ ROLES: dict[str, tuple[str, ...]] = {
 }
 REMEDY = "docs/robot.md says what the model must contain, and has an example"
 ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
+WORLD = ("option", "size", "statistic", "visual", "keyframe")  # the twin has its own
 PLACE_M = 0.02  # how far parts may be from where the profile says
 
 
@@ -42,7 +44,7 @@ def own_model(robot: Robot, body: Body, built: RobotModel) -> RobotModel:
     try:
         spec = mujoco.MjSpec.from_string(robot.mjcf or "")
         model = spec.compile()
-        plain = spec.to_xml()  # angles in radians, defaults written out
+        plain = _robot_alone(spec.to_xml())  # angles in radians, defaults written out
     except (ValueError, mujoco.FatalError) as error:
         raise _refused(f"MuJoCo says: {' '.join(str(error).split())}") from error
     problems, wheels = _problems(model, robot, body, built)
@@ -73,11 +75,17 @@ def own_model(robot: Robot, body: Body, built: RobotModel) -> RobotModel:
     )
 
 
+def _robot_alone(mjcf: str) -> str:
+    """Without what is the world's to say, of which MuJoCo warns wherever the robot is attached."""
+    root = ET.fromstring(mjcf)
+    for part in [part for part in root if part.tag in WORLD]:
+        root.remove(part)
+    return ET.tostring(root, encoding="unicode")
+
+
 def attach_own(spec: Any, robot: RobotModel) -> Any:
     """Put the robot's own model into the twin's; returns its base."""
     child = mujoco.MjSpec.from_string(robot.mjcf)
-    for key in list(child.keys):
-        child.delete(key)
     for part in (*child.worldbody.geoms, *child.worldbody.sites, *child.lights, *child.cameras):
         child.delete(part)
     for geom in child.geoms:
