@@ -15,6 +15,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.physics.model import passed_over
 
 needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())
 TASK = load_profile("warehouse_amr").task
@@ -138,3 +139,26 @@ def test_people_and_forklifts_stand_on_the_floor() -> None:
         if simulation.bumped[there[0]]:
             break
     assert simulation.bumped[there[0]]
+
+
+@pytest.mark.parametrize("layouts", ["default", "generated:3,generated:4"])
+def test_a_lidar_on_a_mast_sees_racks_and_walls(
+    layouts: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    low, high = (
+        WarehouseVectorEnv(
+            8, robot=Robot(lidar=LidarLimits(z_m=z_m)), layouts=layouts, conditions={"nominal": 1.0}
+        )
+        for z_m in (0.3, 1.9)
+    )
+    low.reset(seed=5)
+    high.reset(seed=5)
+    for ranges in both(high, monkeypatch):
+        assert np.isfinite(ranges).all()
+        np.testing.assert_allclose(ranges, low.simulation.cast(np.arange(8)))
+
+
+def test_what_a_lidar_passes_over_is_said_with_its_height() -> None:
+    assert passed_over(0.5) == []
+    assert passed_over(1.0) == ["pallets (0.6 m)"]
+    assert passed_over(1.9) == ["pallets (0.6 m)", "forklifts (1.2 m)", "people (1.7 m)"]

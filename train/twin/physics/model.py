@@ -70,7 +70,8 @@ def build_model(
     `PARKED_RACK_M` away, to be placed by `building_boxes`.
     """
     spec = _spec(timestep_s)
-    _add_building(spec, warehouse, len(warehouse.racks) if rack_slots is None else rack_slots)
+    slots = len(warehouse.racks) if rack_slots is None else rack_slots
+    _add_building(spec, warehouse, slots, robot.lidar_z_m)
     add_robot(spec, robot)
     _add_mocap(spec)
     model = spec.compile()
@@ -105,14 +106,22 @@ def _spec(timestep_s: float) -> Any:
     return spec
 
 
-def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
-    """Middles and half sizes (rack_slots + 4, 3) of racks and walls, in the model's order."""
+def building_boxes(
+    warehouse: Warehouse, rack_slots: int, lidar_z_m: float = 0.0
+) -> tuple[F64, F64]:
+    """Middles and half sizes (rack_slots + 4, 3) of racks and walls, in the model's order.
+
+    They are no lower than a lidar needs to see them.
+    """
     thick, width, depth = warehouse.wall_m, warehouse.width_m, warehouse.depth_m
+    rack_z_m, wall_z_m = (
+        max(half, lidar_z_m / 2 + 0.05) for half in (RACK_HALF_HEIGHT_M, WALL_HALF_HEIGHT_M)
+    )
     middle = np.full((rack_slots + 4, 3), PARKED_RACK_M)
     half = np.full((rack_slots + 4, 3), 0.1)
     for index, rack in enumerate(warehouse.racks[:rack_slots]):
-        middle[index] = (*rack.center, RACK_HALF_HEIGHT_M)
-        half[index] = (*rack.half_size, RACK_HALF_HEIGHT_M)
+        middle[index] = (*rack.center, rack_z_m)
+        half[index] = (*rack.half_size, rack_z_m)
     for index, (center, size) in enumerate(
         (
             ((-thick, depth / 2), (thick, depth / 2 + 2 * thick)),
@@ -121,12 +130,12 @@ def building_boxes(warehouse: Warehouse, rack_slots: int) -> tuple[F64, F64]:
             ((width / 2, depth + thick), (width / 2, thick)),
         )
     ):
-        middle[rack_slots + index] = (*center, WALL_HALF_HEIGHT_M)
-        half[rack_slots + index] = (*size, WALL_HALF_HEIGHT_M)
+        middle[rack_slots + index] = (*center, wall_z_m)
+        half[rack_slots + index] = (*size, wall_z_m)
     return middle, half
 
 
-def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
+def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int, lidar_z_m: float) -> None:
     world = spec.worldbody
     world.add_light(pos=[warehouse.width_m / 2, warehouse.depth_m / 2, 8], dir=[0, 0, -1])
     world.add_geom(
@@ -141,7 +150,9 @@ def _add_building(spec: Any, warehouse: Warehouse, rack_slots: int) -> None:
     )
     names = [f"rack_{index}" for index in range(rack_slots)]
     names += [f"wall_{side}" for side in ("west", "east", "south", "north")]
-    for name, middle, half in zip(names, *building_boxes(warehouse, rack_slots), strict=True):
+    for name, middle, half in zip(
+        names, *building_boxes(warehouse, rack_slots, lidar_z_m), strict=True
+    ):
         world.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -190,6 +201,16 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
         accelerometer=slice(accelerometer, accelerometer + 3),
         bumper=int(model.sensor("bumper").adr[0]),
     )
+
+
+def passed_over(lidar_z_m: float) -> list[str]:
+    """What a lidar at this height never sees, with its own height."""
+    heights = {
+        "pallets": PALLET_HALF_M[2],
+        "forklifts": FORKLIFT_HALF_M[2],
+        "people": PERSON_HALF_HEIGHT_M,
+    }
+    return [f"{name} ({2 * half:g} m)" for name, half in heights.items() if lidar_z_m > 2 * half]
 
 
 def pallet_half_m(yaw_rad: F64) -> F64:

@@ -37,6 +37,7 @@ class Scenery(Stateful):
         floors: Sequence[Warehouse],
         rack_slots: int,
         robot_half_m: tuple[float, float],
+        lidar_z_m: float,
         moves: F64,
     ) -> None:
         """`moves` (N, substeps, 3 * nmocap) are the mocap positions of the coming block, which
@@ -48,7 +49,7 @@ class Scenery(Stateful):
         self.walked = np.zeros(0, np.int64)  # where traffic moved in the last block
         self.position_m = batch.bind("mocap_pos")  # (N, nmocap, 3) of pallets, people, forklifts
         self.quat = batch.bind("mocap_quat")
-        self.buildings = [building_boxes(floor, rack_slots) for floor in floors]
+        self.buildings = [building_boxes(floor, rack_slots, lidar_z_m) for floor in floors]
         self.floor = np.zeros(num_envs, np.int64)  # whose building stands
 
     def build(self, env: int, floor: int) -> None:

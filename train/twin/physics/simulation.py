@@ -124,7 +124,8 @@ class Simulation(Stateful):
         self.outline_m = rectangle(length_m, width_m, robot.axle_x_m, points)  # (K, 2) of the pose
         half_m = length_m / 2, width_m / 2
         self.scenery = Scenery(
-            self.batch, self.handles, floors, slots, half_m, self._control[:, :, self._actuators :]
+            *(self.batch, self.handles, floors, slots, half_m, robot.lidar_z_m),
+            self._control[:, :, self._actuators :],
         )
         self.traffic, self.pallets = self.scenery.traffic, self.scenery.pallets
         self.body = RobotBody(self.batch, self.model, self.handles, num_envs, robot)

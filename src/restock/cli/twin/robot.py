@@ -25,7 +25,7 @@ class RobotCommand:
     """The floor's coefficient of friction, from 0.04 to 1.6."""
     json: bool = False
     """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
-    speed_mps, yaw_rate_radps, driven_mps, driven_radps}]}."""
+    speed_mps, yaw_rate_radps, driven_mps, driven_radps}], "lidar_passes_over": […]}."""
 
     def run(self) -> int:
         """Build it and drive every action."""
@@ -33,6 +33,7 @@ class RobotCommand:
         from restock.errors import ConfigError
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
+        from restock.train.twin.physics.model import passed_over
         from restock.train.twin.physics.robot_trial import driven_actions, measured, robot_model
 
         if not 0.04 <= self.friction <= 1.6:
@@ -51,12 +52,19 @@ class RobotCommand:
                 strict=True,
             )
         ]
+        unseen = passed_over(model.lidar_z_m) if profile.task.lidar else []
         if self.json:
             values = {name: value for name, value, _ in facts}
-            output.print_json({"robot": values, "driven": driven})
+            output.print_json({"robot": values, "driven": driven, "lidar_passes_over": unseen})
             return 0
         rows = [{"": n, "value": value, "from": origin} for n, value, origin in facts]
         output.print_table(rows, title=f"{self.profile}: the robot in the twin")
         sys.stdout.write("\n")
         output.print_table(driven, title="Steady motion for each action")
+        if unseen:
+            over = ", ".join(unseen)
+            sys.stdout.write(
+                f"\nIts lidar, {model.lidar_z_m:g} m above the floor, passes over {over}: the robot"
+                " never sees them\n"
+            )
         return 0
