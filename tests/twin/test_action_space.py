@@ -115,6 +115,16 @@ def test_an_index_outside_the_table_is_refused(index: float) -> None:
     made.step(np.array([0.0, 9.0]))
 
 
+@pytest.mark.parametrize(
+    ("action", "given"), [("discrete", [1, 2, 3]), ("discrete", ["a", "b"]), ("continuous", [0.5])]
+)
+def test_another_number_of_actions_is_refused_with_the_shape(action: str, given: list) -> None:
+    made = WarehouseVectorEnv(2, action=action)
+    made.reset(seed=1)
+    with pytest.raises(ConfigError, match=r"actions must be numbers of shape \(2,"):
+        made.step(np.array(given))
+
+
 def test_an_unknown_face_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown action space 'velocity'"):
         WarehouseVectorEnv(1, action="velocity")

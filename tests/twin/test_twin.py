@@ -359,6 +359,16 @@ def test_a_perturbation_is_read_from_toml_and_refused_with_its_range(tmp_path: A
         ({"seed": -1}, "seed must be 0 or more, got -1"),
         ({"render_mode": "human"}, "unknown render_mode 'human'"),
         ({"perturbation": Perturbation(timestep_s=0.003)}, "does not divide"),
+        ({"seed": "a"}, "seed must be 0 or more, got 'a'"),
+        ({"seed": 1.5}, "seed must be 0 or more, got 1.5"),
+        ({"task": "warehouse_amr"}, "task must be a Task, got 'warehouse_amr'"),
+        ({"robot": "mine.toml"}, "robot must be a Robot, got 'mine.toml'"),
+        ({"perturbation": 0.5}, "perturbation must be a Perturbation or Schedule, got 0.5"),
+        ({"perturbation": "ice"}, "there is no perturbation 'ice'"),
+        ({"perturbation": {"friction": 0.5}}, "unknown key `friction`"),
+        ({"conditions": ["nominal"]}, r"conditions \['nominal'\] are not shares"),
+        ({"conditions": {"nominal": "1"}}, "are not shares per kind of episode"),
+        ({"layouts": ["default", "default"]}, "layout names must be unique"),
     ],
 )
 def test_bad_arguments_say_what_to_do(arguments: dict[str, Any], message: str) -> None:
@@ -386,6 +396,16 @@ def test_the_seed_of_a_single_environment_is_that_of_its_first_reset() -> None:
 def test_an_unknown_kind_of_episode_is_refused() -> None:
     with pytest.raises(ConfigError, match="unknown kind of episode: 'fog'"):
         EpisodeSpec("fog", 1)
+
+
+def test_perturbations_and_floors_may_be_given_by_name() -> None:
+    made = gymnasium.make(
+        "restock/Warehouse-v0", perturbation="friction", layouts=["generated:3"], seed=None
+    )
+    _, info = made.reset(seed=1)
+    assert (info["perturbation"], info["layout"]) == ("friction", "generated:3")
+    heavy = WarehouseVectorEnv(1, perturbation={"payload_kg": 40.0})
+    assert heavy.perturbation == Perturbation(payload_kg=40.0)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63])

@@ -35,7 +35,7 @@ class DiscreteActions:
 
     def read(self, actions: NDArray[Any]) -> Chosen:
         """What these actions (N,) are. Raises ConfigError for one that is not in the table."""
-        given = np.asarray(actions).reshape(self._num_envs)
+        given = _shaped(actions, (self._num_envs,))
         with np.errstate(invalid="ignore"):
             action = given.astype(np.int64)
         wrong = (action != given) | (action < 0) | (action >= len(self._table))
@@ -63,7 +63,7 @@ class ContinuousActions:
 
     def read(self, actions: NDArray[Any]) -> Chosen:
         """As for discrete ones. Raises ConfigError for an action that is not finite."""
-        requested = np.asarray(actions, np.float64).reshape(self._num_envs, 2)
+        requested = _shaped(actions, (self._num_envs, 2)).astype(np.float64)
         if not np.isfinite(requested).all():
             row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
             raise ConfigError(
@@ -74,6 +74,18 @@ class ContinuousActions:
         command = np.clip(requested, self.space.low, self.space.high)
         action, residual = nearest_action(self._task, command[:, 0], command[:, 1])
         return action, command, {"action": action, "action_residual": residual}
+
+
+def _shaped(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Numbers in this shape. Raises ConfigError for another number of them, or none at all."""
+    given = np.asarray(actions)
+    if given.size != np.prod(shape) or given.dtype.kind not in "biuf":
+        raise ConfigError(
+            f"actions must be numbers of shape {shape}, got {actions!r}",
+            where="the twin",
+            remedy="give one action for each environment, of env.action_space",
+        )
+    return given.reshape(shape)
 
 
 def action_space(

@@ -57,21 +57,22 @@ class EpisodeQueue(Stateful):
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
         """Shares per kind of episode, for episodes that begin from now on."""
-        unknown = set(conditions) - set(KINDS)
-        total = sum(conditions.values())
+        shares = conditions.values() if isinstance(conditions, Mapping) else ()
+        numbers = all(isinstance(share, int | float | np.number) for share in shares)
         if (
-            unknown
-            or not all(share >= 0 for share in conditions.values())
-            or not 0 < total < np.inf
+            not numbers
+            or set(conditions) - set(KINDS)
+            or not all(share >= 0 for share in shares)
+            or not 0 < sum(shares) < np.inf
         ):
             raise ConfigError(
-                f"conditions {dict(conditions)} are not shares per kind of episode",
+                f"conditions {conditions!r} are not shares per kind of episode",
                 where="the twin",
                 remedy=f"give numbers of at least 0, not all 0, for {', '.join(KINDS)}",
             )
-        shares = np.array([conditions.get(kind, 0.0) for kind in KINDS])
         self.conditions = {k: float(conditions[k]) for k in KINDS if k in conditions}
-        self._cumulative = np.cumsum(shares) / total
+        parts = np.array([self.conditions.get(kind, 0.0) for kind in KINDS])
+        self._cumulative = np.cumsum(parts) / sum(shares)
 
     def follow(self, orders: MissionOrders, share: float) -> None:
         """From now on this share of the drawn episodes is of these orders, each at its part."""

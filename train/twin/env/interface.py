@@ -14,6 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from restock.arrays import F32, Bools, Ints
+from restock.errors import ConfigError
 from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
@@ -104,3 +105,16 @@ def epsilon_greedy(
     action = np.where(explores, uniform, greedy).astype(np.int64)
     probability = epsilon / actions + (1 - epsilon) * (action == greedy)
     return action, probability.astype(np.float32)
+
+
+def refuse_other_type(
+    name: str, given: object, kind: type | tuple[type, ...], such_as: str
+) -> None:
+    """Raises ConfigError for an environment's argument that is neither None nor of its type."""
+    if given is not None and not isinstance(given, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        raise ConfigError(
+            f"{name} must be a {' or '.join(each.__name__ for each in kinds)}, got {given!r}",
+            where="the twin",
+            remedy=f"such as {name}={such_as}",
+        )

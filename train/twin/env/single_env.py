@@ -26,12 +26,14 @@ class WarehouseEnv(gymnasium.Env[F32, Any]):
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         self.render_mode = render_mode
+        self._seeded = arguments.get("seed") is not None
+        if not self._seeded:
+            arguments.pop("seed", None)
         self.vector = WarehouseVectorEnv(
             1, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **arguments
         )
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
-        self._seeded = "seed" in arguments
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

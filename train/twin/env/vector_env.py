@@ -47,7 +47,7 @@ from restock.train.twin.env.floor_report import (
     refuse_unfit,
 )
 from restock.train.twin.env.info import info_after, info_now
-from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step
+from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step, refuse_other_type
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
@@ -55,7 +55,7 @@ from restock.train.twin.env.truth import Truth
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, with_room
-from restock.train.twin.physics.perturbation import Perturbation, Schedule
+from restock.train.twin.physics.perturbation import Perturbation, Schedule, find_perturbation
 from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
@@ -85,14 +85,14 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         num_envs: int = 1,
         *,
         conditions: Mapping[str, float] | None = None,
-        perturbation: Perturbation | Schedule | None = None,
+        perturbation: Perturbation | Schedule | str | Mapping[str, Any] | None = None,
         seed: int = 0,
         nthread: int = 1,
         render_mode: str | None = None,
         task: Task | None = None,
         robot: Robot | None = None,
         warehouse: Warehouse | None = None,
-        layouts: str | Sequence[Warehouse] = DEFAULT,
+        layouts: str | Sequence[Warehouse | str] = DEFAULT,
         missions: Sequence[MissionOrder] = (),
         missions_share: float = 0.5,
         nav_command: bool = True,
@@ -105,7 +105,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         "warp" steps on MuJoCo Warp's device: see docs/mjwarp.md.
 
         A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
-        one for each such episode (fixed episodes get its base). `env.specs` tells them.
+        one for each such episode (fixed episodes get its base). `env.specs` tells them. It may be
+        the name of a shipped one, a TOML file, or a table.
 
         `robot` is a profile's, in the task's outline; None: the twin's own.
 
@@ -123,13 +124,18 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         Raises:
             ConfigError: an unknown condition, shares below 0, a floor without room for
                 a condition's episodes, a robot that cannot be built or is wider than an aisle, no
-                environments, a seed below 0, an unknown action space or render mode, or an
-                autoreset mode other than SAME_STEP and DISABLED.
+                environments, a seed below 0, an unknown action space or render mode, an argument
+                of another type, or an autoreset mode other than SAME_STEP and DISABLED.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs must be 1 or more, got {num_envs}", where="the twin")
-        if seed < 0:
-            raise ConfigError(f"seed must be 0 or more, got {seed}", where="the twin")
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ConfigError(f"seed must be 0 or more, got {seed!r}", where="the twin")
+        refuse_other_type("task", task, Task, "load_profile(FILE).task")
+        refuse_other_type("robot", robot, Robot, "load_profile(FILE).robot")
+        if isinstance(perturbation, str | Mapping):
+            perturbation = find_perturbation(perturbation, where="the twin")
+        refuse_other_type("perturbation", perturbation, (Perturbation, Schedule), '"friction"')
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(
                 f"unknown render_mode {render_mode!r}", where="the twin", remedy="give rgb_array"

@@ -183,9 +183,11 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
     return tuple(floors)
 
 
-def floors_of(layouts: str | Sequence[Warehouse]) -> tuple[Warehouse, ...]:
+def floors_of(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]:
     """Floors as they are, or as `open_floors` reads them. Raises ConfigError where names repeat."""
-    floors = open_floors(layouts) if isinstance(layouts, str) else tuple(layouts)
+    parts = [layouts] if isinstance(layouts, str) else layouts
+    opened = [open_floors(part) if isinstance(part, str) else (part,) for part in parts]
+    floors = tuple(floor for some in opened for floor in some)
     names = [floor.name for floor in floors]
     if not floors or len(set(names)) < len(names):
         raise ConfigError(
