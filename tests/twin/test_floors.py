@@ -197,6 +197,17 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
         read_map(tmp_path / "map.yaml")
 
 
+def test_a_map_with_black_and_white_exchanged_is_told_by_its_remedy(tmp_path: Path) -> None:
+    """Only its racks are free then: 2 x .7 m."""
+    pixels = np.zeros((80, 100), np.uint8)
+    pixels[30:44, 20:60] = 254
+    write_pgm(tmp_path / "map.pgm", pixels)
+    (tmp_path / "map.yaml").write_text("image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(ConfigError, match=r"is 2\.0 x 0\.7 m: not a floor") as refused:
+        read_map(tmp_path / "map.yaml")
+    assert "negate" in str(refused.value.remedy)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

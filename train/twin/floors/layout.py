@@ -31,6 +31,7 @@ HEADINGS: dict[str, tuple[int, int]] = {
 }
 DEFAULT = "default"
 ELSEWHERE = "elsewhere"
+MIN_SIDE_M = 1.0
 MAX_SIDE_M = 60.0  # a plan of a floor larger than this takes seconds
 MAX_RACKS = 400
 ROOM_M = 0.3  # half the stand-in's width and a margin: its middle comes no nearer to a rack
@@ -136,11 +137,13 @@ class Warehouse:
         """Raises ConfigError where the numbers do not make a floor."""
         where = f"layout {self.name}"
         for side in (self.width_m, self.depth_m):
-            if not 1.0 <= side <= MAX_SIDE_M:
+            if not MIN_SIDE_M <= side <= MAX_SIDE_M:
                 raise ConfigError(
-                    f"a side of {side:g} m is outside 1 to {MAX_SIDE_M:g} m",
+                    f"a side of {side:g} m is outside {MIN_SIDE_M:g} to {MAX_SIDE_M:g} m",
                     where=where,
-                    remedy="cut the floor to the part that the robots drive in",
+                    remedy="cut the floor to the part that the robots drive in"
+                    if side > MAX_SIDE_M
+                    else "give width_m and depth_m in metres",
                 )
         if len(self.racks) > MAX_RACKS:
             raise ConfigError(

@@ -25,7 +25,15 @@ from restock.train.twin.floors.cells import (
     find_goals,
     find_segments,
 )
-from restock.train.twin.floors.layout import MAX_RACKS, MAX_SIDE_M, ROOM_M, Rect, Warehouse, bays
+from restock.train.twin.floors.layout import (
+    MAX_RACKS,
+    MAX_SIDE_M,
+    MIN_SIDE_M,
+    ROOM_M,
+    Rect,
+    Warehouse,
+    bays,
+)
 from restock.train.twin.floors.places import connected, find_places, missions_way, with_missions
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -146,6 +154,13 @@ def floor_of_grid(
             f" {free.shape[1] * grid.cell_m:.1f} m, more than {MAX_SIDE_M:g} m",
             where=where,
             remedy="cut the map to the part that the robots drive in",
+        )
+    if min(free.shape) * grid.cell_m < MIN_SIDE_M:
+        raise ConfigError(
+            f"the largest part that a robot fits in is {free.shape[0] * grid.cell_m:.1f} x"
+            f" {free.shape[1] * grid.cell_m:.1f} m: not a floor",
+            where=where,
+            remedy=_NO_ROOM_REMEDY,
         )
     free, cell_m, racks = _racks(free, grid.cell_m, where, notes)
     reachable = drivable_part(free, cell_m, room_m, _cells_in(grid, visited_m, cell_m))
