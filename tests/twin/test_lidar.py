@@ -15,7 +15,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.model import passed_over
+from restock.train.twin.physics.model import pallet_half_m, passed_over
 
 needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())
 TASK = load_profile("warehouse_amr").task
@@ -162,3 +162,19 @@ def test_what_a_lidar_passes_over_is_said_with_its_height() -> None:
     assert passed_over(0.5) == []
     assert passed_over(1.0) == ["pallets (0.6 m)"]
     assert passed_over(1.9) == ["pallets (0.6 m)", "forklifts (1.2 m)", "people (1.7 m)"]
+
+
+@pytest.mark.parametrize(
+    "lidar", [LidarLimits(angle_min_rad=-1.6, angle_max_rad=1.6), LidarLimits(z_m=1.0)]
+)
+def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) -> None:
+    env = WarehouseVectorEnv(1, robot=Robot(lidar=lidar), conditions={"blocked_aisle": 1.0})
+    env.reset(seed=2)
+    x, y, yaw = env.simulation.pallets[0, 0]
+    half = pallet_half_m(np.array([yaw]))[0, 0]
+    # Backed up to a pallet, .1 m short of it.
+    env.simulation.place_robot(0, x + half + 0.35 + 0.1, y, 0.0)
+    *_, info = env.step(np.zeros(1, np.int64))
+    assert "near_collision" in info["true_condition"][0]
+    assert env.sensing.true_clearance_m[0] == pytest.approx(0.1, abs=0.02)
+    assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind

@@ -14,7 +14,7 @@ import numpy as np
 
 from restock.arrays import F64, Ints
 from restock.ingest.task.route import view_route
-from restock.ingest.task.scan import SectorMap
+from restock.ingest.task.scan import Body, SectorMap, outline_reach
 from restock.ingest.task.signals import Signals, localised_velocity, wrap_angle
 from restock.ingest.task.surroundings import (
     PLAN_PARTS,
@@ -26,11 +26,15 @@ from restock.ingest.task.surroundings import (
 )
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
+from restock.train.twin.physics.lidar import Lidar
+from restock.train.twin.physics.model import passed_over
 from restock.train.twin.physics.perturbation import Perturbation
+from restock.train.twin.physics.robot_model import LIDAR_Z_M, stand_in
 from restock.train.twin.physics.simulation import Simulation
 
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0
 DRIFT_TIME_S = 3.0
+WIDEST_GAP_RAD = np.radians(20)  # between two beams that pass nothing by
 _SCALARS = 9  # x, y, yaw, drift x, drift y, left, right, gyro, accel
 
 
@@ -41,8 +45,10 @@ class Sensing(Stateful):
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation, self.task = simulation, task
-        # Truth is told by the beams of the lidar that the twin has, also where the robot has none.
+        # Truth is told by the beams of the lidar that the twin has, also where the robot has none,
+        # if these see everything.
         self.beams = SectorMap.build(simulation.bearings_rad, max(task.sectors, 4), task.body)
+        self._around = None if _sees_everything(simulation) else _Around(simulation)
         num, steps = simulation.num_envs, task.time_limit_steps + 1
         self._noise = np.zeros((num, steps, _SCALARS + simulation.beams), np.float32)
         self._scale = np.zeros((num, _SCALARS))
@@ -99,7 +105,11 @@ class Sensing(Stateful):
         noise = self._noise[ids, step]
         scalar = noise[:, :_SCALARS] * self._scale[ids]
         true_ranges = sim.cast(ids)
-        self.true_clearance_m[ids] = np.maximum(true_ranges - self.beams.reach_m, 0.0).min(axis=1)
+        if self._around is None:
+            room = true_ranges - self.beams.reach_m
+        else:
+            room = self._around.room_m(ids)
+        self.true_clearance_m[ids] = np.maximum(room, 0.0).min(axis=1)
         beam = noise[:, _SCALARS:].astype(np.float64)
         lost = np.abs(beam) > self._dropout_beyond[ids, None]
         ranges = np.maximum(true_ranges + beam * self._range_noise_m[ids, None], 0.0)
@@ -160,6 +170,29 @@ class Sensing(Stateful):
             return
         signals["came_nearer_m"] = came_nearer(self.task, signals, self.scanned)
         self.scanned = [{name: signals[name].copy() for name in SCANNED}, *self.scanned[:-1]]
+
+
+class _Around:
+    """The room around robots whose own lidar does not see all around, or over what stands there."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        body, bearings = simulation.task.body, np.array(stand_in(simulation.task.body).bearings_rad)
+        self._simulation = simulation
+        self._reach_m = outline_reach(bearings, Body(body.length_m, body.width_m))
+        self._lidar = Lidar(simulation.batch, simulation.scenery, bearings, LIDAR_Z_M)
+
+    def room_m(self, ids: Ints) -> F64:
+        """From the outlines (n,) to what is nearest along each bearing, (n, beams)."""
+        middle = self._simulation.middle(self._simulation.pose()[ids])
+        ranges: F64 = self._lidar.ranges(ids, middle[:, :2], middle[:, 2]) - self._reach_m
+        return ranges
+
+
+def _sees_everything(simulation: Simulation) -> bool:
+    """Whether no bearing is far from a beam, and none passes over what stands on a floor."""
+    bearings = np.sort(simulation.bearings_rad % (2 * np.pi))
+    widest = np.diff(bearings, append=bearings[0] + 2 * np.pi).max()
+    return bool(widest < WIDEST_GAP_RAD) and not passed_over(simulation.robot.lidar_z_m)
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
