@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from restock.ingest.steps.align import NS
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task
-from restock.train.twin.physics.simulation import BLOCK_S, _block_s
+from restock.train.twin.physics.simulation import blocks_of
 
 PACES = [0.5, 0.9, 0.97, 1.0, 1.1]
 
@@ -279,8 +278,7 @@ def test_every_proposed_period_is_one_that_the_twin_can_drive() -> None:
         task = Task(
             body=Body(0.6, 0.5), actions=((0.0, 0.0), (0.4, 0.0)), control_period_s=proposed
         )
-        blocks = math.ceil(proposed / BLOCK_S - 1e-9)
-        assert _block_s(task, 0.01, blocks) * blocks == pytest.approx(proposed)
+        assert np.prod(blocks_of(task, 0.01)) == pytest.approx(proposed)
     for kept in (0.08, 0.1, 0.12, 0.2, 0.3, 0.5):
         assert drivable(kept) == kept
     # Of commands a fifth of a second apart .21 s were proposed, which no log of theirs can follow.

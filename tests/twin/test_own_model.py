@@ -149,3 +149,10 @@ def test_the_verb_says_what_is_built_and_driven(
     assert printed["robot"]["mass_kg"] == pytest.approx(24.0)
     fast = next(row for row in printed["driven"] if row["speed_mps"] == 1.0)
     assert fast["driven_mps"] == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_verb_refuses_a_control_period_that_the_twin_cannot_drive(tmp_path: Path) -> None:
+    text = profile_toml(AMR).replace("control_period_s = 0.2", "control_period_s = 0.033")
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"control_period_s = 0\.033 is not some physics"):
+        RobotCommand(str(tmp_path / "mine.toml")).run()

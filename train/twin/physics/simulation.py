@@ -97,8 +97,7 @@ class Simulation(Stateful):
         self.robot = robot = robot or stand_in(task.body, beams)
         self.beams = len(robot.bearings_rad)
         self.timestep_s = timestep_s
-        self.blocks = max(math.ceil(task.control_period_s / BLOCK_S - 1e-9), 1)
-        self.block_s = _block_s(task, timestep_s, self.blocks)
+        self.blocks, self.block_s = blocks_of(task, timestep_s)
         self.substeps = round(self.block_s / timestep_s)
         slots = max(len(floor.racks) for floor in floors)
         self.model, self.handles = build_model(floors[0], robot, timestep_s, slots)
@@ -359,17 +358,19 @@ def _batch(physics: Physics) -> Any:
     raise ConfigError(f"unknown physics {physics!r}", where="the twin", remedy="use mujoco or warp")
 
 
-def _block_s(task: Task, timestep_s: float, blocks: int) -> float:
-    """The length of a block: `BLOCK_S` where periods are some of these, else a part of a period.
+def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
+    """The blocks of a control period and their length: `BLOCK_S` where periods are some of these,
+    else a part of a period.
 
     Raises:
         ConfigError: it is not some timesteps.
     """
     period_s = task.control_period_s
+    blocks = max(math.ceil(period_s / BLOCK_S - 1e-9), 1)
     whole = abs(blocks * BLOCK_S - period_s) < 1e-9
     block_s = BLOCK_S if whole else period_s / blocks
     if abs(round(block_s / timestep_s) * timestep_s - block_s) < 1e-9:
-        return block_s
+        return blocks, block_s
     if whole:
         raise ConfigError(
             f"timestep_s = {timestep_s} does not divide {BLOCK_S} s",

@@ -34,7 +34,13 @@ class RobotCommand:
         from restock.ingest.profile.profile import load_profile
         from restock.ingest.task.robot import refuse_beyond_steering
         from restock.train.twin.physics.model import passed_over
-        from restock.train.twin.physics.robot_trial import driven_actions, measured, robot_model
+        from restock.train.twin.physics.robot_trial import (
+            TIMESTEP_S,
+            driven_actions,
+            measured,
+            robot_model,
+        )
+        from restock.train.twin.physics.simulation import blocks_of
 
         if not 0.04 <= self.friction <= 1.6:
             raise ConfigError(
@@ -42,6 +48,7 @@ class RobotCommand:
             )
         profile = load_profile(self.profile)
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
+        blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot drive
         model = robot_model(profile.robot, profile.task.body)
         facts = measured(model, profile.robot)
         driven = [
