@@ -62,7 +62,7 @@ test-lowest: .venv-lowest/.ready
 .venv-lowest/.ready: pyproject.toml $(VENV)/.runtime
 	$(PYTHON) -m venv .venv-lowest
 	PYTHONPATH=tests $(BIN)/python -m support.lowest > .venv-lowest/constraints.txt
-	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test]'
+	.venv-lowest/bin/pip install --quiet --disable-pip-version-check -c .venv-lowest/constraints.txt -e '.[test,onnx]'
 	@touch $@
 
 # d3rlpy pins an old gymnasium and lerobot a CUDA torch: the tests that read exports back with the
