@@ -279,3 +279,9 @@ def test_a_dotted_key_is_set_where_it_stands() -> None:
     text = "replay.ring_capacity = 5 # five\n[env]\nnum_envs = 2\n"
     changed = with_value(text, "replay.ring_capacity", 7, where="test")
     assert changed == text.replace("= 5", "= 7")
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "mix.toml"
+    path.write_text('name = "a"\n', encoding="utf-8-sig")
+    assert read_toml(path) == {"name": "a"}
