@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,9 @@ def test_a_map_in_the_bag_becomes_a_floor_that_is_driven_on(
     assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.txt")]) == 2
     assert "'a.txt' does not end in .png" in capsys.readouterr().err
     assert main([*arguments, "--footprint", "0.6x0.5", "--png", str(tmp_path / "a.png")]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"map_origin +-2\.8, 2\.2, ", shown)
+    assert re.search(r"one_way_rules +0$", shown, re.MULTILINE)
     floor = read_floor(tmp_path / "floor.toml")
     assert (floor.width_m, floor.depth_m) == pytest.approx((8.6, 6.6))
     assert floor.map_origin == pytest.approx((-2.8, 2.2, 0.0))

@@ -176,9 +176,11 @@ class LayoutCommand:
 
 def _show(name: str, facts: dict[str, Any]) -> None:
     from restock.cli import output
+    from restock.cli.table_layout import cell
 
     notes = facts.get("notes", [])
     rows = {key: value for key, value in facts.items() if key not in ("notes", "elsewhere")}
-    output.print_table([{"": key, name: str(value)} for key, value in rows.items()])
+    texts = {key: value if isinstance(value, str) else cell(value) for key, value in rows.items()}
+    output.print_table([{"": key, name: text} for key, text in texts.items()])  # to the left
     for note in notes:
         output.stdout().print(f"- {note}", markup=False, soft_wrap=True)
