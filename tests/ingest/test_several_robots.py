@@ -12,6 +12,7 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.roles import choose_robot, robots_in, usable_topics
+from restock.ingest.propose.propose import propose_profile
 
 NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")
 
@@ -49,6 +50,18 @@ def test_the_profile_is_of_the_robot_that_was_named(
     said = next(one["text"] for one in document["advice"] if one["key"] == "inputs")
     assert said.startswith(f"of the robot {robot}, one of 2 in the recording: ")
     assert f"`restock profile new --robot NAME` proposes another profile, for {other}," in said
+
+
+def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path: Path) -> None:
+    short, whole = typed_topics(Drive(duration_s=2.0)), typed_topics(Drive(duration_s=3.0))
+    topics = {f"/robot{n}{name}": short[name] for name in NEEDED for n in (1, 2)}
+    topics |= {name: whole[name] for name in ("/odom", "/amcl_pose")}  # with more messages
+    with open_recording(write_topics(topics, tmp_path / "fleet")) as recording:
+        choose_robot(recording, "robot1")
+        assert recording.topics["/odom"].expected > recording.topics["/robot1/odom"].expected
+        inputs = parse_profile(propose_profile(recording, "p").toml, where="p").inputs
+    assert inputs.wheels is not None
+    assert (inputs.pose.topic, inputs.wheels.topic) == ("/robot1/amcl_pose", "/robot1/odom")
 
 
 def test_a_robot_whose_topics_have_names_of_their_own_can_be_named(tmp_path: Path) -> None:

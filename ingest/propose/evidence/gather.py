@@ -53,6 +53,7 @@ from restock.ingest.propose.evidence.roles import (
     Roles,
     node_topics,
     other_robots_topics,
+    robots_in,
     topics_for,
     usable_topics,
 )
@@ -105,10 +106,11 @@ def gather(
 ) -> Evidence:
     """What a recording says of its robot."""
     topics, others = usable_topics(recording), other_robots_topics(recording)
-    roles = {role: topics_for(topics, kinds) for role, kinds in KINDS.items()}
+    own = "".join(f"{robot}/" for robot in robots_in(recording)[:1])
+    roles = {role: topics_for(topics, kinds, own) for role, kinds in KINDS.items()}
     chosen = CommandChoice()
     if not roles["command"] and odometry_as_command:
-        roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND)
+        roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND, own)
     else:
         if len(roles["command"]) > 1:  # an arm on the robot may have its own
             roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
