@@ -47,6 +47,8 @@ def test_importing_restock_is_enough_to_reach_a_room() -> None:
 
 @pytest.mark.parametrize("face", ROOMS)
 def test_a_name_is_what_type_checkers_see(face: str) -> None:
+    if face == "restock.train":  # which has names for its learners
+        pytest.importorskip("stable_baselines3")
     module = importlib.import_module(face)
     seen = imported(face)
     assert sorted(name for names in seen.values() for name in names) == module.__all__

@@ -367,6 +367,7 @@ def test_lerobot_reads_its_data_set(
 def test_lerobots_layout_is_complete_without_lerobot(
     store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("pandas")  # the table of tasks is one of its own
     monkeypatch.setattr("restock.replay.export.lerobot_v3.DATA_FILE_MB", 0.05)  # several files
     monkeypatch.setattr("restock.replay.export.lerobot_v3.CHUNK_FILES", 2)
     out = tmp_path / "a"
@@ -472,6 +473,7 @@ def test_what_cannot_be_exported_is_refused(
 def test_an_export_ends_before_hdf5_would_crash_on_a_full_disk(
     to: str, store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip(FORMATS[to][1])
     free = iter([10**10, 10**10, 2**20])  # less, an episode after the other
     monkeypatch.setattr(
         "shutil.disk_usage", lambda path: SimpleNamespace(free=next(free), path=path)

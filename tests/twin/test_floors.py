@@ -177,7 +177,7 @@ def png_header(width: int, height: int) -> bytes:
     ("data", "message"),
     [
         (b"\x89PNG", "is not a PGM"),
-        (b"P5\n4 4\n255\nab", "truncated"),
+        (b"P5\n4 4\n255\nab", "truncated|not large enough"),
         (b"P5\n99999 99999\n255\n", "more than 40,000,000 pixels"),
         (b"P5\n9000 9000\n255\n", "9,000 x 9,000 pixels"),
         (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
