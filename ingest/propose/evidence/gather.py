@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import MOTION
 from restock.ingest.propose.driven.command_hold import (
     CommandHold,
@@ -50,10 +51,11 @@ from restock.ingest.propose.evidence.roles import (
     ODOMETRY_AS_COMMAND,
     REQUIRED,
     SPENT,
+    Kind,
     Roles,
     node_topics,
     other_robots_topics,
-    robots_in,
+    own_first,
     topics_for,
     usable_topics,
 )
@@ -106,11 +108,15 @@ def gather(
 ) -> Evidence:
     """What a recording says of its robot."""
     topics, others = usable_topics(recording), other_robots_topics(recording)
-    own = "".join(f"{robot}/" for robot in robots_in(recording)[:1])
-    roles = {role: topics_for(topics, kinds, own) for role, kinds in KINDS.items()}
+
+    def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
+        found = topics_for(topics, kinds)
+        return [fit for _, fit in own_first(recording, [(fit[0].name, fit) for fit in found])]
+
+    roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
     chosen = CommandChoice()
     if not roles["command"] and odometry_as_command:
-        roles["command"] = topics_for(topics, ODOMETRY_AS_COMMAND, own)
+        roles["command"] = fitting(ODOMETRY_AS_COMMAND)
     else:
         if len(roles["command"]) > 1:  # an arm on the robot may have its own
             roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))

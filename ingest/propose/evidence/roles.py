@@ -327,10 +327,9 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
 
 
 def topics_for(
-    topics: dict[str, TopicInfo], kinds: tuple[Kind, ...], own: str = ""
+    topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:
-    """The topics that may fill an input, best first: by kind, by name, by messages; before all
-    others those whose names begin with `own`, the namespace of one robot of several."""
+    """The topics that may fill an input, best first: by kind, by name, by messages."""
     fitting = []
     for rank, kind in enumerate(kinds):
         for topic in topics.values():
@@ -340,8 +339,7 @@ def topics_for(
             later = any(word in name for word in kind.rather)
             if topic.type == kind.type and not against and (named or not kind.must):
                 place = min(named, default=len(kind.words))
-                order = (later, rank, place, -topic.expected, topic.name)
-                fitting.append(((not topic.name.startswith(own), *order), topic, kind))
+                fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
 
 
