@@ -7,7 +7,6 @@ arXiv:2412.07762). Read `_train` from top to bottom: it is the whole of it.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -35,6 +34,7 @@ from restock.train.feed.teacher import TeacherFailed
 from restock.train.finite import check_loss, check_parameters
 from restock.train.guard import enforce, falls
 from restock.train.jump_start import POLICIES
+from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
 from restock.train.update_blocks import Made
@@ -87,9 +87,7 @@ def train(
     except TeacherFailed as error:
         _save(session)
         session.write_held()
-        again = (
-            f"; then continue with `restock train --resume {shlex.quote(str(session.run.path))}`"
-        )
+        again = f"; then continue with {resuming(session.run.path)}"
         raise TeacherFailed(
             f"{error.what}; a checkpoint was written",
             where=error.where,
@@ -491,5 +489,5 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
             f"interrupted after {session.progress.env_steps:,} environment steps and"
             f" {session.learner.gradient_steps:,} updates; a checkpoint was written",
             where=str(session.run.path),
-            remedy=f"continue with `restock train --resume {shlex.quote(str(session.run.path))}`",
+            remedy=f"continue with {resuming(session.run.path)}",
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +20,7 @@ from restock.train.dqn.learner import greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
-from restock.train.run.run import Run
+from restock.train.run.run import Run, resuming
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Policy
 
@@ -78,7 +77,7 @@ def load_agent(run: Run) -> GreedyPolicy:
         raise RunError(
             "has not kept a policy yet: it stopped before its first evaluation",
             where=str(run.path),
-            remedy=f"continue it with `restock train --resume {shlex.quote(str(run.path))}`",
+            remedy=f"continue it with {resuming(run.path)}",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
     state = load_kept(run)

@@ -216,9 +216,13 @@ def check_free(path: Path) -> None:
         raise RunError(
             "already exists",
             where=str(path),
-            remedy="choose another --out, remove it, or continue it with"
-            f" `restock train --resume {shlex.quote(str(path))}`",
+            remedy=f"choose another --out, remove it, or continue it with {resuming(path)}",
         )
+
+
+def resuming(path: Path) -> str:
+    """The command that continues a run, to be pasted in a shell."""
+    return f"`restock train --resume {shlex.quote(str(path))}`"
 
 
 def software_versions() -> dict[str, str]:

@@ -324,7 +324,7 @@ class StudyPlan:
         return request
 
 
-def refuse_changed(plan: StudyPlan) -> None:
+def check_jobs(plan: StudyPlan) -> None:
     """Raises RunError where a finished run was made as the study does not ask any more; ConfigError
     where one that is still to do has no panel, which would be found after those before it."""
     for job in plan.jobs:
@@ -370,7 +370,7 @@ __all__ = [
     "StudyEvaluation",
     "StudyJob",
     "StudyPlan",
+    "check_jobs",
     "check_seeds",
     "load_study",
-    "refuse_changed",
 ]

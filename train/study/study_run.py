@@ -30,7 +30,7 @@ from restock.train.study.study import (
     StudyEvaluation,
     StudyJob,
     StudyPlan,
-    refuse_changed,
+    check_jobs,
 )
 
 Say = Callable[[str], None]
@@ -57,7 +57,7 @@ def run_study(
         if arm.library is not None:
             check_installed()
             resolve(tuple(plan.settings(arm, plan.study.seeds[0])), arm.library)
-    refuse_changed(plan)
+    check_jobs(plan)
     for arm in plan.study.arms:
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]

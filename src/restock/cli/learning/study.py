@@ -76,7 +76,7 @@ class StudyCommand:
         from restock.toml import read_toml
         from restock.train.study.findings import findings, power_of, too_small
         from restock.train.study.page import as_markdown, power_sentence
-        from restock.train.study.study import StudyPlan, load_study, refuse_changed
+        from restock.train.study.study import StudyPlan, check_jobs, load_study
         from restock.train.study.study_run import run_study
 
         if self.workers < 1:
@@ -107,7 +107,7 @@ class StudyCommand:
         if small := too_small(plan, power):
             say(small)
         if self.dry_run:
-            refuse_changed(plan)
+            check_jobs(plan)
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
                 for pair in plan.study.pairs

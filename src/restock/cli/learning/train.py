@@ -113,6 +113,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     from restock.train.describe import describe_run, nothing_to_do
     from restock.train.flush_fresh import flush
     from restock.train.loop import TrainingInterrupted, train
+    from restock.train.run.run import resuming
 
     config = prepared.config
     session = prepared.open()
@@ -154,7 +155,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     if kept
                     else "ended at once, before its first checkpoint",
                     where=str(path),
-                    remedy=f"continue with `restock train --resume {shlex.quote(str(path))}`"
+                    remedy=f"continue with {resuming(path)}"
                     if kept
                     else "remove it, and train again",
                 ) from None
