@@ -162,6 +162,7 @@ def test_the_command_line_names_cameras(
     export = ["export", str(store_path), "--out", str(tmp_path / "a"), "--to"]
     assert cli.main([*export, "lerobot", "--cameras", "front"]) == ExitCode.OK
     assert "observation.images.front: 29 pictures as they were recorded" in capsys.readouterr().out
+    pytest.importorskip("minari")
     assert cli.main([*export, "minari", "--cameras", "front"]) == ExitCode.USAGE
     assert "holds no images" in capsys.readouterr().err
 

@@ -12,10 +12,12 @@ from pathlib import Path
 import gymnasium
 import msgspec
 import numpy as np
+import PIL
 import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from packaging.version import Version
 from scipy.sparse import csgraph
 
 import restock  # noqa: F401 - registers the environment
@@ -50,6 +52,9 @@ from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
 
 SEEDS = st.integers(0, 10_000)
+SAYS_TRUNCATED = pytest.mark.skipif(
+    Version(PIL.__version__) < Version("13"), reason="Pillow before 13 says it in other words"
+)
 KINDS_OF_FLOOR = st.sampled_from(sorted(RECIPES))
 
 
@@ -177,7 +182,7 @@ def png_header(width: int, height: int) -> bytes:
     ("data", "message"),
     [
         (b"\x89PNG", "is not a PGM"),
-        (b"P5\n4 4\n255\nab", "truncated|not large enough"),
+        pytest.param(b"P5\n4 4\n255\nab", "truncated", marks=SAYS_TRUNCATED),
         (b"P5\n99999 99999\n255\n", "more than 40,000,000 pixels"),
         (b"P5\n9000 9000\n255\n", "9,000 x 9,000 pixels"),
         (b"P5\n7900 7900\n255\n", "7,900 x 7,900 pixels"),  # by the header: no pixel follows
