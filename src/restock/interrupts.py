@@ -63,12 +63,16 @@ def went_on_after_interrupt() -> None:
 @contextmanager
 def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
     """A process that must not outlive the block: where the block fails it is interrupted, once, and
-    waited for. It needs a session of its own, or Ctrl-C reaches it from the terminal too."""
+    waited for. It needs a session of its own, or Ctrl-C reaches it from the terminal too.
+
+    It is interrupted by a kill (see `kill_as_interrupt`): in the background of a script Ctrl-C is
+    ignored, and so it is in what is started there.
+    """
     _running.add(process)
     try:
         yield
     except BaseException:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         process.wait()
         raise
     finally:
@@ -78,7 +82,7 @@ def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
 def interrupt_running() -> None:
     """Interrupt those that other threads wait for: no interrupt reaches a thread."""
     for process in list(_running):
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

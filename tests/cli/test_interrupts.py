@@ -52,9 +52,18 @@ def test_a_kill_does_what_ctrl_c_does_at_that_moment(number: int) -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_process_ends_with_the_block_that_waits_for_it_and_from_another_thread() -> None:
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_process_ends_with_the_block_that_waits_for_it_and_from_another_thread(
+    ctrl_c: Any,
+) -> None:
+    """Also where Ctrl-C is ignored, as in the background of a script."""
+
     def waiting() -> subprocess.Popen[bytes]:
-        process = subprocess.Popen(WAITS, stdout=subprocess.PIPE, start_new_session=True)
+        before = signal.signal(signal.SIGINT, ctrl_c)
+        try:
+            process = subprocess.Popen(WAITS, stdout=subprocess.PIPE, start_new_session=True)
+        finally:
+            signal.signal(signal.SIGINT, before)
         assert process.stdout is not None
         process.stdout.readline()
         return process

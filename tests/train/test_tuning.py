@@ -182,7 +182,7 @@ def test_what_ends_the_search_reaches_the_training_once(
         assert signal.getsignal(ended_by) == usual
     finally:
         signal.signal(ended_by, before)
-    assert signals == [signal.SIGINT]
+    assert signals == [signal.SIGTERM]
 
 
 def test_a_trial_is_told_of_the_evaluations_of_its_training(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from restock.files import write_text
 from restock.imports import installed
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
+from restock.interrupts import kill_as_interrupt
 from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
 from restock.train.dqn.network import QNetwork, make_network
 from restock.train.dqn.target import Hard, describe
@@ -219,7 +220,8 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
 def main(words: list[str]) -> int:
     """`python -m restock.train.libraries.library_arm JSON`: one run, in a process of its own."""
     try:
-        train_library(msgspec.json.decode(words[0], type=LibraryArm))
+        with kill_as_interrupt():
+            train_library(msgspec.json.decode(words[0], type=LibraryArm))
     except RestockError as error:
         sys.stderr.write(f"error: {error}\n")
         return int(error.exit_code)
