@@ -2,9 +2,8 @@
 
 Opening a panel always checks the header's seal, and of every file its size and a sample of its
 blocks, which costs a few milliseconds whatever its size. Checking every byte is `verify`. The
-checksum of a file is blake2b in tree mode (RFC 7693; "BLAKE2: simpler, smaller, fast as MD5",
-section 2.10): one leaf for each stretch of it, and a root over all leaves. So stretches are hashed
-as they are written, in any order, and by several threads.
+checksum of a file is the BLAKE3 of the BLAKE3s of its leaves, stretches of equal length: so they
+are hashed as they are written, in any order, and by several threads.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+from blake3 import blake3
 
 from restock.errors import PanelError
 
@@ -31,9 +31,9 @@ class FileRecord(msgspec.Struct, frozen=True):
     """Size and checksums of one file, when it was written."""
 
     bytes: int
-    blake2b: str  # of all of it
+    blake3: str  # of all of it, by leaves
     sample: str  # of some blocks of it
-    leaf_bytes: int = 0  # of each leaf of `blake2b`; 0: it has no leaves (an older Restock)
+    leaf_bytes: int  # of each leaf
 
     @classmethod
     def of(cls, path: Path) -> FileRecord:
@@ -56,7 +56,7 @@ class FileRecord(msgspec.Struct, frozen=True):
             )
         actual, expected = sample_checksum(path), self.sample
         if verify and actual == expected:
-            actual, expected = checksum(path, self.leaf_bytes), self.blake2b
+            actual, expected = checksum(path, self.leaf_bytes), self.blake3
         if actual != expected:
             raise PanelError(
                 f"its checksum is {actual}, not {expected}: it was changed or damaged",
@@ -80,39 +80,20 @@ class Leaves:
 
     def add(self, number: int, content: bytes | memoryview) -> None:
         """Hash the content of one leaf."""
-        last = number == self.count - 1
-        self._digests[number] = self._hash(content, offset=number, depth=0, last=last)
+        self._digests[number] = blake3(content).digest(DIGEST_BYTES)
 
     def root(self) -> str:
         """The checksum, 32 hex digits, of leaves that were all added."""
-        return self._hash(b"".join(self._digests), offset=0, depth=1, last=True).hex()
+        return blake3(b"".join(self._digests)).hexdigest(DIGEST_BYTES)
 
     def record(self, path: Path) -> FileRecord:
         """Of a file whose leaves were all added."""
         size, sample = path.stat().st_size, sample_checksum(path)
         return FileRecord(size, self.root(), sample, self._leaf_bytes)
 
-    def _hash(self, content: bytes | memoryview, *, offset: int, depth: int, last: bool) -> bytes:
-        return hashlib.blake2b(
-            content,
-            digest_size=DIGEST_BYTES,
-            fanout=0,
-            depth=2,
-            leaf_size=self._leaf_bytes,
-            node_offset=offset,
-            node_depth=depth,
-            inner_size=DIGEST_BYTES,
-            last_node=last,
-        ).digest()
-
 
 def checksum(path: Path, leaf_bytes: int) -> str:
-    """blake2b of a file's content, 32 hex digits; `leaf_bytes` as `FileRecord` has them."""
-    if not leaf_bytes:
-        with path.open("rb") as file:
-            return hashlib.file_digest(
-                file, lambda: hashlib.blake2b(digest_size=DIGEST_BYTES)
-            ).hexdigest()
+    """BLAKE3 of a file's content by its leaves of `leaf_bytes`, 32 hex digits."""
     leaves = Leaves(path.stat().st_size, leaf_bytes)
     descriptor = os.open(path, os.O_RDONLY)
 
@@ -171,7 +152,9 @@ def unseal(content: bytes, kind: type[T], where: Path) -> T:
         header = msgspec.convert(values, kind)
     except (msgspec.DecodeError, ValueError) as error:
         raise PanelError(
-            f"its header cannot be read: {error}", where=str(where), remedy=AGAIN
+            f"its header is damaged, or of another version of Restock: {error}",
+            where=str(where),
+            remedy=AGAIN,
         ) from error
     if given_seal != _seal_of(values):
         raise PanelError(

@@ -480,7 +480,7 @@ def test_what_is_no_panel_is_said_to_be_none(tmp_path: Path) -> None:
     with pytest.raises(PanelError, match="not a panel"):
         Panel.open(tmp_path)
     (tmp_path / "panel.json").write_text('{"id": 3}')
-    with pytest.raises(PanelError, match="header cannot be read"):
+    with pytest.raises(PanelError, match="header is damaged, or of another version"):
         Panel.open(tmp_path)
 
 

@@ -62,8 +62,8 @@ def test_a_changed_byte_of_the_panel_is_refused_before_anything_is_written(
         rows.write_bytes(whole)
     assert main(["train", "--panel", str(panel), "--out", str(out), *TINY]) == 0
     header = json.loads((panel / "panel.json").read_text())
-    recorded = json.loads((out / "config.json").read_text())["panel"]["blake2b"]
-    assert recorded == {name: file["blake2b"] for name, file in header["files"].items()}
+    recorded = json.loads((out / "config.json").read_text())["panel"]["blake3"]
+    assert recorded == {name: file["blake3"] for name, file in header["files"].items()}
 
     # Going on reads them again, so they are checked again.
     rows.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])

@@ -253,7 +253,7 @@ def panel_document(panel: Panel) -> dict[str, Any]:
         "n_step": panel.n_step,
         "discount": panel.discount,
         "labels_version": header.labels_version,
-        "blake2b": {name: record.blake2b for name, record in header.files.items()},
+        "blake3": {name: record.blake3 for name, record in header.files.items()},
     }
 
 
