@@ -31,7 +31,8 @@ _REFUSED = {
     "PARAMETER": "it contains a parameter",
     "POSITIONAL_REFERENCE": "it refers to a column by position: use its name",
 }
-_UNBALANCED = "its brackets do not match: a condition must be one expression over the steps"
+_BRACKETS = "its brackets do not match"
+_UNBALANCED = f"{_BRACKETS}: a condition must be one expression over the steps"
 # Macros of DuckDB's own that compute from their arguments alone; the others look around.
 _MACROS = ("list_", "array_")
 _MORE_MACROS = {
@@ -218,10 +219,25 @@ def _changing() -> frozenset[str]:
 
 
 @lru_cache(maxsize=1024)
+def not_an_expression(sql: str) -> str | None:
+    """Why this is no SQL that may stand between brackets of ours, or None."""
+    with sandbox().cursor() as connection:
+        query = "SELECT json_serialize_sql(?::VARCHAR), json_serialize_sql(?::VARCHAR)"
+        both = [f"SELECT ({sql}\n)", f"SELECT [{sql}\n]"]  # as in `refusal`
+        ((text, other),) = connection.execute(query, both).fetchall()
+    parsed, in_square = json.loads(text), json.loads(other)
+    if not in_square["error"]:
+        return None
+    if not parsed["error"]:
+        return f"{_BRACKETS}: it must be one expression"
+    return f"its SQL cannot be read: {str(parsed['error_message']).splitlines()[0]}"
+
+
+@lru_cache(maxsize=1024)
 def not_repeatable(sql: str) -> str | None:
     """What in an expression may come out otherwise on the same rows, or None.
 
-    SQL that cannot be read is DuckDB's to refuse.
+    SQL that cannot be read is `not_an_expression`'s to refuse.
     """
     with sandbox().cursor() as connection:
         query = "SELECT json_serialize_sql(?::VARCHAR)"

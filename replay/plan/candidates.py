@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Bools, Codes
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
-from restock.ingest.task.condition_sql import not_repeatable
+from restock.ingest.task.condition_sql import not_an_expression, not_repeatable
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.rows_in_order import RowsInOrder
@@ -79,6 +79,8 @@ def read_candidates(
             state = (f"stratum {stratum.name!r}", stratum.state_predicate)
             predicates[f"state_{index}"] = state
     for place, sql in predicates.values():
+        if reason := not_an_expression(sql):
+            raise ConfigError(reason, where=f"mixture, {place}")
         if reason := not_repeatable(sql):
             raise ConfigError(
                 f"its SQL could choose other rows when it is mixed again: {reason}",

@@ -147,6 +147,21 @@ def test_sql_that_only_fails_on_rows_is_named_too(transitions: pa.Table, sql: st
 
 
 @pytest.mark.parametrize(
+    ("sql", "why"),
+    [
+        ("step_index > 3) OR (true", "its brackets do not match"),
+        ("(step_index > 3", "its SQL cannot be read"),
+        ("step_index > 3; SELECT 1", "its SQL cannot be read"),
+    ],
+)
+def test_sql_that_is_not_one_expression_is_refused(
+    transitions: pa.Table, sql: str, why: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^mixture, `where`: {why}"):
+        planned(transitions, f'where = "{sql}"\n' + EVERY)
+
+
+@pytest.mark.parametrize(
     ("sql", "name"),
     [
         ("random() < .5", "random"),
