@@ -52,7 +52,7 @@ class OtherStore(Checked, frozen=True):
     def check(self) -> None:
         _check_rates(self.represents)
         _require(
-            bool(self.name) and "/" not in self.name, f"not a valid name for a store: {self.name!r}"
+            bool(self.name) and "/" not in self.name, f"name {self.name!r} is not one for a store"
         )
         _require(
             self.name not in ("logs", "fresh"), f"a store cannot be called {self.name!r}: taken"
@@ -219,7 +219,10 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
 
     def check(self) -> None:
         name = getattr(self, "name", "each_condition")
-        _require(self.floor <= self.cap, f"{name!r} needs floor <= cap")
+        _require(
+            self.floor <= self.cap,
+            f"floor of {name!r} is {self.floor:g}, above its cap of {self.cap:g}",
+        )
         _require(
             self.unit == "episode" or self.min_steps == 1,
             f'min_steps of {name!r} applies to episodes: it needs unit = "episode"',
@@ -237,9 +240,9 @@ class StratumRule(StratumLimits, frozen=True, kw_only=True):
 
     def check(self) -> None:
         super().check()
-        _require(bool(self.name), "a stratum needs a name")
+        _require(bool(self.name), "name is empty: a stratum needs a name")
         if isinstance(share := self.share, int | float):
-            said = f"the share of {self.name!r} is {share:g}"
+            said = f"share of {self.name!r} is {share:g}"
             _require(share >= self.floor, f"{said}, below its floor of {self.floor:g}")
             _require(share <= self.cap, f"{said}, above its cap of {self.cap:g}")
 

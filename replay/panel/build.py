@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from restock import __version__
 from restock.errors import PanelError, StoreError
-from restock.files import building
+from restock.files import building, expect_place
 from restock.ingest.store.location import Location
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
@@ -141,6 +141,7 @@ def build_panel(
         ConfigError, MixtureError, StoreError: see `plan_panel`.
         PanelError: `out` already exists.
     """
+    check_free(Path(out), force)
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
         plan = plan_panel(source.connection, mixture, source.conditions, source.others)
         return write_panel(source, plan, out, force=force, advance=advance)
@@ -160,7 +161,7 @@ def write_panel(
     packed.
     """
     out = Path(out)
-    _check_free(out, force)
+    check_free(out, force)
     with building(out) as partial, _enough_memory():
         scratch = partial / "scratch"
         scratch.mkdir()
@@ -221,13 +222,28 @@ def _address(store: str) -> str:
     return str(place if place.folder is None else place.folder.resolve())
 
 
-def _check_free(out: Path, force: bool) -> None:
+def check_free(out: Path, force: bool) -> None:
+    """Raises PanelError when something is at `out` that may not be replaced, or when no panel can
+    be made there."""
+    expect_place(out, PanelError)
     is_panel = (out / HEADER).is_file()
     if out.exists() and not (force and is_panel):
         raise PanelError(
             "already there",
             where=str(out),
             remedy="choose another --out" + ("; --force replaces a panel" if is_panel else ""),
+        )
+    foreign = (
+        sorted({item.name for item in out.iterdir()} - {HEADER, ROWS, META, EVALUATION_SPLIT})
+        if is_panel
+        else []
+    )
+    if foreign:
+        raise PanelError(
+            f"would be replaced with what is in it beside the panel: {', '.join(foreign[:3])}"
+            + (" …" if len(foreign) > 3 else ""),
+            where=str(out),
+            remedy="move that away, or choose another --out",
         )
 
 

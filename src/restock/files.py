@@ -136,6 +136,36 @@ def refuse_folder(path: Path | None, option: str) -> None:
         )
 
 
+# What marks a folder that Restock writes, and its name for people.
+_MARKS = {
+    "panel.json": "the panel",
+    "transitions/_delta_log": "the store",
+    "progress.parquet": "the run",
+}
+
+
+def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
+    """Refuse a place where no new folder can be made, or where one would be lost with another.
+
+    Raises:
+        RestockError: (of the kind `error`) a file or a folder without permission is in the way; or
+            it lies within a panel, a store or a run, and goes where that is replaced or removed.
+    """
+    absolute = path.absolute()
+    parent = next(folder for folder in absolute.parents if folder.exists())
+    why = None
+    if not parent.is_dir():
+        why = f"cannot be made: {parent} is a file"
+    elif not os.access(parent, os.W_OK | os.X_OK):
+        why = f"cannot be made: {parent} may not be written"
+    for folder in absolute.parents:
+        for mark, kind in _MARKS.items():
+            if (folder / mark).exists():
+                why = f"is within {kind} {folder}: what replaces or removes that removes this, too"
+    if why is not None:
+        raise error(why, where=str(path), remedy="choose another --out")
+
+
 def _temporary(path: Path, *, replaces: bool = True) -> Path:
     if replaces and path.is_dir():  # said of the path itself: not, later, of the file beside it
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -205,6 +235,7 @@ def is_running(process: int) -> bool:
 
 __all__ = [
     "building",
+    "expect_place",
     "first_line",
     "is_running",
     "read_json",

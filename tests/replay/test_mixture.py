@@ -81,7 +81,7 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
             "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",
             "share of 'a' is 0.1, below its floor",
         ),
-        ("[[strata]]\nname = 'a'\nshare = 0.3\ncap = 0.2", "share of 'a' is 0.3, above its cap"),
+        ("[[strata]]\nname = 'a'\nshare = 0.3\ncap = 0.2", r"\.share of 'a' is 0.3, above"),
         (EVERY + "[[strata]]\nname = ''\nwhere = 'true'", "a stratum needs a name"),
         (
             "[adaptive]\n[[strata]]\nname = 'a'\n"
@@ -98,7 +98,7 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
         ("[[strata]]\nname = 'a'\nshare = 0.7\n[[strata]]\nname = 'b'\nshare = 0.7", "sum to 1.4"),
         ("[[strata]]\nname = 'a'\n[[strata]]\nname = 'a'", "named twice"),
         ("[[strata]]\nname = 'a'\nshare = 'some'", "share"),
-        ("[[strata]]\nname = 'a'\nfloor = 0.5\ncap = 0.4", "floor <= cap"),
+        ("[[strata]]\nname = 'a'\nfloor = 0.5\ncap = 0.4", r"floor of 'a' is 0.5, above its cap"),
         ("[[strata]]\nname = 'a'\nunit = 'mission'", "unit"),
         ("[[strata]]\nname = 'a'\nmin_steps = 3", 'needs unit = "episode"'),
         ("[each_condition]\nunit = 'episode'\nmin_steps = 0", "at least 1"),

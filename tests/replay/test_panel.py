@@ -335,6 +335,17 @@ def test_a_panel_that_is_there_is_kept_unless_forced(transitions: pa.Table, tmp_
         build_panel(transitions, uniform(), tmp_path / "mine", force=True)
 
 
+def test_what_lies_in_a_panel_is_not_lost_with_it(transitions: pa.Table, tmp_path: Path) -> None:
+    build_panel(transitions, uniform(), tmp_path / "p")
+    with pytest.raises(PanelError, match=r"is within the panel .*/p:"):
+        build_panel(transitions, uniform(), tmp_path / "p" / "other")
+    (tmp_path / "p").chmod(0o755)
+    (tmp_path / "p" / "notes.txt").write_text("mine")
+    with pytest.raises(PanelError, match=r"beside the panel: notes\.txt"):
+        build_panel(transitions, uniform(n_step=3), tmp_path / "p", force=True)
+    assert (tmp_path / "p" / "notes.txt").read_text() == "mine"
+
+
 def test_an_interruption_leaves_nothing(
     transitions: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ import pytest
 from support.paths import ROOT
 
 from restock.errors import RunError
-from restock.train.run.run import Run
+from restock.train.run.run import Run, check_free
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES, rewrite
 
 
@@ -114,6 +114,24 @@ def test_an_existing_directory_is_refused_with_a_remedy(tmp_path: Path) -> None:
         Run.create(tmp_path / "a b", {})
     (tmp_path / "empty").mkdir()
     Run.create(tmp_path / "empty", {})  # an empty directory is free
+
+
+def test_a_place_where_no_run_can_be_made_or_stay_is_refused(tmp_path: Path) -> None:
+    Run.create(tmp_path / "a", {})
+    (tmp_path / "panel").mkdir()
+    (tmp_path / "panel" / "panel.json").touch()
+    (tmp_path / "store" / "transitions" / "_delta_log").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    for within, why in {
+        "a/eval/b": "is within the run",
+        "panel/b": "is within the panel",
+        "store/b": "is within the store",
+        "file/b": "file is a file",
+    }.items():
+        with pytest.raises(RunError, match=why):
+            check_free(tmp_path / within)
+        assert not (tmp_path / within).exists()
+    check_free(tmp_path / "new" / "b")
 
 
 def test_a_directory_that_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -22,7 +22,14 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import RunError
-from restock.files import read_json, read_table, remove_leftovers, write_table, write_text
+from restock.files import (
+    expect_place,
+    read_json,
+    read_table,
+    remove_leftovers,
+    write_table,
+    write_text,
+)
 from restock.train.run.run_lock import LOCK
 from restock.train.run.run_tables import TABLES
 
@@ -211,7 +218,9 @@ class Run:
 
 
 def check_free(path: Path) -> None:
-    """Raises RunError when there is something at `path` that a new run would overwrite."""
+    """Raises RunError when there is something at `path` that a new run would overwrite, or when no
+    run can be made there."""
+    expect_place(path, RunError)
     if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
         raise RunError(
             "already exists",

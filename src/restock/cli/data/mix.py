@@ -63,7 +63,7 @@ class MixCommand:
         from restock.cli import output
         from restock.ingest.store.version import given_version
         from restock.replay.mixture.mixture import load_mixture, shipped_schema
-        from restock.replay.panel.build import open_source, write_panel
+        from restock.replay.panel.build import check_free, open_source, write_panel
         from restock.replay.plan.plan import plan_panel
         from restock.replay.store.store import Store
 
@@ -79,6 +79,8 @@ class MixCommand:
             )
         if self.out is None and not self.dry_run:
             raise MixtureError("no --out given", remedy="give --out PANEL, or --dry-run")
+        if self.out is not None and not self.dry_run:
+            check_free(self.out, self.force)
         mixture = load_mixture(self.mixture)
         folder = Path(self.mixture).parent
         with (
