@@ -98,6 +98,15 @@ def test_seeds_that_no_generator_takes_are_refused(
     assert "must be from 0 to 2147483647, got -1" in capsys.readouterr().err
 
 
+def test_a_kind_of_episode_that_is_named_twice_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = kept_run(tmp_path / "a")
+    asked = ["--episodes", "nominal=2, wheel_slip=1,nominal=3", "--dry-run"]
+    assert main(["eval", str(run), *asked]) == 2
+    assert "--episodes: names 'nominal' twice" in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_evaluations_add_up_and_the_newest_floors_are_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -188,11 +188,14 @@ def test_the_verb_evaluates_and_says_why_it_refuses(
 ) -> None:
     run = kept_run(tmp_path / "a", NETWORK, panel)
     argv = ["eval", str(run), "--on-logs", "own"]
-    assert main([*argv, "--dry-run"]) == 0
+    assert main([*argv, "--dry-run"]) == 0  # fits nothing: it is asked what would be done
     assert not (run / "eval").exists()
-    capsys.readouterr()
+    asked = json.loads(capsys.readouterr().out)
+    assert (asked["episodes"], asked["measures"]) == (9, ["return", "success"])
+    assert "results" not in asked
     assert main(argv) == 0
     said = capsys.readouterr()
+    assert f"on 9 episodes ({asked['rows']} rows): {asked['updates']} updates" in said.err
     assert "refused" in said.out
     assert "episodes, less than" in " ".join(said.err.split())
     assert "are estimated (cloned) for" in " ".join(said.err.split())

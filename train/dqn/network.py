@@ -7,7 +7,8 @@ keeps off-policy learning on logs and fresh experience together stable (RLPD, ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -91,3 +92,17 @@ def clone(network: N) -> N:
     for parameter in copied.parameters():
         parameter.requires_grad_(False)
     return copied
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """As many threads of torch on the CPU for as long as the block runs.
+
+    Networks of this size are slower on several, many times so where other processes want the cores.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -15,6 +15,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import RunError
+from restock.train.dqn.network import torch_threads
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.evaluation.evaluation_plan import (
     CLEAN,
@@ -108,16 +109,17 @@ def drive_evaluation(
         versions[policy] = driver.version
         if env.limits is not None:
             versions[policy] += f" limits {env.limits.hash}"
-        driven = run_episodes(
-            env,
-            driver,
-            [spec for _, spec in episodes],
-            control_period_s=task.control_period_s,
-            time_limit_steps=task.time_limit_steps,
-            goal=task.goal != "none",
-            discount=plan.config.loss.discount,
-            progress=progress,
-        )
+        with torch_threads(plan.config.threads):
+            driven = run_episodes(
+                env,
+                driver,
+                [spec for _, spec in episodes],
+                control_period_s=task.control_period_s,
+                time_limit_steps=task.time_limit_steps,
+                goal=task.goal != "none",
+                discount=plan.config.loss.discount,
+                progress=progress,
+            )
         for (perturbation, _), result in zip(episodes, driven, strict=True):
             results.setdefault((policy, perturbation), []).append(result)
     table = episodes_table(results, plan, versions)

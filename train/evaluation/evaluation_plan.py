@@ -206,6 +206,10 @@ def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
                 where=where,
                 remedy="write 20, or nominal=1000,wheel_slip=300",
             ) from None
+        if found is not None and len(found) < len(parts):
+            kinds = [kind.strip() for kind, _, _ in parts]
+            twice = next(kind for kind in kinds if kinds.count(kind) > 1)
+            raise ConfigError(f"names {twice!r} twice", where=where, remedy="name each kind once")
     if isinstance(asked, int):
         asked = dict.fromkeys(KINDS, asked)
     if unknown := [kind for kind in asked if kind not in KINDS]:

@@ -21,7 +21,7 @@ from restock.files import write_table
 from restock.ingest.task.task import Task
 from restock.toml import Checked
 from restock.train.dqn.behaviour import PolicyNetwork
-from restock.train.dqn.config import parse_config
+from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.fitted_q import (
     FittedQConfig,
     cloned_behaviour,
@@ -30,7 +30,7 @@ from restock.train.dqn.fitted_q import (
     soft_greedy,
     values,
 )
-from restock.train.dqn.network import QNetwork
+from restock.train.dqn.network import QNetwork, torch_threads
 from restock.train.evaluation.off_policy.dataset import (
     Measure,
     OpeDataset,
@@ -38,7 +38,7 @@ from restock.train.evaluation.off_policy.dataset import (
     load_ope_dataset,
 )
 from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes, estimate
-from restock.train.evaluation.policies import load_agent
+from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
@@ -72,6 +72,57 @@ class OpeResult:
     version: str  # of the policy
 
 
+@dataclass(frozen=True)
+class OpePlan:
+    """What the off-policy evaluation of a run needs: nothing is fitted yet."""
+
+    path: Path
+    policy: GreedyPolicy
+    trained: TrainConfig
+    task: Task
+    dataset: OpeDataset
+    config: OpeConfig
+
+    @property
+    def measures(self) -> tuple[Measure, ...]:
+        return measures_of(self.task, self.dataset)
+
+    @property
+    def updates(self) -> int:
+        """How often a model is updated."""
+        model = self.config.model
+        cloned = not (self.dataset.evaluation.probability > 0).all()
+        return model.cloning_updates * cloned + (
+            model.iterations * model.updates * len(self.measures)
+        )
+
+    def document(self) -> dict[str, Any]:
+        """What would be evaluated, as JSON."""
+        evaluated = self.dataset.evaluation
+        return {
+            "run": str(self.path),
+            "policy": self.policy.version,
+            "measures": list(self.measures),
+            "episodes": len(np.unique(evaluated.episode)),
+            "rows": len(evaluated.rows),
+            "fitted_rows": len(self.dataset.training.rows),
+            "updates": self.updates,
+            "epsilon": self.config.epsilon,
+            "horizon": self.config.horizon,
+            "notes": list(notes_of(self.task, self.dataset, self.config)),
+        }
+
+
+def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
+    """The run and the logs of an evaluation, read and checked; raises as that does."""
+    run = Run.open(path)
+    trained = parse_config(run.document["config"], where=str(path / "config.json"))
+    agent = load_agent(run)
+    task = profile_of_run(run).task
+    dataset = load_ope_dataset(run_panel(run.document), task, logs, seed=config.seed)
+    return OpePlan(path, agent, trained, task, dataset, config)
+
+
 def evaluate_run_off_policy(
     path: Path,
     logs: str | None,
@@ -85,32 +136,35 @@ def evaluate_run_off_policy(
     Args:
         path: the run.
         logs: a store, or a panel whose held-out episodes count; default the run's own panel.
-        progress: called with 1 after every measure.
+        progress: called with 1 before every update of its models.
         write: whether to write the file.
 
     Raises:
         RunError: no such run, no policy kept, or no episode that it did not learn from.
         StoreError, PanelError: no such logs.
     """
-    run = Run.open(path)
-    trained = parse_config(run.document["config"], where=str(path / "config.json"))
-    agent = load_agent(run)
-    task = profile_of_run(run).task
-    dataset = load_ope_dataset(run_panel(run.document), task, logs, seed=config.seed)
-    rows = evaluate_off_policy(
-        agent.network,
-        dataset,
-        discount=trained.loss.discount,
-        measures=measures_of(task, dataset),
-        config=config,
-        progress=progress,
-    )
+    return evaluate_planned(plan_off_policy(path, logs, config), progress, write=write)
+
+
+def evaluate_planned(
+    plan: OpePlan, progress: Callable[[int], None] | None = None, *, write: bool = True
+) -> OpeResult:
+    """As `evaluate_run_off_policy`."""
+    with torch_threads(plan.trained.threads):
+        rows = evaluate_off_policy(
+            plan.policy.network,
+            plan.dataset,
+            discount=plan.trained.loss.discount,
+            measures=plan.measures,
+            config=plan.config,
+            between=(lambda: None) if progress is None else (lambda: progress(1)),
+        )
     if write:
-        steps = int(agent.version.rpartition("@")[2])
+        steps = int(plan.policy.version.rpartition("@")[2])
         clocks = {"env_steps": None, "gradient_steps": steps}
         table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
-        write_table(table, path / "eval" / FILE)
-    return OpeResult(rows, notes_of(task, dataset, config), agent.version)
+        write_table(table, plan.path / "eval" / FILE)
+    return OpeResult(rows, notes_of(plan.task, plan.dataset, plan.config), plan.policy.version)
 
 
 def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:
@@ -144,7 +198,6 @@ def evaluate_off_policy(
     discount: float,
     measures: tuple[Measure, ...] = ("return", "success"),
     config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
-    progress: Callable[[int], None] | None = None,
     between: Callable[[], None] = lambda: None,
 ) -> list[dict[str, Any]]:
     """Rows of `off_policy`: measure x condition of the episode x estimator.
@@ -198,8 +251,6 @@ def evaluate_off_policy(
                 }
                 for answer in estimate(part, gate=gate, horizon=config.horizon, rng=rng)
             ]
-        if progress is not None:
-            progress(1)
     return results
 
 

@@ -192,19 +192,26 @@ class EvalCommand:
 
     def _evaluate_off_policy(self, logs: str) -> int:
         from restock.cli.learning.eval_tables import show_off_policy
-        from restock.cli.output import progress
+        from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError
-        from restock.train.evaluation.ope import OpeConfig, evaluate_run_off_policy
+        from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
 
         try:
             config = OpeConfig(epsilon=self.epsilon, horizon=self.horizon)
         except ValueError as error:
             raise ConfigError(str(error), where="restock eval") from error
-        named = None if logs == "own" else logs
-        with progress("off-policy evaluation", 2) as advance:
-            result = evaluate_run_off_policy(
-                self.run_path, named, config, advance, write=not self.dry_run
-            )
+        plan = plan_off_policy(self.run_path, None if logs == "own" else logs, config)
+        document = plan.document()
+        if self.dry_run:
+            print_json(document)
+            return 0
+        say(
+            f"off-policy evaluation on {document['episodes']:,} episodes"
+            f" ({document['rows']:,} rows): {plan.updates:,} updates of models fitted on"
+            f" {document['fitted_rows']:,} other rows"
+        )
+        with progress("off-policy evaluation", plan.updates) as advance:
+            result = evaluate_planned(plan, advance)
         show_off_policy(self.run_path, result, config, as_json=self.json)
         return 0
 
