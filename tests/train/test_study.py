@@ -9,6 +9,7 @@ from threading import Event, main_thread
 from time import sleep
 
 import pytest
+from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RunError
@@ -300,6 +301,21 @@ def test_a_panel_that_is_not_there_is_refused_before_the_runs(tmp_path: Path, ca
     (tmp_path / "s.toml").write_text(f"{TWO}panel = 'p'\n")
     assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path), "--dry-run"]) == 2
     assert "p: arm 'b': there is no panel here" in capsys.readouterr().err
+
+
+def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
+    arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\nmixture = "b.toml"\n'
+    (tmp_path / "s.toml").write_text(f'store = "s"\ntreatment = "mixture"\n{arms}')
+    (tmp_path / "b.toml").write_text("where = 'speed > 1'\n[each_condition]\n")
+    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    assert main(argv) == 2
+    assert f"{tmp_path / 's'}: no such store" in capsys.readouterr().err
+    write_store(tmp_path / "s", [recording_transitions(1)])
+    assert main(argv) == 2
+    assert f"{tmp_path / 'b.toml'}: mixture, `where`: its SQL" in capsys.readouterr().err
+    (tmp_path / "b.toml").write_text("where = 'reward > -99'\n[each_condition]\n")
+    assert main(argv) == 0
+    assert not (tmp_path / "o").exists()
 
 
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:

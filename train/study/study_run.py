@@ -182,12 +182,17 @@ def pack(store: str, mixture: str, folder: Path, out: Path, log: Path, say: Say)
     """A panel of a mixture, unless it is there; paths are relative to `folder`."""
     if out.exists():
         return
-    if "://" not in store:
-        store = str(folder / store)
-    name = str(folder / mixture) if (folder / mixture).is_file() else mixture
+    store, name = packed_from(store, mixture, folder)
     say(f"packing {name}")
     out.parent.mkdir(parents=True, exist_ok=True)
     restock_verb(["mix", store, "--mixture", name, "--out", str(out)], log)
+
+
+def packed_from(store: str, mixture: str, folder: Path) -> tuple[str, str]:
+    """A store and a mixture as `restock mix` takes them: as the study names them, from `folder`."""
+    if "://" not in store:
+        store = str(folder / store)
+    return store, str(folder / mixture) if (folder / mixture).is_file() else mixture
 
 
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:

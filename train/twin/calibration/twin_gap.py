@@ -206,6 +206,9 @@ def read_gap(folder: Path) -> TwinGap:
     Raises:
         RunError: there is no gap in `folder`, or it cannot be read.
     """
+    remedy = f"`restock twin gap STORE --out {folder}` measures one"
+    if not (folder / DOCUMENT).exists():
+        raise RunError("no gap of the twin has been measured", where=str(folder), remedy=remedy)
     try:
         document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
         if document.get("format") != FORMAT:
@@ -221,7 +224,7 @@ def read_gap(folder: Path) -> TwinGap:
         raise RunError(
             f"it contains no readable gap: {error}",
             where=str(folder),
-            remedy=f"`restock twin gap STORE --out {folder}` measures one",
+            remedy=remedy,
         ) from error
 
 
