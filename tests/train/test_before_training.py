@@ -447,6 +447,8 @@ def test_a_run_is_judged_with_its_rows(
     both = with_rows(alone, diagnose_rows(_swapped(logs), twin))
     assert (both.cause, both.runs) == (together, [of_run])
     assert both.evidence[-1] == "rows: ACTIONS_MIRRORED: the logs' left is the twin's right"
+    why = f"{of_run} by the run's own figures, {together} with the rows that were fed:"
+    assert (why in both.evidence) is (of_run != together)
 
 
 @pytest.mark.parametrize(

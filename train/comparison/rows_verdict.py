@@ -56,7 +56,11 @@ def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
     experiment = diagnosis.experiment
     if cause in ("BUFFER", "BOTH"):
         experiment = f"first correct the rows ({rows.findings[0].remedy}), mix and train again"
-    said = [f"rows: {one.cause}: {one.text}" for one in rows.findings]
+    said = []
+    if cause != diagnosis.cause:
+        whose = "the run's own figures" if len(diagnosis.runs) == 1 else "the runs' own figures"
+        said = [f"{diagnosis.cause} by {whose}, {cause} with the rows that were fed:"]
+    said += [f"rows: {one.cause}: {one.text}" for one in rows.findings]
     if rows.untrusted:
         said.append(f"rows: the twin is far from these logs in {', '.join(rows.untrusted)}")
     return replace(
