@@ -18,13 +18,13 @@ import msgspec
 import pyarrow as pa
 
 from restock import __version__
-from restock.errors import PanelError, StoreError
+from restock.errors import PanelError, RestockError, StoreError
 from restock.files import building, expect_place
 from restock.ingest.store.location import Location
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
 from restock.ingest.task.task import Task
-from restock.replay.mixture.mixture import Mixture
+from restock.replay.mixture.mixture import Mixture, load_mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
 from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, ROWS, Header, Panel
@@ -145,6 +145,22 @@ def build_panel(
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
         plan = plan_panel(source.connection, mixture, source.conditions, source.others)
         return write_panel(source, plan, out, force=force, advance=advance)
+
+
+def plan_only(store: str, name: str) -> PanelPlan:
+    """What a panel of a mixture, by its name or its file, would hold; nothing is written.
+
+    Raises:
+        StoreError, ConfigError, MixtureError: see `plan_panel`; those say which mixture it is.
+    """
+    mixture = load_mixture(name)
+    with Store(store) as opened:
+        try:
+            with open_source(opened, mixture, folder=Path(name).parent) as source:
+                return plan_panel(source.connection, mixture, source.conditions, source.others)
+        except RestockError as error:
+            where = name if error.where is None else f"{name}: {error.where}"
+            raise type(error)(error.what, where=where, remedy=error.remedy) from error
 
 
 def write_panel(

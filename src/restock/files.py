@@ -158,6 +158,8 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} is a file"
     elif not os.access(parent, os.W_OK | os.X_OK):
         why = f"cannot be made: {parent} may not be written"
+    elif any("\udc80" <= one <= "\udcff" for one in str(absolute)):
+        why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
     for folder in absolute.parents:
         for mark, kind in _MARKS.items():
             if (folder / mark).exists():

@@ -6,6 +6,7 @@ No traceback and no exit 1: that one means that an audit failed or a comparison 
 from __future__ import annotations
 
 import json
+import os
 import runpy
 import shutil
 from pathlib import Path
@@ -392,6 +393,16 @@ def test_a_mujoco_gl_that_cannot_be_used_is_named(
     assert "egl, osmesa or glfw" in said
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert cli.main(["twin", "layout", "default"]) == 0
+
+
+def test_a_path_that_is_not_utf_8_is_no_bug(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")
+    assert cli.main(["audit", place]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "a path is not UTF-8, as it must be for a store, a panel or a run" in said
+    assert r"/caf\xe9/transitions rename the folder" in said
 
 
 def test_what_nobody_foresaw_exits_2_and_developers_see_where(

@@ -84,7 +84,7 @@ MAY_IMPORT = {
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn evaluation libraries run twin/physics ingest",
+    "train/study": "comparison dqn evaluation libraries run twin/physics replay/panel ingest",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "",

@@ -127,6 +127,7 @@ def test_a_place_where_no_run_can_be_made_or_stay_is_refused(tmp_path: Path) -> 
         "panel/b": "is within the panel",
         "store/b": "is within the store",
         "file/b": "file is a file",
+        "caf\udce9/b": "not UTF-8",
     }.items():
         with pytest.raises(RunError, match=why):
             check_free(tmp_path / within)

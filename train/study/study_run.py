@@ -22,6 +22,7 @@ import msgspec
 from restock.errors import RestockError, RunError
 from restock.files import write_text
 from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
+from restock.replay.panel.build import plan_only
 from restock.train.comparison.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.study.study import (
@@ -195,6 +196,16 @@ def packed_from(store: str, mixture: str, folder: Path) -> tuple[str, str]:
     return store, str(folder / mixture) if (folder / mixture).is_file() else mixture
 
 
+def check_mixtures(store: str | None, mixtures: Sequence[str], folder: Path) -> None:
+    """Plan every mixture, as `restock mix --dry-run` does.
+
+    Raises:
+        RestockError: there is no such store or mixture, or a mixture does not fit the store.
+    """
+    for mixture in dict.fromkeys(mixtures if store is not None else ()):
+        plan_only(*packed_from(str(store), mixture, folder))
+
+
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     """Train and evaluate one run; taken up from its checkpoint if it has one."""
     log = plan.out / "logs" / f"{job.path.name}.log"
@@ -304,4 +315,4 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
         )
 
 
-__all__ = ["Engine", "Say", "run_job", "run_study", "train_words"]
+__all__ = ["Engine", "Say", "check_mixtures", "run_job", "run_study", "train_words"]

@@ -61,6 +61,14 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             where=" -> ".join(files) or where,
             remedy="check the path, the permissions and the free space",
         )
+    if isinstance(error, UnicodeEncodeError) and _undecoded(error):
+        return RestockError(
+            "a path is not UTF-8, as it must be for a store, a panel or a run: "
+            + repr(os.fsencode(error.object))[2:-1],
+            where=where,
+            remedy="rename the folder; or set a locale of UTF-8, if the shell has none:"
+            " LC_ALL=C.UTF-8",
+        )
     if _in_gl(error):  # of MuJoCo as it is imported: any verb that needs the twin
         return RestockError(
             f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}",
@@ -95,6 +103,11 @@ def _out_of_memory(error: BaseException | None) -> str:
             return first_line(error)
         error = error.__cause__
     return ""
+
+
+def _undecoded(error: UnicodeEncodeError) -> bool:
+    """Whether it is of bytes that Python could not decode, of a path or of the command line."""
+    return all("\udc80" <= one <= "\udcff" for one in error.object[error.start : error.end])
 
 
 def _in_gl(error: Exception) -> bool:

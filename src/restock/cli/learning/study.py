@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +77,7 @@ class StudyCommand:
         from restock.train.study.findings import findings, power_of, too_small
         from restock.train.study.page import as_markdown, power_sentence
         from restock.train.study.study import StudyPlan, check_jobs, load_study
-        from restock.train.study.study_run import run_study
+        from restock.train.study.study_run import check_mixtures, run_study
 
         if self.workers < 1:
             raise ConfigError(f"must be at least 1, got {self.workers}", where="--workers")
@@ -115,7 +115,7 @@ class StudyCommand:
                 and not job.done.exists()
                 and not (out / "panels" / job.arm.name).exists()
             ]
-            _check_mixtures(plan.study.store, to_pack, plan.folder)
+            check_mixtures(plan.study.store, to_pack, plan.folder)
             against = {
                 pair.arm.name: f"{pair.baseline.name} ({pair.treatment})"
                 for pair in plan.study.pairs
@@ -158,6 +158,7 @@ class StudyCommand:
         from restock.errors import ConfigError
         from restock.files import write_text
         from restock.train.study.space import MIXTURE, load_search, settings_of
+        from restock.train.study.study_run import check_mixtures
         from restock.train.study.tuning import SearchPlan, require_optuna, run_search, search_page
 
         search = load_search(self.study)
@@ -172,7 +173,7 @@ class StudyCommand:
             chosen = search.parameters.get(MIXTURE)
             mixtures = (search.mixture,) if chosen is None else chosen.choices
             named = [str(one) for one in mixtures if one is not None]
-            _check_mixtures(search.store, named, self.study.parent)
+            check_mixtures(search.store, named, self.study.parent)
             fixed = " ".join(settings_of(search, {}))
             rows = [{"key": name, **to_builtins(one)} for name, one in search.parameters.items()]
             if self.json:
@@ -194,28 +195,3 @@ class StudyCommand:
         else:
             sys.stdout.write(page)
         return 0
-
-
-def _check_mixtures(store: str | None, mixtures: Sequence[str], folder: Path) -> None:
-    """Plan every panel that is still to be packed, as `restock mix --dry-run` does.
-
-    Raises:
-        RestockError: there is no such store or mixture, or a mixture does not fit the store.
-    """
-    from restock.errors import RestockError
-    from restock.replay.mixture.mixture import load_mixture
-    from restock.replay.panel.build import open_source
-    from restock.replay.plan.plan import plan_panel
-    from restock.replay.store.store import Store
-    from restock.train.study.study_run import packed_from
-
-    for name in dict.fromkeys(mixtures if store is not None else ()):
-        place, path = packed_from(str(store), name, folder)
-        mixture = load_mixture(path)
-        with Store(place) as opened:
-            try:
-                with open_source(opened, mixture, folder=Path(path).parent) as source:
-                    plan_panel(source.connection, mixture, source.conditions, source.others)
-            except RestockError as error:
-                where = path if error.where is None else f"{path}: {error.where}"
-                raise type(error)(error.what, where=where, remedy=error.remedy) from error
