@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import ConfigError
+from restock.files import first_line
 
 LARGEST_BYTES = 200_000
 MOST = {"body": 100, "geom": 300, "joint": 60, "site": 100, "actuator": 60}
@@ -64,7 +65,7 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
             )
         text = path.read_text(encoding="utf-8").lstrip("\ufeff \t\r\n")
     except (OSError, UnicodeDecodeError) as error:
-        raise refused(f"cannot be read: {given}: {error}", "check its path") from error
+        raise refused(f"cannot be read: {given}: {first_line(error)}", "check its path") from error
     if problem := mjcf_problem(text):
         raise refused(f"{given}: {problem}", REMEDY)
     return document | {"robot": robot | {"mjcf": text}}

@@ -28,6 +28,7 @@ from typing import Any
 import msgspec
 
 from restock.errors import ConfigError
+from restock.files import first_line
 from restock.ingest.task.conditions import Condition, Kind
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import STAND_IN_LIMITS
@@ -142,6 +143,6 @@ def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> d
             raise refused(f"is larger than {LARGEST_BYTES:,} bytes: {name}")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise refused(f"cannot be read: {name}: {error}") from error
+        raise refused(f"cannot be read: {name}: {first_line(error)}") from error
     stem = {"name": path.stem} if path.stem.isidentifier() else {}
     return stem | settings_of(text) | {k: value for k, value in entry.items() if k != "file"}

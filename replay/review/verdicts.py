@@ -18,6 +18,7 @@ import numpy as np
 
 from restock.arrays import Ints
 from restock.errors import LabelError
+from restock.files import first_line
 from restock.ingest.correct import RecordingCorrections
 from restock.ingest.store.corrections import Correction
 from restock.replay.review.doubtful import VERDICT
@@ -93,7 +94,7 @@ def read_verdicts(path: Path, store: Store) -> Verdicts:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise LabelError(f"cannot be read: {error}", where=str(path)) from error
+        raise LabelError(f"cannot be read: {first_line(error)}", where=str(path)) from error
     return _Reading(path, store).read(text)
 
 

@@ -71,13 +71,15 @@ def _unreadable(
 ) -> RestockError:
     if not path.exists():
         return error("does not exist", where=str(path), remedy=remedy)
-    said = getattr(problem, "strerror", None) or first_line(problem)
-    return error(f"is damaged or cannot be read: {said}", where=str(path), remedy=remedy)
+    return error(
+        f"is damaged or cannot be read: {first_line(problem)}", where=str(path), remedy=remedy
+    )
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first; libraries say the rest below it."""
-    return next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    """What an error says first; libraries say the rest below it, and the system a number before."""
+    said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return next((line for line in said.splitlines() if line.strip()), type(error).__name__)
 
 
 def write_table(table: pa.Table, path: Path) -> None:

@@ -153,6 +153,8 @@ def test_a_store_has_a_page_of_what_it_holds(
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
     assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
     assert "give --out FILE, too" in capsys.readouterr().err
+    assert main(["coverage", str(store_path), "--every", "hour"]) == 2
+    assert "--every: applies only to the page" in capsys.readouterr().err
 
 
 CONTROL_PERIOD_S = 0.2

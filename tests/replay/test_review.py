@@ -298,7 +298,7 @@ def test_wrong_usage_writes_nothing(
             "cannot be combined with --profile",
         ),
         (["--review", "0"], "must be 1 or more"),
-        (["--corrections", "gone.csv"], "cannot be read"),
+        (["--corrections", "gone.csv"], "gone.csv: cannot be read: No such file"),
     ):
         assert main(["label", str(reviewed[0]), *words]) == 2
         assert problem in " ".join(capsys.readouterr().err.split())

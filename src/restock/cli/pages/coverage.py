@@ -43,15 +43,14 @@ class CoverageCommand:
     def run(self) -> None:
         """Ask, print, and write the page."""
         from restock.cli import output
-        from restock.errors import ConfigError
+        from restock.cli.command_line import refuse
         from restock.files import refuse_folder
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
 
-        if self.figures is not None and self.out is None:
-            raise ConfigError(
-                "applies only to the page", where="--figures", remedy="give --out FILE, too"
-            )
+        if self.out is None:
+            options, why = ("figures", "mixture", "every"), "applies only to the page"
+            refuse(self, options, why, remedy="give --out FILE, too")
         refuse_folder(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
