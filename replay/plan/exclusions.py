@@ -35,6 +35,7 @@ class LeftOut:
     """Rows (N,) that are left out, each under the first reason that applied to it."""
 
     gone: Bools
+    admitted: Bools  # those that the mixture's limits admit, whatever is then held out of them
     reasons: dict[str, int] = field(default_factory=dict)
 
     def add(self, reason: str, rows: Bools) -> None:
@@ -51,7 +52,8 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
         MixtureError: every row is too old; rows without a label, where the mixture does not say
             what to do with them.
     """
-    out = LeftOut(np.zeros(len(table), np.bool_))
+    none = np.zeros(len(table), np.bool_)
+    out = LeftOut(none, ~none)
     out.add("refused by the mixture's `where`", ~bools(table, "admitted"))
     if mixture.safety is not None:
         unsafe = bools(table, "unsafe")
@@ -74,6 +76,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
     if mixture.max_versions_behind is not None:
         behind = versions_behind(table)
         out.add("of an old version of its policy", behind > mixture.max_versions_behind)
+    out.admitted = ~out.gone
     out.add("evaluation split", split.held)
     out.add("gap before the evaluation split", split.gap)
     bare = ~bools(table, "labelled") & ~out.gone

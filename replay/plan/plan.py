@@ -81,7 +81,7 @@ class PanelPlan:
     newest_ns: int  # when the newest row was logged
     as_of_ns: int | None  # what max_age_days counted to, where there is one
     others: tuple[PinnedStore, ...] = ()  # besides the first store
-    uncertain_rows: int = 0  # with a condition too near to call, whatever the mixture does of it
+    uncertain_rows: int = 0  # with a condition too near to call, of those admitted
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
     warnings: tuple[str, ...] = ()  # of a source that may be an archive
 
@@ -159,7 +159,7 @@ def plan_panel(
             f"no row is left: {reasons}", remedy="change what leaves out too much in the mixture"
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
-    given = _sources(mixture, table, stratum, state_code, beyond_cap, len(strata))
+    given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))
     warnings: tuple[str, ...] = ()
     if others:
         met = episodes_met(connection, mixture, conditions)
@@ -228,14 +228,20 @@ def _sources(
     stratum: NDArray[np.int16],
     state_code: NDArray[np.int16],
     beyond_cap: Bools,
+    logged: Bools,
     size: int,
 ) -> list[SourceRows]:
-    """What each store may give, with its share of a batch as a run begins; `size` strata."""
+    """What each store may give, with its share of a batch as a run begins; `size` strata.
+
+    A recording of which the mixture admits none of the rows (`logged`) is no logging of its kind.
+    """
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
+    logged = np.isin(recording, np.unique(recording[logged]))
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
         admitted = (stratum != NO_STRATUM) & (store == number)
+        seen = logged & (store == number)
         at = np.flatnonzero(admitted & ~beyond_cap)
         sources.append(
             SourceRows(
@@ -246,7 +252,7 @@ def _sources(
                 stratum[at],
                 state_code[at],
                 episode[at],
-                hours_of(recording[store == number], stamp_ns[store == number]),
+                hours_of(recording[seen], stamp_ns[seen]),
                 np.bincount(stratum[admitted], minlength=size),
             )
         )
@@ -335,7 +341,7 @@ def _joined(
         newest_ns=int(table["logged_ns"].to_numpy().max()),
         as_of_ns=None if mixture.max_age_days is None else as_of_ns,
         others=tuple(others),
-        uncertain_rows=int(bools(table, "uncertain").sum()),
+        uncertain_rows=int((bools(table, "uncertain") & out.admitted).sum()),
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
         warnings=warnings,
     )

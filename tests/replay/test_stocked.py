@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
@@ -196,6 +197,17 @@ def test_hours_of_logging_are_from_first_to_last_of_every_recording() -> None:
     hour = 3_600 * 10**9
     stamps = np.array([0, hour, 9 * hour, 9 * hour + hour // 2])
     assert hours_of(np.array([0, 0, 2, 2]), stamps) == pytest.approx(1.5)
+
+
+def test_what_is_missing_counts_the_logging_that_a_mixture_is_of(transitions: pa.Table) -> None:
+    text = "max_replays_per_row = 40\n[each_condition]\nshare = 'equal'\n" + NO_SPLIT
+    recording, *others = pc.unique(transitions["recording_id"]).to_pylist()
+    assert others
+    alone = planned(transitions.filter(pc.field("recording_id") == recording), text)
+    of_all = planned(transitions, f"where = \"recording_id = '{recording}'\"\n{text}")
+    assert any(line.missing_hours for line in alone.strata)
+    for one, other in zip(alone.strata, of_all.strata, strict=True):
+        assert (one.rows, one.missing_hours) == (other.rows, other.missing_hours)
 
 
 def test_the_plan_shows_four_shares_side_by_side_and_what_is_missing(
