@@ -92,6 +92,11 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
     assert "no such store" in capsys.readouterr().err
     assert main(["check", str(stores["one"]), "--baseline", "released"]) == 2
     assert "--run" in capsys.readouterr().err
+    assert main(["check", str(stores["one"]), "--margin", "0.1"]) == 2
+    assert "--margin: has no effect without --baseline" in capsys.readouterr().err
+    gate = ["check", str(stores["one"]), "--run", str(tmp_path), "--baseline", "released"]
+    assert main([*gate, "--margin", "5"]) == 2
+    assert "--margin: must be from 0 to 1, got 5.0" in capsys.readouterr().err
     assert main(["check", str(stores["one"]), "--run", str(tmp_path)]) == 2
     assert "is not a run directory" in capsys.readouterr().err
 

@@ -220,7 +220,10 @@ def test_any_duckdb_sees_the_exported_views(
         assert not other.sql("FROM columns WHERE contains(view, 'frames')").fetchall()
     assert cli.main(["sql", str(store_path), "--export", str(out)]) == 2
     assert cli.main(["sql", str(store_path), "--export", str(tmp_path / "views.db")]) == 2
+    line = ["sql", str(store_path), "FROM coverage", "--export", str(tmp_path / "v.sql")]
+    assert cli.main(line) == 2
     err = capsys.readouterr().err
+    assert "runs no query" in err
     assert "already there" in err
     assert "no export to .db" in err
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from restock.errors import RunError
+from restock.errors import ConfigError, RunError
 from restock.files import read_table, write_table
 from restock.stats import iqm, mean_over_strata, paired_improvement
 from restock.train.run.kept_evaluations import shown_evaluation
@@ -56,6 +56,12 @@ def of_run(path: Path, policy: str = AGENT) -> Evaluated:
     run = Run.open(path)
     name = str(path) if policy == AGENT else policy
     return Evaluated(name, str(run.document.get("task_hash")), _cells(_driven(run, policy)))
+
+
+def check_margin(margin: float) -> None:
+    """Raises ConfigError where nothing could be worse by more than that, or a rise would be."""
+    if not 0 <= margin <= 1:  # NaN is neither
+        raise ConfigError(f"must be from 0 to 1, got {margin}", where="--margin")
 
 
 def of_baseline(name: str) -> Evaluated:

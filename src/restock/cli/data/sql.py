@@ -63,6 +63,10 @@ class SqlCommand:
         if self.json and self.csv:
             raise QueryError("--json and --csv cannot be combined", remedy="choose one")
         if self.export is not None:
+            if self.query is not None:
+                raise QueryError(
+                    "--export writes the views, and runs no query", remedy="leave out one"
+                )
             self._export(self.export)
             return
         beside = {"run": self.run_dir, "panel": self.panel}

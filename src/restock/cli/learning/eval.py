@@ -98,10 +98,16 @@ class EvalCommand:
     def _drive(self) -> int:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, progress, say
-        from restock.errors import ConfigError, ExitCode
+        from restock.errors import ExitCode
         from restock.train.evaluation.eval_run import clones_driven, drive_evaluation, recorded
         from restock.train.evaluation.evaluation_plan import plan_evaluation, settings
-        from restock.train.evaluation.regression import of_baseline, of_run, regressed, regression
+        from restock.train.evaluation.regression import (
+            check_margin,
+            of_baseline,
+            of_run,
+            regressed,
+            regression,
+        )
         from restock.train.evaluation.regression import save_baseline as save
         from restock.train.run.measures import summary_rows
 
@@ -115,8 +121,7 @@ class EvalCommand:
         if not self.drive:
             names = ("episodes", "perturbations", "seed", "limiter")
             refuse(self, names, "has no effect with --no-drive", remedy="leave out one of them")
-        if not 0 <= self.margin <= 1:  # nothing is worse by more than 1, or by NaN
-            raise ConfigError(f"must be from 0 to 1, got {self.margin}", where="--margin")
+        check_margin(self.margin)
         beside = self.baseline if self.baseline in _names(self.policies) else None
         baseline = None
         if self.baseline is not None and beside is None:

@@ -55,14 +55,20 @@ class CheckCommand:
     def run(self) -> int:
         """Look at all of it, say what was found, and exit 1 where something fails."""
         from restock.cli import output
+        from restock.cli.command_line import refuse
         from restock.cli.pipeline.findings import markdown
         from restock.files import refuse_folder, write_text
         from restock.replay.store.audit import junit_suites
+        from restock.train.evaluation.regression import check_margin
 
         if self.baseline is not None and self.run_dir is None:
             raise ConfigError(
                 "applies only to a run", where="--baseline", remedy="also give --run RUN"
             )
+        if self.baseline is None:
+            why = "has no effect without --baseline"
+            refuse(self, ("margin",), why, remedy="name the run or the saved baseline")
+        check_margin(self.margin)
         refuse_folder(self.junit, "--junit")
         refuse_folder(self.summary, "--summary")
         parts = self._parts()
