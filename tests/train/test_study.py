@@ -318,6 +318,14 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     assert not (tmp_path / "o").exists()
 
 
+def test_a_study_is_not_put_into_its_store(tmp_path: Path, capsys) -> None:
+    (tmp_path / "s.toml").write_text(SMALL)
+    write_store(tmp_path / "s", [recording_transitions(1)])
+    for out, why in ((tmp_path / "s" / "o", "within the store"), (tmp_path / "s.toml", "a file")):
+        assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--dry-run"]) == 2
+        assert why in " ".join(capsys.readouterr().err.split())
+
+
 def test_panels_of_mixtures_are_the_studys_own(tmp_path: Path) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\npanel = "p"\n'
     (tmp_path / "s.toml").write_text(f'store = "../s"\n{arms}')

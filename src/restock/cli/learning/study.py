@@ -71,7 +71,7 @@ class StudyCommand:
 
         from restock.cli.output import plain, print_json, print_table, say
         from restock.errors import ConfigError
-        from restock.files import write_text
+        from restock.files import expect_place, write_text
         from restock.report import write_study_page
         from restock.toml import read_toml
         from restock.train.study.findings import findings, power_of, too_small
@@ -87,6 +87,8 @@ class StudyCommand:
                 where="--out",
                 remedy="give a directory, or --power",
             )
+        if self.out is not None:
+            expect_place(self.out / "runs", ConfigError)
         if "space" in read_toml(self.study):
             return self._search()
         out = self.out if self.out is not None else self.study.parent
