@@ -14,6 +14,7 @@ The header of an audit's file says what it is:
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 import tomllib
@@ -122,8 +123,21 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
             raise ConfigError(
                 f"{name!r} is not a table", where=str(file), remedy="write [audit] tables of values"
             )
+        for key, value in table.items():
+            _check_value(f"{name}.{key}", value, thresholds.get(name, {}).get(key), str(file))
         thresholds[name] = {**thresholds.get(name, {}), **table}
     return thresholds
+
+
+def _check_value(key: str, value: object, shipped: float | str | None, where: str) -> None:
+    """Refuse what is of another kind than the shipped threshold, and NaN: no row is above it."""
+    number = (
+        isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+    )
+    if shipped is None or (number if isinstance(shipped, int | float) else isinstance(value, str)):
+        return
+    kind = "a number" if isinstance(shipped, int | float) else "a text"
+    raise ConfigError(f"{key} must be {kind}, got {value!r}", where=where)
 
 
 def run_audits(

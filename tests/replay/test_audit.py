@@ -617,6 +617,10 @@ def test_wrong_files_of_audits_and_thresholds_are_refused(tmp_path: Path) -> Non
     (tmp_path / "t.toml").write_text("rare_condition = 3")
     with pytest.raises(ConfigError, match="not a table"):
         load_thresholds(tmp_path / "t.toml")
+    for value in ("'x'", "nan", "true"):  # of NaN, nothing would be found
+        (tmp_path / "t.toml").write_text(f"stale_data.max_age_days = {value}")
+        with pytest.raises(ConfigError, match=r"stale_data\.max_age_days must be a number, got"):
+            load_thresholds(tmp_path / "t.toml")
     (tmp_path / "t.toml").write_text("[rare")
     with pytest.raises(ConfigError, match="is not TOML"):
         load_thresholds(tmp_path / "t.toml")
