@@ -53,7 +53,8 @@ class SectorMap:
         inf, NaN, and readings below `range_min_m` (the driver's "no valid return") or above
         `range_max_m` count as free up to `range_max_m`; so does a sector without beams.
         """
-        ranges = np.asarray(ranges_m, np.float64)
+        with np.errstate(invalid="ignore"):  # a damaged range may be a NaN that signals
+            ranges = np.asarray(ranges_m, np.float64)
         valid = (ranges >= range_min_m) & (ranges <= range_max_m)  # False for NaN and inf
         near = ranges - self.reach_m
         np.copyto(near, range_max_m, where=~valid)

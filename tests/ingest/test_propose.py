@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.bag_samples import write_bag as write_sample_bag
-from support.driven_robot import Drive, columns, typed_topics, write_bag, write_topics
+from support.driven_robot import Drive, columns, ragged, typed_topics, write_bag, write_topics
 from support.paths import ROOT, SHARED, sample_transitions
 
 from restock.cli import main
@@ -84,6 +84,23 @@ def test_what_navigation_proposes_is_taken_for_that(topic, tmp_path, capsys):
     with Store(tmp_path / "s") as store:
         found = store.sql("SELECT DISTINCT nav_speed_mps, nav_yaw_rate_radps FROM transitions")
         assert found.fetchall() == [(pytest.approx(0.3), pytest.approx(0.1))]
+
+
+@pytest.mark.parametrize("topic", ["/local_plan", "/move_base/DWAPlannerROS/local_plan"])
+def test_what_a_controller_looks_at_is_no_plan(topic, tmp_path, capsys):
+    """It comes more often than the plan, and does not lead to the goal."""
+    drive = Drive()
+    near = columns(
+        np.arange(0.0, drive.duration_s, 0.1),
+        {f"poses[].pose.position.{axis}": ragged([np.full(100, 1.0)] * 2) for axis in "xy"},
+    )
+    topics = {**typed_topics(drive), topic: ("nav_msgs/msg/Path", near)}
+    file = proposed(write_topics(topics, tmp_path / "bag"), tmp_path, capsys)
+    assert load_profile(file).inputs.plan.topic == "/plan"
+    del topics["/plan"]
+    file.unlink()
+    file = proposed(write_topics(topics, tmp_path / "no_plan"), tmp_path, capsys)
+    assert load_profile(file).goal.source == "hindsight"
 
 
 def test_the_only_command_is_no_proposal(tmp_path):

@@ -30,6 +30,13 @@ def test_clearance_is_what_lies_beyond_the_outline():
     assert outline_reach(np.array([corner]), BODY) == pytest.approx([np.hypot(0.35, 0.25)])
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_range_that_is_a_signalling_nan_is_a_nan():
+    ranges = np.full((1, 360), 3.0, np.float32)
+    ranges.view(np.uint32)[0, :5] = 0x7F800001  # of a damaged message
+    assert SectorMap.build(CIRCLE, 4, POINT).clearance(ranges, 0.05, 4.0)[0, 0] == pytest.approx(3)
+
+
 def test_a_lidar_that_looks_backward():
     turned = Body(length_m=1e-9, width_m=1e-9, lidar_yaw_rad=np.pi)
     ranges = np.full((1, 360), 3.0)

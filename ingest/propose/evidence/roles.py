@@ -57,6 +57,9 @@ _ELSEWHERE = (
     *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
 )
 
+# A name of a path that does not lead to the goal: what a controller looks at, next to the robot.
+_NEAR_PATHS = ("local_plan", "local_path", "local_traj", "transformed_", "pruned_")
+
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
 # Best first.
@@ -154,6 +157,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             "nav_msgs/msg/Path",
             {"x_m": "poses[].pose.position.x", "y_m": "poses[].pose.position.y"},
             ("plan", "path"),
+            never=_NEAR_PATHS,
         ),
     ),
     "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
