@@ -15,7 +15,7 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
-from restock.ingest.propose.evidence.footprint import Footprint
+from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
 from restock.ingest.propose.evidence.gather import Evidence, gather
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.roles import (
@@ -146,6 +146,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
+    if seen.footprint.upside_down and seen.roles["scan"]:
+        advice.append(Advice("inputs.scan", UPSIDE_DOWN))
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
         several_commands(usable_topics(recording)),

@@ -9,7 +9,7 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.footprint import GUESS
+from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, UPSIDE_DOWN
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
@@ -118,6 +118,7 @@ def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
 def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
+    placed = footprint.lidar_source != DESCRIBED
     return [
         "[task.body]  # the outline, from which clearance is measured",
         f"# {footprint.source}"
@@ -129,12 +130,14 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
         *(
             [
                 f"lidar_x_m = {round(x or 0.0, 3):g}  # of the lidar, ahead of the middle"
-                + ("; a guess" if x is None else f"; {footprint.lidar_source}")
+                + ("; a guess" if x is None else "")
+                + ("" if x is None and not placed else f"; {footprint.lidar_source}")
             ]
             if seen.roles["scan"]
             else []
         ),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
+        *([f"# {UPSIDE_DOWN}"] if footprint.upside_down else []),
         "",
         *_reward_lines(footprint.width_m),
     ]

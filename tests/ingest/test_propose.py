@@ -103,6 +103,14 @@ def test_what_a_controller_looks_at_is_no_plan(topic, tmp_path, capsys):
     assert load_profile(file).goal.source == "hindsight"
 
 
+def test_of_two_lidars_the_one_that_looks_back_is_not_taken(tmp_path, capsys):
+    topics = typed_topics(Drive())
+    topics["/scan_front"] = topics["/scan_back"] = topics.pop("/scan")
+    file = proposed(write_topics(topics, tmp_path / "bag"), tmp_path, capsys)
+    assert load_profile(file).inputs.scan.topic == "/scan_front"
+    assert "or /scan_back?" in file.read_text()
+
+
 def test_the_only_command_is_no_proposal(tmp_path):
     for topic in ("/joy/cmd_vel", None):
         with open_recording(write_bag(Drive(proposals=topic), tmp_path / f"{topic}"[-4:])) as bag:

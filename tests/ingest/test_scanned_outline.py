@@ -15,6 +15,7 @@ from restock.cli import main
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile, parse_profile
 
+NAMES = ("base_link", "lidar")
 TYPES = {
     "/cmd_vel": "geometry_msgs/msg/Twist",
     "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -121,6 +122,65 @@ def test_a_costmaps_footprint_comes_first(tmp_path, capsys):
     profile, text = proposed(tmp_path, capsys, Turning(12.0), **more)
     assert profile.task.body.length_m == pytest.approx(0.3, abs=1e-3)
     assert f"the polygon of {name}" in text
+
+
+def lidar_at(x_m: float, y_m: float, yaw_rad: float, roll_rad: float = 0.0) -> TopicColumns:
+    """The transform of the scans' frame, rolled and then turned."""
+    one = offsets_of(np.array([1]))
+    yaw, roll = yaw_rad / 2, roll_rad / 2
+    values: dict[str, Any] = {
+        "header.frame_id": "base_link",
+        "child_frame_id": "lidar",
+        "transform.translation.x": x_m,
+        "transform.translation.y": y_m,
+        "transform.rotation.x": np.cos(yaw) * np.sin(roll),
+        "transform.rotation.y": np.sin(yaw) * np.sin(roll),
+        "transform.rotation.z": np.sin(yaw) * np.cos(roll),
+        "transform.rotation.w": np.cos(yaw) * np.cos(roll),
+    }
+    fields = {
+        f"transforms[].{path}": Ragged(np.array([value], object if value in NAMES else None), one)
+        for path, value in values.items()
+    }
+    return columns(np.zeros(1), fields, stamped=False)
+
+
+@dataclass
+class Framed(Turning):
+    """Its scans say in which frame they are."""
+
+    def topics(self) -> dict[str, TopicColumns]:
+        found = super().topics()
+        found["/scan"].fields["header.frame_id"] = np.full(len(found["/scan"]), "lidar", object)
+        return found
+
+
+def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsys):
+    """At a corner, as one of two is. How it is turned was dropped, with its place."""
+    more = {"/tf_static": lidar_at(-0.35, -0.3, -2.356)}
+    profile, text = proposed(tmp_path, capsys, Framed(12.0), **more)
+    body = profile.task.body
+    assert (body.length_m, body.width_m) == pytest.approx((0.7, 0.6), abs=1e-3)
+    assert (body.lidar_x_m, body.lidar_yaw_rad) == pytest.approx((-0.35, -2.356), abs=1e-3)
+    assert "that it is 0.30 m to the right is ignored" in text
+    assert "UPSIDE DOWN" not in text
+
+
+def test_a_lidar_outside_a_measured_outline_is_turned_as_transforms_say(tmp_path, capsys):
+    """Its base frame is no middle, as that of a car, between its rear wheels."""
+    topics = {name: (TYPES[name], c) for name, c in Framed(12.0).topics().items()}
+    topics["/tf_static"] = (TYPES["/tf_static"], lidar_at(0.9, 0.0, 3.0))
+    bag = write_topics(topics, tmp_path / "bag", storage="mcap")
+    assert main(["profile", "new", str(bag), "--footprint", "1.2x0.6", "--json"]) in (0, 3)
+    text = json.loads(capsys.readouterr().out)["toml"]
+    body = parse_profile(text, where="p").task.body
+    assert (body.length_m, body.lidar_x_m, body.lidar_yaw_rad) == (1.2, 0.0, pytest.approx(3.0))
+    assert "; a guess; base_link has it 0.90 m ahead, outside" in text
+
+
+def test_a_lidar_that_hangs_upside_down_is_said(tmp_path, capsys):
+    more = {"/tf_static": lidar_at(0.1, 0.0, 0.0, np.pi)}
+    assert "# THE LIDAR HANGS UPSIDE DOWN" in proposed(tmp_path, capsys, Framed(12.0), **more)[1]
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

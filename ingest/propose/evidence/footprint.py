@@ -30,6 +30,10 @@ _POLYGONS = ("geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/Polygon")
 
 
 DESCRIBED = "as described"  # where a lidar's place is from
+UPSIDE_DOWN = (
+    "THE LIDAR HANGS UPSIDE DOWN by its frame: left and right of its scans are swapped, unless its "
+    "driver turns them. No key does: record a scan whose frame is upright, or remove inputs.scan"
+)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Footprint:
     lidar_x_m: float | None = None  # ahead of the middle; None: nothing says
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
+    upside_down: bool = False  # the lidar
     measured: bool = True  # False: a guess, though with a reason
 
     @property
@@ -198,13 +203,14 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
     low, high, count = shapes
     places = description.places(OUTLINE)
     length, width = (float(side) for side in (high - low)[:2])
-    x, yaw = _lidar(places, scan_frame)
+    x, yaw, upside_down = _lidar(places, scan_frame)
     return Footprint(
         length,
         width,
         f"shapes of {count} links in {source}",
         None if x is None else x - float(low[0] + high[0]) / 2,
         yaw,
+        upside_down=upside_down,
     )
 
 
@@ -220,12 +226,13 @@ def outline(description: Description) -> tuple[F64, F64, int] | None:
     return low, high, len(known)
 
 
-def _lidar(places: dict[str, Place], frame: str) -> tuple[float | None, float | None]:
-    """How far ahead of the base, and turned how, the lidar is."""
+def _lidar(places: dict[str, Place], frame: str) -> tuple[float | None, float | None, bool]:
+    """How far ahead of the base, and turned how, the lidar is, and whether it is upside down."""
     frame = frame.strip("/")
     near = [n for n in places if n == frame or n.split("/")[-1] == frame.split("/")[-1]]
     if not frame or not near:
-        return None, None
+        return None, None, False
     place = places[near[0]]
     x, yaw = float(place.at_m[0]), float(np.arctan2(place.rotation[1, 0], place.rotation[0, 0]))
-    return (x, yaw) if np.isfinite([x, yaw]).all() else (None, None)
+    known = np.isfinite([x, yaw]).all()
+    return (x, yaw, bool(place.rotation[2, 2] < 0)) if known else (None, None, False)

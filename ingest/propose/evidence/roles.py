@@ -142,6 +142,7 @@ KINDS: dict[str, tuple[Kind, ...]] = {
                 "angle_increment_rad": "angle_increment",
             },
             ("scan",),
+            rather=("back", "rear"),
         ),
     ),
     "goal": (

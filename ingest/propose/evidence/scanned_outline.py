@@ -35,7 +35,7 @@ LEAST_RANGE_M = 0.01
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
 FACING_RAD, LEAST_FACINGS, LEAST_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
-MOST_AHEAD_M = 3.0  # of a lidar
+MOST_ASIDE_M = 3.0  # of the middle: a lidar
 _FIELDS = ("ranges", "angle_min", "angle_increment", "range_min", "range_max")
 
 
@@ -157,11 +157,20 @@ def _range_m(
     return round(low, 3), min(round(high, 3), 4.0), why
 
 
-def lidar_place(recording: Recording, scan_frame: str) -> tuple[float, float, str] | None:
-    """How far ahead of the robot's base frame the lidar is (m), turned how (rad), and of which.
+@dataclass(frozen=True)
+class LidarPlace:
+    """Where a lidar is in a robot's base frame, by transforms."""
 
-    By the last transforms of the recording; None where they do not say, or not sanely.
-    """
+    base: str
+    x_m: float  # ahead
+    y_m: float  # to the left
+    yaw_rad: float
+    upside_down: bool
+
+
+def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
+    """Where the lidar is, by the last transforms of the recording; None where they do not say, or
+    not sanely."""
     if not scan_frame:
         return None
     edges = transform_edges(recording)
@@ -175,16 +184,29 @@ def lidar_place(recording: Recording, scan_frame: str) -> tuple[float, float, st
         last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
         times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
         at = Tree(usual, kept, segments).place(scan_frame, times)
-        x, yaw = float(at.translation_m[0, 0]), float(at.yaw_rad[0])
-        if at.problem[0] == "" and abs(x) < MOST_AHEAD_M and np.isfinite(yaw):
-            return x, yaw, base
+        x, y, yaw = *at.translation_m[0, :2].tolist(), float(at.yaw_rad[0])
+        if at.problem[0] == "" and max(abs(x), abs(y)) < MOST_ASIDE_M and np.isfinite(yaw):
+            return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
     return None
 
 
-def with_lidar(footprint: Footprint, place: tuple[float, float, str] | None) -> Footprint:
-    """The footprint with the lidar's place by transforms, the base frame taken for its middle."""
-    if place is None or abs(place[0]) > footprint.length_m / 2:
+def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
+    """The footprint with the lidar's place by transforms, the base frame taken for its middle.
+
+    An outline that is guessed is made as large as to hold it. Of one that is measured, a lidar
+    outside says that the base frame is not its middle: then only how it is turned is known.
+    """
+    if place is None:
         return footprint
-    x, yaw, base = place
-    source = f"of {base}, by transforms; that this is the middle is a guess"
-    return replace(footprint, lidar_x_m=x, lidar_yaw_rad=yaw, lidar_source=source)
+    turned = replace(footprint, lidar_yaw_rad=place.yaw_rad, upside_down=place.upside_down)
+    source = f"of {place.base}, by transforms; that this is the middle is a guess"
+    if abs(place.y_m) > ROOM_M:
+        side = "left" if place.y_m > 0 else "right"
+        source += f"; that it is {abs(place.y_m):.2f} m to the {side} is ignored"
+    if not footprint.measured:
+        sizes = (footprint.length_m, place.x_m), (footprint.width_m, place.y_m)
+        length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
+        turned = replace(turned, length_m=length, width_m=width)
+    elif abs(place.x_m) > footprint.length_m / 2:
+        return replace(turned, lidar_source=f"{place.base} has it {place.x_m:.2f} m ahead, outside")
+    return replace(turned, lidar_x_m=place.x_m, lidar_source=source)
