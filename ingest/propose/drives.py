@@ -202,7 +202,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
         footprint=outlined.footprint,
         footprint_notes=outlined.footprint_notes,
         outline=outlined.outline,
-        robot=described.robot
+        robot=(described if described.robot.described else base).robot  # of one wheelbase
         if base.commands.steered
         else described.robot.driven(turned, outlined.footprint.length_m),
     )

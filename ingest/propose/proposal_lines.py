@@ -290,10 +290,10 @@ def _input_lines(
     if role == "command" and seen.turns is not None:
         lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:
-        origin = "of [robot]" if seen.commands.wheelbase_known else "A GUESS: MEASURE IT"
         lines += [
             "# Its yaw rate is speed x tan(steering_rad) / wheelbase_m.",
-            f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}  # {origin}",
+            f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}"
+            f"  # {seen.commands.wheelbase_from}",
         ]
     if role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)

@@ -143,6 +143,9 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.command", steered_by(seen)))
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
+    if seen.commands.steered and not seen.robot.wheelbase_from:
+        told = "a guess, and with it every yaw rate that was commanded: measure it"
+        advice.append(Advice("inputs.command.wheelbase_m", told))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))

@@ -209,10 +209,15 @@ def write_topics(
 
 @cache
 def _humble() -> Any:
-    """The types of ROS 2 Humble, which compile how each is serialised when it is first written."""
+    """The types of ROS 2 Humble, which compile how each is serialised when it is first written, and
+    those of ackermann_msgs."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(Stores.ROS2_HUMBLE)
+    from restock.ingest.decoding.hand_definitions import ackermann_types
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    types.register(ackermann_types())
+    return types
 
 
 def _blank(types: Any, name: str) -> Any:

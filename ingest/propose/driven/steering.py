@@ -12,7 +12,7 @@ its front wheels, as some drivers take it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,7 @@ LEAST_HALF_RAD = 1.0  # … of which following half is turning on the spot
 LEAST_DRIVEN_M = 0.05  # else it may not have been able to move
 LEAST_TIGHT, TIGHTER, AS_ONE, SPEEDS = 20, 1.5, 0.25, 1.5
 LEAST_TURNS = 20  # moments of driving in a turn
+WHEELBASES_M = (0.05, 10.0)  # of what drives
 WELL, CLEARLY = 0.5, 0.5  # of the turning, left unexplained; of what the other reading leaves
 
 
@@ -235,6 +236,47 @@ class TurnReading:
     least_m: float = 0.0  # that circle
 
 
+def _answers(told_s: F64, turn: F64, poses: PoseSeries) -> Iterator[tuple[F64, F64, F64]]:
+    """At each delay what was told (K,), and the speed and the yaw rate with which it drove then."""
+    ticks = _looks(poses.stamp_ns)
+    window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
+    motion = motion_at(poses, ticks, window_s, KNOWN_S)
+    middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps
+    for delay_s in DELAYS_S:
+        index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
+        told = turn[np.maximum(index, 0)]
+        used = (index >= 0) & (motion.problem == "") & (np.abs(speed) > 0.05)
+        used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(told) > 0.03)
+        if used.sum() >= LEAST_TURNS and (turned[used] ** 2).sum() > 0:
+            yield told[used], speed[used], turned[used]
+
+
+def _as_angles(
+    told: F64, speed: F64, turned: F64, most_rad: float, wheelbase_m: float | None
+) -> tuple[float, float]:
+    """The wheelbase by which steering angles (K,) explain best how it turned, where none is given;
+    and the part of the squared yaw rates that they leave unexplained."""
+    by_angle = speed * np.tan(np.clip(told, -most_rad, most_rad))
+    base_m = wheelbase_m or float((by_angle**2).sum() / (turned @ by_angle))
+    by_angle /= base_m if base_m > 0 else np.inf
+    return base_m, float(((turned - by_angle) ** 2).sum() / (turned**2).sum())
+
+
+def shown_wheelbase_m(
+    told_s: F64, told_rad: F64, poses: PoseSeries, steering_rad: float | None
+) -> float | None:
+    """The wheelbase by which steering angles (N,) explain how it turned; None where they do not.
+
+    Args:
+        told_s, told_rad: of the commands, in order, on the clock of `poses`.
+        steering_rad: the largest angle; None: the usual one.
+    """
+    most = steering_rad or USUAL_STEERING_RAD
+    fits = [_as_angles(*answer, most, None) for answer in _answers(told_s, told_rad, poses)]
+    base_m, left = min(fits, key=lambda fit: fit[1], default=(0.0, np.inf))
+    return base_m if left < WELL and WHEELBASES_M[0] <= base_m <= WHEELBASES_M[1] else None
+
+
 def turn_reading(
     told_s: F64,
     told_mps: F64,
@@ -255,30 +297,18 @@ def turn_reading(
             wheelbase that is None is the one by which the angles explain best how it turned.
         least_m: its tightest circle, where there is no wheelbase.
     """
-    ticks = _looks(poses.stamp_ns)
-    window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
-    motion = motion_at(poses, ticks, window_s, KNOWN_S)
-    middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps
     most = steering_rad or USUAL_STEERING_RAD
     best, seen, fitted_m = [np.inf, np.inf], 0, wheelbase_m
     least_m = wheelbase_m / float(np.tan(most)) if wheelbase_m else least_m or SPOT_M
     tight = int((np.abs(turn) * least_m > np.abs(told_mps) * 1.01).sum())
-    for delay_s in DELAYS_S:
-        index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
-        told = turn[np.maximum(index, 0)]
-        used = (index >= 0) & (motion.problem == "") & (np.abs(speed) > 0.05)
-        used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(told) > 0.03)
-        if (turning := float((turned[used] ** 2).sum())) == 0 or used.sum() < LEAST_TURNS:
-            continue
-        seen = max(seen, int(used.sum()))
-        sharpest = np.abs(speed[used]) / least_m
-        as_rate = np.clip(told[used], -sharpest, sharpest)
-        as_angle = speed[used] * np.tan(np.clip(told[used], -most, most))
-        base_m = wheelbase_m or float((as_angle**2).sum() / (turned[used] @ as_angle))
-        as_angle /= base_m if base_m > 0 else np.inf
-        left = [float(((turned[used] - by) ** 2).sum()) / turning for by in (as_rate, as_angle)]
-        fitted_m = base_m if left[1] < best[1] else fitted_m
-        best = [min(pair) for pair in zip(best, left, strict=True)]
+    for told, speed, turned in _answers(told_s, turn, poses):
+        seen = max(seen, len(told))
+        sharpest = np.abs(speed) / least_m
+        as_rate = np.clip(told, -sharpest, sharpest)
+        base_m, by_angle = _as_angles(told, speed, turned, most, wheelbase_m)
+        by_rate = float(((turned - as_rate) ** 2).sum() / (turned**2).sum())
+        fitted_m = base_m if by_angle < best[1] else fitted_m
+        best = [min(best[0], by_rate), min(best[1], by_angle)]
     untold = TurnReading(too_tight=tight, least_m=least_m)
     if not seen:
         return untold

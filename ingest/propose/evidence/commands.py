@@ -24,6 +24,7 @@ from restock.ingest.propose.driven.steering import (
     DriveEvidence,
     TurnReading,
     drive_evidence,
+    shown_wheelbase_m,
     turn_reading,
 )
 from restock.ingest.propose.evidence.clock_choice import Gaps
@@ -50,7 +51,7 @@ class Commands:
     measured: bool = False  # they are odometry, in place of commands
     steered: bool = False  # by the angle of the front wheels, as a car
     wheelbase_m: float = 0.3
-    wheelbase_known: bool = False
+    wheelbase_from: str = "A GUESS: MEASURE IT"
     reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
@@ -102,7 +103,6 @@ def read_commands(
         measured=topic.type == MOTION,
         steered="steering_rad" in kind.fields,
         wheelbase_m=wheelbase_m or Commands.wheelbase_m,
-        wheelbase_known=wheelbase_m is not None,
     )
     settled = settled_at_most(recording, roles, commands, times, speed, turn)
     commands = commands.limited(
@@ -118,14 +118,19 @@ def read_commands(
 
 
 def commanded(
-    recording: Recording, fit: tuple[TopicInfo, Kind], wheelbase_m: float | None
+    recording: Recording,
+    fit: tuple[TopicInfo, Kind],
+    wheelbase_m: float | None,
+    *,
+    angles: bool = False,
 ) -> tuple[TopicColumns, Ints, F64, F64]:
-    """The commands of a topic; of those that are numbers log time (N,), m/s (N,), rad/s (N,)."""
+    """The commands of a topic; of those that are numbers log time (N,), m/s (N,), rad/s (N,), or
+    of steering angles, with `angles`, rad."""
     topic, kind = fit
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     speed, turn = (np.asarray(columns.fields[path], np.float64) for path in paths)
-    if "steering_rad" in kind.fields:
+    if "steering_rad" in kind.fields and not angles:
         turn = speed * np.tan(turn) / (wheelbase_m or Commands.wheelbase_m)
     sane = np.isfinite(speed) & np.isfinite(turn)
     return columns, columns.log_time_ns[sane], speed[sane], turn[sane]
@@ -222,6 +227,19 @@ def read_turns(
     return reading if not reading.problem else TurnReading(least_m=least_m)
 
 
+def wheelbase_of(
+    recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
+) -> RobotProposal:
+    """The robot with the wheelbase by which steering angles explain how it turned, where nothing
+    describes it and they do."""
+    angled = bool(roles["command"]) and "steering_rad" in roles["command"][0][1].fields
+    if robot.described or not angled or poses is None or len(poses) < 2:
+        return robot
+    told_s, _, told_rad, since = _since(recording, roles, poses, angles=True)
+    wheelbase_m = shown_wheelbase_m(told_s, told_rad, since, robot.values.get("max_steering_rad"))
+    return robot if wheelbase_m is None else robot.with_wheelbase(wheelbase_m)
+
+
 def as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Kind]]:
     """The same topics, their turns read as steering angles."""
     return [
@@ -231,11 +249,11 @@ def as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Ki
 
 
 def _since(
-    recording: Recording, roles: Roles, poses: PoseSeries
+    recording: Recording, roles: Roles, poses: PoseSeries, *, angles: bool = False
 ) -> tuple[F64, F64, F64, PoseSeries]:
     """The commands in order, in seconds (N,), m/s and rad/s, and the poses: both since the first
-    pose."""
-    _, times, speed, turn = commanded(recording, roles["command"][0], None)
+    pose. With `angles` the steering angles themselves, in rad."""
+    _, times, speed, turn = commanded(recording, roles["command"][0], None, angles=angles)
     order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
     since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)
     return (times[order] - zero) * 1e-9, speed[order], turn[order], since

@@ -33,6 +33,7 @@ from restock.ingest.propose.evidence.commands import (
     leaves_the_floor,
     read_commands,
     read_turns,
+    wheelbase_of,
 )
 from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.evidence.frame_guess import FrameGuess, transform_frames
@@ -149,14 +150,16 @@ def gather(
     robot = propose_robot(recording, scan, frame, urdf)
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
+    robot = wheelbase_of(recording, roles, poses, robot)
     turns = read_turns(recording, roles, poses, robot, turned)
     if turns is not None and turns.is_angle:
         roles["command"], chosen = choose_command(recording, topics, as_angles(roles["command"]))
         if turns.wheelbase_m is not None:
-            robot = replace(robot, values=robot.values | {"wheelbase_m": turns.wheelbase_m})
+            robot = robot.with_wheelbase(turns.wheelbase_m)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
-    commands = replace(commands, wheelbase_known=robot.described and wheelbase_m is not None)
+    if wheelbase_m is not None and robot.wheelbase_from:
+        commands = replace(commands, wheelbase_from=robot.wheelbase_from)
     paces = _paces(recording, roles)
     recorded_s = _recorded_s(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))

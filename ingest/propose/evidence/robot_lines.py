@@ -21,6 +21,7 @@ from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
 
+BY_TURNS = "by which its steering angles explain best how it turned: MEASURE IT"
 WHEELBASE_PART = 0.6  # of the outline's length, where nothing says
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
 MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
@@ -79,6 +80,18 @@ class RobotProposal:
             origin["max_steering_rad"] = "logs"
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
+    def with_wheelbase(self, wheelbase_m: float) -> RobotProposal:
+        """With the wheelbase that its logs show."""
+        values = self.values | {"wheelbase_m": round(wheelbase_m, 3)}
+        return replace(self, values=values, origin=self.origin | {"wheelbase_m": "logs"})
+
+    @property
+    def wheelbase_from(self) -> str:
+        """What its wheelbase is from; "": a guess."""
+        if self.described:
+            return "of [robot]"
+        return BY_TURNS if self.origin.get("wheelbase_m") == "logs" else ""
+
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
         """With the limits that its logs show, in place of what a description says."""
         logged = {"max_speed_mps": speed_mps, "max_yaw_rate_radps": yaw_rate_radps}
@@ -101,13 +114,14 @@ class RobotProposal:
         own = {key: value for key, value in values.items() if "." not in key}
         lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
         drive, told = own.pop("drive", None), self.described
-        guess = {} if told else {"wheelbase_m": "  # A GUESS from the outline: MEASURE IT"}
+        guess = self.wheelbase_from or "A GUESS from the outline: MEASURE IT"
+        guesses = {} if told else {"wheelbase_m": f"  # {guess}"}
         lines = [
             "[robot]  # what the twin builds; missing values follow from the size of the outline",
             *(f"# {note}" for note in notes),
             *([] if told else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
             f'drive = "{drive or "differential"}"',
-            *(f"{key} = {toml_value(value)}{guess.get(key, '')}" for key, value in own.items()),
+            *(f"{key} = {toml_value(value)}{guesses.get(key, '')}" for key, value in own.items()),
         ]
         if lidar:
             lines += ["", "[robot.lidar]", *(f"{k} = {toml_value(v)}" for k, v in lidar.items())]

@@ -184,7 +184,8 @@ def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
         last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
         times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
         at = Tree(usual, kept, segments).place(scan_frame, times)
-        x, y, yaw = *at.translation_m[0, :2].tolist(), float(at.yaw_rad[0])
+        x, y = (float(way) for way in at.translation_m[0, :2])
+        yaw = float(at.yaw_rad[0])
         if at.problem[0] == "" and max(abs(x), abs(y)) < MOST_ASIDE_M and np.isfinite(yaw):
             return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
     return None
