@@ -308,11 +308,12 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
     if edges.parent_changes:
         notes.append(f"transforms: a frame was given another parent {edges.parent_changes} times")
     if profile.frames is None:
-        frames = sorted({*inputs.frames_of("goal"), *inputs.frames_of("plan")} - {""})
-        if len(frames) > 1:
+        found = {name: set(inputs.frames_of(name)) - {""} for name in ("pose", "goal", "plan")}
+        told = [f"{name} {', '.join(sorted(frames))}" for name, frames in found.items() if frames]
+        if ("goal" in inputs.by_name) and len(set().union(*found.values())) > 1:
             notes.append(
-                f"goals and plans are in the frames {', '.join(frames)}, and are treated as if "
-                "they were in one frame: the profile has no [frames]"
+                f"frames: {'; '.join(told)}: they are treated as if they were one: the profile has "
+                "no [frames]"
             )
     return notes
 

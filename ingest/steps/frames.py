@@ -10,7 +10,7 @@ until the next one): it counts from when it was received.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
 from restock.ingest.decoding.columns import Ragged, TopicColumns
+from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.tables import Frames
 from restock.ingest.steps.align import ClockSegment, LatestMessages
 from restock.ingest.steps.clocks import STAMP
@@ -33,6 +34,16 @@ FIELDS = (
 )
 PARENT = "parent"
 FRAME_ID = "header.frame_id"
+
+
+def frame_path(source: Input, fields: Container[str]) -> str | None:
+    """The field that says in which frame an input's point is: of the innermost header around it."""
+    around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
+    for count in range(len(around), -1, -1):
+        path = ".".join([*around[:count], FRAME_ID])
+        if path in fields and "[" not in path:
+            return path
+    return None
 
 
 @dataclass(frozen=True)

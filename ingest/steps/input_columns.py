@@ -19,7 +19,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.fixes import FixedPoses, fixes_of
-from restock.ingest.steps.frames import FRAME_ID, Placement, plain
+from restock.ingest.steps.frames import Placement, frame_path, plain
 from restock.ingest.task.signals import yaw_of
 
 
@@ -116,10 +116,9 @@ class InputColumns:
     def frames_of(self, name: str) -> list[str]:
         """The frame that each message of an input is in; empty where messages do not say."""
         source = self.by_name.get(name)
-        column = None if source is None else self.topics[source.topic].fields.get(FRAME_ID)
-        if column is None:
-            return []
-        return [plain(str(frame)) for frame in np.asarray(column, object)]
+        fields = {} if source is None else self.topics[source.topic].fields
+        path = None if source is None else frame_path(source, fields)
+        return [] if path is None else [plain(str(one)) for one in np.asarray(fields[path], object)]
 
     def _yaw(self, name: str) -> F64:
         """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""

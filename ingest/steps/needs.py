@@ -24,7 +24,7 @@ from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
-from restock.ingest.steps.frames import FIELDS, FRAME_ID
+from restock.ingest.steps.frames import FIELDS, frame_path
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
@@ -105,15 +105,16 @@ def wanted_fields(
             " goes on from there)",
         )
     wanted: dict[str, list[str]] = {}
-    optional = {FRAME_ID}
+    optional = set[str]()
     for name, source in profile.sources.items():
         if source.topic not in available:
             continue
         paths = wanted.setdefault(source.topic, [])
         if name != "scan":
             paths += field_paths(source)
-        if name in ("goal", "plan"):
-            paths += [FRAME_ID]
+        if name in ("pose", "goal", "plan"):
+            frame = frame_path(source, {leaf.path for leaf in leaves[source.topic]})
+            paths += [frame] if frame else []
         optional.add(aside := sideways_path(source) if name == "command" else "")
         paths += [aside] if aside else []
     for topic in profile.transform_topics:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,24 @@ def test_what_a_controller_looks_at_is_no_plan(topic, tmp_path, capsys):
     file.unlink()
     file = proposed(write_topics(topics, tmp_path / "no_plan"), tmp_path, capsys)
     assert load_profile(file).goal.source == "hindsight"
+
+
+def test_the_goals_that_move_base_was_sent_are_goals(tmp_path, capsys):
+    """And they are in the frame of the pose in them: the action's own header has none."""
+    topics = typed_topics(Drive())
+    _, sent = topics.pop("/goal_pose")
+    pose = "goal.target_pose.pose.position"
+    fields = {path.replace("pose.position", pose): c for path, c in sent.fields.items()}
+    fields["goal.target_pose.header.frame_id"] = np.full(len(sent), "odom", object)
+    goals = replace(sent, fields=fields)
+    topics["/move_base/goal"] = ("move_base_msgs/msg/MoveBaseActionGoal", goals)
+    topics["/plan"][1].fields["header.frame_id"] = np.full(len(topics["/plan"][1]), "map", object)
+    bag = write_topics(topics, tmp_path / "bag")
+    file = proposed(bag, tmp_path, capsys)
+    assert load_profile(file).inputs.goal.topic == "/move_base/goal"
+    outcome = check(file, bag, capsys)
+    assert outcome["transitions"] > 10
+    assert any("goal odom; plan map" in note for note in outcome["notes"])
 
 
 def test_of_two_lidars_the_one_that_looks_back_is_not_taken(tmp_path, capsys):

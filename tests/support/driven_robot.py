@@ -21,6 +21,11 @@ LATENCY_NS = 2_000_000  # from header stamp to log time, of every topic
 BEAMS = 72
 FREE_M = 3.0
 GOAL = (11.0, 1.0)
+MOVE_BASE = {
+    "MoveBaseGoal": "geometry_msgs/PoseStamped target_pose\n",
+    "MoveBaseActionGoal": "std_msgs/Header header\nactionlib_msgs/GoalID goal_id\n"
+    "move_base_msgs/MoveBaseGoal goal\n",
+}
 ITEMS = {  # of lists: what they hold
     "poses": "geometry_msgs/msg/PoseStamped",
     "polygon.points": "geometry_msgs/msg/Point32",
@@ -210,13 +215,15 @@ def write_topics(
 @cache
 def _humble() -> Any:
     """The types of ROS 2 Humble, which compile how each is serialised when it is first written, and
-    those of ackermann_msgs."""
-    from rosbags.typesys import Stores, get_typestore
+    those of ackermann_msgs and move_base_msgs."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from restock.ingest.decoding.hand_definitions import ackermann_types
 
     types = get_typestore(Stores.ROS2_HUMBLE)
     types.register(ackermann_types())
+    for name, text in MOVE_BASE.items():
+        types.register(get_types_from_msg(text, f"move_base_msgs/msg/{name}"))
     return types
 
 

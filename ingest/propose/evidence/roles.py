@@ -146,6 +146,10 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         ),
     ),
     "goal": (
+        Kind(  # all that move_base was sent
+            "move_base_msgs/msg/MoveBaseActionGoal",
+            _under("goal.target_pose.pose", {"x_m": "position.x", "y_m": "position.y"}),
+        ),
         Kind(
             "geometry_msgs/msg/PoseStamped",
             {"x_m": "pose.position.x", "y_m": "pose.position.y"},
