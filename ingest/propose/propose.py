@@ -40,6 +40,7 @@ REMEDIES = {
 INSTEAD_OF_COMMANDS = (
     "; or, if the measured motion may be used as the command, add --odometry-as-command"
 )
+SELDOM = 2.5  # control periods between two poses
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.command", steered_by(seen)))
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
+    advice += _seldom_poses(seen)
     if seen.commands.steered and not seen.robot.wheelbase_from:
         told = "a guess, and with it every yaw rate that was commanded: measure it"
         advice.append(Advice("inputs.command.wheelbase_m", told))
@@ -156,6 +158,23 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         several_commands(usable_topics(recording)),
         wheeled=other is None,
     )
+
+
+def _seldom_poses(seen: Evidence) -> list[Advice]:
+    """Where the localiser speaks seldom, and transforms lead to the map all the time."""
+    if not seen.roles["pose"] or seen.poses_from_frames or seen.frames is None:
+        return []
+    topic = seen.roles["pose"][0][0].name
+    pace_s = seen.paces_s.get(topic, 0.0) * seen.clock.pace
+    if not seen.frames.localised or pace_s <= SELDOM * seen.clock.period_s:
+        return []
+    behind_m = pace_s * seen.commands.speed_mps
+    text = (
+        f"{topic} comes every {pace_s:.1f} s, so that poses are up to {behind_m:.1g} m behind; the "
+        "[frames] of the proposal, in place of [inputs.pose], follow the transforms (a policy on "
+        "the robot needs a topic)"
+    )
+    return [Advice("inputs.pose", text)]
 
 
 def _by_rate(

@@ -79,7 +79,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         return Trial(problem=why)
     endings = Counter(episode.ended_by for episode in episodes.episodes)
     asked = _Advisor(profile, topics, steps, episodes)
-    advice = [*asked.ages(), *asked.gaps(), *asked.ticks(), *asked.outline()]
+    advice = [*asked.ages(), *asked.gaps(), *asked.ticks(), *asked.outline(), *asked.limit()]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]
@@ -201,6 +201,25 @@ class _Advisor:
             f' = "rate" without inputs.command.max_age_s gives {number:,}'
         )
         return [Advice("clock.steps", text)]
+
+    def limit(self) -> list[Advice]:
+        """Whether logged missions take longer than the time limit: cut there, they have failed."""
+        task, cut = self.profile.task, self.cuts["time limit"]
+        if task.goal != "route" or self.profile.goal.source != "logged" or not cut:
+            return []
+        for times in (2, 4):
+            longer = times * task.time_limit_steps
+            changed = msgspec.structs.replace(task, time_limit_steps=longer)
+            found = split(changed, self.steps).episodes
+            left = sum(episode.ended_by == "time limit" for episode in found)
+            if left <= cut / 2:
+                text = (
+                    f"{task.time_limit_steps:,} steps end {cut:,} of {self.cuts.total():,} "
+                    f"episodes on their way to a logged goal, which then count as failed; "
+                    f"{longer:,} end {left or 'none'}"
+                )
+                return [Advice("task.time_limit_steps", text)]
+        return []
 
     def outline(self) -> list[Advice]:
         """Whether the lidar sees things inside the robot's outline, or all but touching it."""
