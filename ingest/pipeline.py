@@ -48,6 +48,7 @@ from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
+from restock.words import counted
 
 
 def ingest(
@@ -309,18 +310,18 @@ class _Ingest:
 
     def _lost_messages(self, steps: Steps) -> list[str]:
         frames = [
-            f"cameras.{name}: {reason} ({count:,} messages)"
+            f"cameras.{name}: {reason} ({counted(count, 'message')})"
             for name, camera in steps.cameras.items()
             for reason, count in camera.problems.items()
             if count and reason != OFF_CLOCK  # which is said of the topic
         ]
         lost = frames + [
             f"{loss.topic or 'the file'}: {loss.reason}"
-            + (f" ({loss.messages:,} messages)" if loss.messages is not None else "")
+            + (f" ({counted(loss.messages, 'message')})" if loss.messages is not None else "")
             for loss in self.recording.lost_messages
         ]
         return lost + [
-            f"{topic}: left out, as their stamps do not fit the clock ({count:,} messages)"
+            f"{topic}: left out, as their stamps do not fit the clock ({counted(count, 'message')})"
             for topic, count in steps.clock.off_clock.items()
         ]
 
@@ -340,16 +341,21 @@ class _Ingest:
                 " (1st to 99th percentile)"
             )
         elif clock.alignment == "header.stamp":
+            where = "ahead of" if clock.offset_ns >= 0 else "behind"
             notes.append(
-                f"clock: log time is {clock.offset_ns * 1e-9:,.3f} s ahead of header stamps, "
+                f"clock: log time is {abs(clock.offset_ns) * 1e-9:,.3f} s {where} header stamps, "
                 f"within {clock.spread_ns * 1e-6:.1f} ms (1st to 99th percentile)"
             )
         if clock.jumps:
-            notes.append(f"the alignment clock was set {clock.jumps} times; each cuts an episode")
+            set_ = counted(clock.jumps, "time")
+            notes.append(f"the alignment clock was set {set_}; each cuts an episode")
         for topic, count in clock.restamped.items():
-            notes.append(f"{topic}: {count} messages older than the recording, put at log time")
+            notes.append(
+                f"{topic}: {counted(count, 'message')} older than the recording, put at log time"
+            )
         if steps.commands_between:
-            notes.append(f"{steps.commands_between} commands closer than a control period: no step")
+            closer = counted(steps.commands_between, "command")
+            notes.append(f"{closer} closer than a control period: no step")
         residual = table["action_residual"].to_numpy()
         far = int((residual > 0.25).sum())
         if far:

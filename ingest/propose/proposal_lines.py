@@ -222,7 +222,10 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
 
 
 def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
-    offset = "" if clock.ahead_s is None else f"  # log time is {clock.ahead_s:,.3f} s ahead of it"
+    offset = ""
+    if (ahead_s := clock.ahead_s) is not None:
+        where = "ahead of" if ahead_s >= 0 else "behind"
+        offset = f"  # log time is {abs(ahead_s):,.3f} s {where} it"
     why = "no commands seen" if clock.every_s is None else f"a command every {clock.every_s:.2f} s"
     return [
         "[clock]",

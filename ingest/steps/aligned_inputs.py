@@ -36,6 +36,7 @@ from restock.ingest.steps.align import (
 from restock.ingest.steps.frames import Edges, Placement, Tree, plain
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.motion import PoseSeries, poses_along
+from restock.words import counted
 
 # A handover is announced on the tick it takes force; its message may arrive a moment later. Used
 # for provenance alone, never for what the robot knew.
@@ -306,7 +307,8 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
     """What is odd about the frames of a recording."""
     notes = []
     if edges.parent_changes:
-        notes.append(f"transforms: a frame was given another parent {edges.parent_changes} times")
+        changes = counted(edges.parent_changes, "time")
+        notes.append(f"transforms: a frame was given another parent {changes}")
     if profile.frames is None:
         found = {name: set(inputs.frames_of(name)) - {""} for name in ("pose", "goal", "plan")}
         told = [f"{name} {', '.join(sorted(frames))}" for name, frames in found.items() if frames]

@@ -15,6 +15,7 @@ import numpy as np
 
 from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
+from restock.words import counted
 
 STAMP = "header.stamp"
 WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
@@ -74,15 +75,15 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
 def odd(row: Mapping[str, Any]) -> str:
     """What of a topic's clocks is worth a look, in words; "" for nothing."""
     words = {
-        "jumps": "jumps",
-        "log_backsteps": "log time backsteps",
-        "backsteps": "backsteps",
-        "duplicates": "repeated stamps",
-        "zero_stamps": "zero stamps",
-        "off_clock": "left out",
-        "restamped": "put at log time",
+        "jumps": "jump",
+        "log_backsteps": "log time backstep",
+        "backsteps": "backstep",
+        "duplicates": "repeated stamp",
+        "zero_stamps": "zero stamp",
     }
-    parts = [f"{row[key]:,} {word}" for key, word in words.items() if row.get(key)]
+    parts = [counted(row[key], word) for key, word in words.items() if row.get(key)]
+    others = {"off_clock": "left out", "restamped": "put at log time"}
+    parts += [f"{row[key]:,} {word}" for key, word in others.items() if row.get(key)]
     if (row["spread_ns"] or 0) > WIDE_NS:
         parts.append(f"spread over {row['spread_ns'] * 1e-9:.1f} s")
     return ", ".join(parts)

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from restock.errors import RecordingError
+from restock.ingest.decoding.field_paths import Leaf
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.steps.needs import near, wanted_fields
+from restock.ingest.steps.needs import field_paths, near, wanted_fields
 
 SCAN, PATH = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Path"
 
@@ -52,3 +53,18 @@ def test_of_very_many_topics_those_that_could_be_used_are_named() -> None:
     assert "its topics are /lidar, 200 others, which `restock info` lists; choose" in str(
         error.value
     )
+
+
+def test_a_field_of_another_name_is_no_matter_of_topics() -> None:
+    """After an update of the robot, one profile does not fit the recordings from before it."""
+    profile = load_profile("warehouse_amr")
+    there = {s.topic: SimpleNamespace(type=s.type, expected=9) for s in profile.sources.values()}
+    leaves = {
+        s.topic: [Leaf(path, (), "") for path in field_paths(s)] for s in profile.sources.values()
+    }
+    leaves["/odom"] = [Leaf(f"twist.twist.{path}", (), "") for path in ("linear.x", "angular.yaw")]
+    with pytest.raises(RecordingError) as error:
+        wanted_fields(profile, there, leaves)
+    assert "`inputs.wheels.fields`: /odom: no field 'twist.twist.angular.z'" in str(error.value)
+    assert "with a profile each: a copy with the other field and another `name`" in str(error.value)
+    assert "its topics are" not in str(error.value)

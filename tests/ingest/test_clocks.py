@@ -99,7 +99,7 @@ def test_the_manifest_keeps_them_and_ingest_shows_them(bag, tmp_path, capsys):
     shown = capsys.readouterr().out
     line = " ".join(shown[shown.index(" /odom ") :].split())  # long cells are wrapped
     # 19 -> 20 and 29 -> 30 go back; and the zero stamp is off the clock, so it is left out.
-    assert "2 backsteps, 1 repeated stamps, 1 zero stamps, 1 left out" in line
+    assert "2 backsteps, 1 repeated stamp, 1 zero stamp, 1 left out" in line
     assert "0.002" in line[: line.index("backsteps")]
     question = "SELECT unnest(clocks, recursive := true) FROM recordings"
     assert main(["sql", str(store), question, "--json"]) == 0

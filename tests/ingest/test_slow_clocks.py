@@ -151,7 +151,7 @@ def test_messages_off_the_clock_are_lost_and_said_so(
     bag = write_bag(Odd(12.0), tmp_path / "bag")
     assert cli.main(["ingest", str(bag), "--store", str(tmp_path / "s"), "--json"]) == 3
     (row,) = json.loads(capsys.readouterr().out)["recordings"]
-    assert "/odom: left out, as their stamps do not fit the clock (1 messages)" in row["losses"]
+    assert "/odom: left out, as their stamps do not fit the clock (1 message)" in row["losses"]
 
 
 # The three recordings of simulations slower than real time, recomputed: rosbags and plain loops.
