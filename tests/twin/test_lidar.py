@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.profile_texts import WAREHOUSE
 
 from restock import native
+from restock.cli import main
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
@@ -178,3 +182,25 @@ def test_truth_knows_what_the_lidar_of_a_robot_does_not_see(lidar: LidarLimits) 
     assert "near_collision" in info["true_condition"][0]
     assert env.sensing.true_clearance_m[0] == pytest.approx(0.1, abs=0.02)
     assert info["signals"]["sector_clearance_m"][0, 0] > 0.5  # straight behind
+
+
+def test_where_the_lidar_is_and_what_it_sees_is_shown_and_what_lies_outside_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = "[robot]\ncasters_m = [[0.6, 0.0]]\n[robot.lidar]\nangle_max_rad = 1.5\n"
+    text = WAREHOUSE.replace("lidar_x_m = 0.0", "lidar_x_m = -0.5") + robot
+    (tmp_path / "amr.toml").write_text(text)
+    assert main(["twin", "robot", str(tmp_path / "amr.toml"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {key: said["robot"][f"body.{key}"] for key in ("length_m", "width_m", "lidar_x_m")} == {
+        "length_m": 0.7,
+        "width_m": 0.5,
+        "lidar_x_m": -0.5,
+    }
+    assert said["robot"]["lidar.angle_max_rad"] == 1.5
+    assert said["outside"] == [
+        "the lidar is 0.15 m outside the outline of [task.body]",
+        "caster 1 is 0.25 m outside the outline of [task.body]",
+    ]
+    assert main(["twin", "robot", "warehouse_amr"]) == 0
+    assert "CHECK" not in capsys.readouterr().out

@@ -17,7 +17,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.ingest.task.robot import Robot
+from restock.ingest.task.robot import Lidar, Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.physics.contact import FLOOR_FRICTION
 from restock.train.twin.physics.model import build_robot_alone
@@ -28,6 +28,7 @@ from restock.train.twin.physics.robot_parts import actuator_places, wheels_of
 TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5
 MOST_TILT_RAD = 0.05
+LEAST_OUTSIDE_M = 0.01  # that is said of a part
 TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
 
 
@@ -116,6 +117,7 @@ def driven_actions(
 def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
     """The values of a robot in the twin: name, value, and where it is from."""
     own = robot is not None and robot.mjcf is not None
+    lidar = Lidar() if robot is None else robot.lidar
     of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
     values: dict[str, Any] = {
         "drive": model.drive,
@@ -129,6 +131,8 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
         "track_ratio": model.turn_track_m / model.track_m,
         "lidar.z_m": model.lidar_z_m,
         "lidar.beams": len(model.bearings_rad),
+        "lidar.angle_min_rad": lidar.angle_min_rad,
+        "lidar.angle_max_rad": lidar.angle_max_rad,
         "max_speed_mps": _known(model.speed_limit[0]),
         "max_yaw_rate_radps": _known(model.speed_limit[1]),
         "max_accel_mps2": model.accel_limit[0],
@@ -145,12 +149,35 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
             origin = "mjcf"
         elif name == "min_turning_radius_m":
             origin = "wheelbase_m, max_steering_rad"
+        elif name.startswith("lidar.angle") and lidar == Lidar(beams=lidar.beams, z_m=lidar.z_m):
+            origin = "default"
         elif name == "track_ratio" and not robot.track_ratio:
             origin = "measured"
         else:
             origin = "profile" if name == "own_model" else robot.origin_of(name)
         rows.append((name, round(value, 4) if isinstance(value, float) else value, origin))
     return rows
+
+
+def outlined(body: Body) -> list[tuple[str, Any, str]]:
+    """The outline of a robot, and where its lidar is on it: name, value, and where it is from."""
+    return [
+        (f"body.{name}", round(getattr(body, name), 4), "task.body")
+        for name in body.__struct_fields__
+    ]
+
+
+def outside(model: RobotModel, body: Body) -> list[str]:
+    """The parts of a robot that are not within its outline, and by how much."""
+    places = {"the lidar": (body.lidar_x_m, 0.0)}
+    for number, (x, y) in enumerate(model.casters_m):
+        places[f"caster {number + 1}"] = (x + model.axle_x_m, y)
+    found = []
+    for name, (x, y) in places.items():
+        over_m = max(abs(x) - body.length_m / 2, abs(y) - body.width_m / 2)
+        if over_m > LEAST_OUTSIDE_M:
+            found.append(f"{name} is {over_m:.2f} m outside the outline of [task.body]")
+    return found
 
 
 def _known(limit: float) -> float | None:

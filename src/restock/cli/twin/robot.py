@@ -25,7 +25,8 @@ class RobotCommand:
     """The floor's coefficient of friction, from 0.04 to 1.6."""
     json: bool = False
     """Print JSON: {"robot": {drive, wheel_radius_m, …}, "driven": [{action, friction,
-    speed_mps, yaw_rate_radps, driven_mps, driven_radps}], "lidar_passes_over": […]}."""
+    speed_mps, yaw_rate_radps, driven_mps, driven_radps}], "lidar_passes_over": […], "outside": […]
+    (parts outside the outline)}."""
 
     def run(self) -> int:
         """Build it and drive every action."""
@@ -38,6 +39,8 @@ class RobotCommand:
             TIMESTEP_S,
             driven_actions,
             measured,
+            outlined,
+            outside,
             robot_model,
         )
         from restock.train.twin.physics.simulation import blocks_of
@@ -50,7 +53,8 @@ class RobotCommand:
         refuse_beyond_steering(profile.robot, profile.task.actions, where=self.profile)
         blocks_of(profile.task, TIMESTEP_S)  # refuses a period that the twin cannot drive
         model = robot_model(profile.robot, profile.task.body)
-        facts = measured(model, profile.robot)
+        facts = outlined(profile.task.body) + measured(model, profile.robot)
+        beyond = outside(model, profile.task.body)
         driven = [
             {"action": name, "friction": self.friction, **row}
             for name, row in zip(
@@ -62,12 +66,15 @@ class RobotCommand:
         unseen = passed_over(model.lidar_z_m) if profile.task.lidar else []
         if self.json:
             values = {name: value for name, value, _ in facts}
-            output.print_json({"robot": values, "driven": driven, "lidar_passes_over": unseen})
+            document = {"robot": values, "driven": driven, "lidar_passes_over": unseen}
+            output.print_json(document | {"outside": beyond})
             return 0
         rows = [{"": n, "value": value, "from": origin} for n, value, origin in facts]
         output.print_table(rows, title=f"{self.profile}: the robot in the twin")
         sys.stdout.write("\n")
         output.print_table(driven, title="Steady motion for each action")
+        for line in beyond:
+            sys.stdout.write(f"\nCHECK: {line}\n")
         if unseen:
             over = ", ".join(unseen)
             sys.stdout.write(
