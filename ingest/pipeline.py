@@ -67,7 +67,8 @@ def ingest(
 
     A recording that is in the store as this profile, these conditions and this software would
     put it there is left alone, unless `force`. One whose rows are largely those of another
-    recording in the store (a part of it, a copy) is kept and said, or refused, by `repeated`.
+    recording in the store (a part of it, a copy) is kept and said, refused, or takes the place of
+    a part of it, by `repeated`.
     `tags` say whose drive it is, before what the recording says itself; "" takes a tag off. Where
     only tags or the profile's [robot] are new, the rows that are there are written with them: the
     status is "tagged". `watch` is told what is being done, how much of it is, and of how much.

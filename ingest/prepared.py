@@ -14,16 +14,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from restock.errors import RecordingError, RestockError, StoreError
+from restock.ingest.remove import remove_recordings
 from restock.ingest.store.lineage import Ingest
 from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.tags import in_words
+from restock.words import counted
 
 GROUP_S = 5.0
 MOST = 64
 Status = Literal["written", "tagged", "unchanged", "dry run"]
-OnRepeat = Literal["keep", "refuse"]
+OnRepeat = Literal["keep", "refuse", "replace"]
 
 
 @dataclass(frozen=True)
@@ -93,20 +95,21 @@ def _refusal(
     store: StoreWriter, one: Prepared, before: Sequence[Prepared]
 ) -> RecordingError | StoreError | None:
     """Why a recording is not to be committed: it is in the store, or before it in its group."""
-    if one.staged is None or one.repeated != "refuse":
+    if one.staged is None or one.repeated in (None, "keep"):
         return None
     ahead = [other.staged for other in before if other.staged]
     try:
         found = store.repeated(one.staged, one.period_s, ahead=ahead)
     except StoreError as error:
         return error
-    if found is None:
+    if found is None or (one.repeated == "replace" and found.the_less):
         return None
     remedy = "leave it out, or use --repeated keep to ingest it anyway"
     if found.the_less:  # as of a recording that was still being written, or salvaged
         remedy = (
             f"this one holds more of the drive: {_removal(store, found.recording_id)} takes that"
-            " one out; then ingest this one again, or keep both with --repeated keep"
+            " one out; then ingest this one again (--repeated replace does both), or keep both with"
+            " --repeated keep"
         )
     return RecordingError(str(found), where=one.result.path, remedy=remedy)
 
@@ -156,7 +159,14 @@ def _finished(
         except StoreError as error:
             return error
     notes = list(one.result.notes)
-    if repeats is not None:
+    if repeats is not None and one.repeated == "replace":
+        try:
+            replaced_by, note = _replaced(store, repeats)
+        except StoreError as error:
+            replaced_by, note = None, f"a part of it stays in the store: {error}"
+        version = replaced_by or version
+        notes.append(note)
+    elif repeats is not None:
         until = f"{repeats}; the audit `repeated_steps` fails until one of them is removed:"
         if repeats.the_less:
             how = f"{_removal(store, repeats.recording_id)} takes out that one, which holds less"
@@ -164,6 +174,22 @@ def _finished(
             how = f"{_removal(store, staged.recording_id)} takes this one out"
         notes.append(f"{until} {how}")
     return replace(one.result, version=version, repeats=repeats, notes=notes)
+
+
+def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
+    """Take a part of what was just ingested out of the store: the store's version, None where it
+    stays; and what is to be said."""
+    why = "it has steps that this one has not"
+    if part.is_part:
+        (told,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
+        if not told.corrections:
+            removed = remove_recordings(store, [part.recording_id])
+            return removed.version, (
+                f"in place of {part.source_file} (recording {part.recording_id}), a part of it, "
+                "which was removed"
+            )
+        why = f"people corrected {counted(told.corrections, 'label')} of it"
+    return None, f"{part}. It stays, as {why}: {_removal(store, part.recording_id)} takes it out"
 
 
 class CommitGroup:

@@ -25,6 +25,7 @@ SKETCH = b"restock.sketch"  # key in the metadata of a manifest
 SKETCH_HASHES = 256
 LEAST_HASHES = 3  # that two recordings must share
 LARGELY = 0.5  # of the smaller recording's rows
+NEARLY_ALL = 0.95  # at its cut, a part has rows of its own
 # Replaced meanwhile, or damaged: no fault of the recording that is being ingested.
 UNREADABLE = (OSError, StoreError, pa.ArrowException)
 PART_ROWS = 2048  # hashed at a time: bounds memory
@@ -41,6 +42,12 @@ class RepeatedDrive:
     rows: int  # of the new recording that it holds too
     share: float  # of the new recording's rows
     share_of_other: float  # of its own rows
+    held: float  # of its own rows that look like no other of it
+
+    @property
+    def is_part(self) -> bool:
+        """Whether the new one holds (nearly) all that it has, and more."""
+        return self.the_less and self.held >= NEARLY_ALL
 
     @property
     def the_less(self) -> bool:
@@ -138,6 +145,7 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive |
         same,
         same / len(rows),
         same / len(other),
+        same / len(theirs),
     )
 
 

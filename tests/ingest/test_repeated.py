@@ -51,10 +51,45 @@ def test_the_whole_after_a_part_is_said(
         "rows": first["transitions"],
         "share": first["transitions"] / whole["transitions"],
         "share_of_other": 1.0,
+        "held": 1.0,
     }
     (note,) = (note for note in whole["notes"] if "same drive twice" in note)
     assert str(part) in note
     assert f"`restock remove {store} {first['recording_id']}` takes out that one" in note
+
+
+def test_the_whole_takes_the_place_of_a_part_where_asked(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of a bag that was still being written the night before. The part does not come back."""
+    store, replace = tmp_path / "store", ("--repeated", "replace")
+    first = ingested(capsys, part, "--salvage", "--store", store, *replace)
+    whole = ingested(capsys, MONDAY, "--store", store, *replace)
+    (note,) = (note for note in whole["notes"] if "which was removed" in note)
+    assert note.startswith(f"in place of {part} (recording {first['recording_id']}), a part of it")
+    assert [row["recording_id"] for row in StoreWriter(store).live().to_pylist()] == [
+        whole["recording_id"]
+    ]
+    again = ingested(capsys, part, "--salvage", "--store", store, *replace)
+    assert again["status"] == "failed"
+    assert whole["recording_id"] in again["error"]
+
+
+def test_what_people_corrected_stays(
+    part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = tmp_path / "store"
+    first = ingested(capsys, part, "--salvage", "--store", store)
+    review = tmp_path / "review.csv"
+    review.write_text(
+        "episode_id,condition,first_step,last_step,verdict\n"
+        f"{first['recording_id']}/0,near_collision,0,3,yes\n"
+    )
+    assert main(["label", str(store), "--corrections", str(review)]) == 0
+    whole = ingested(capsys, MONDAY, "--store", store, "--repeated", "replace")
+    (note,) = (note for note in whole["notes"] if "It stays" in note)
+    assert "people corrected 1 label of it" in note
+    assert f"`restock remove {store} {first['recording_id']}`" in note
 
 
 @pytest.mark.long

@@ -44,10 +44,11 @@ class IngestCommand:
     """Also ingest unchanged recordings again."""
     salvage: bool = False
     """Also read what is intact in damaged or truncated files (exit code 3)."""
-    repeated: Literal["keep", "refuse"] = "keep"
+    repeated: Literal["keep", "refuse", "replace"] = "keep"
     """What to do with a recording whose rows are mostly those of another one in the store (a part
-    of it, a copy, a drive recorded again): keep it and say so (the audit
-    `repeated_steps` then fails), or refuse it."""
+    of it, a copy, a drive recorded again): keep it and say so (the audit `repeated_steps` then
+    fails), refuse it, or replace: what is a part of it leaves the store, and it is refused if the
+    store holds as much or more of it."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()
