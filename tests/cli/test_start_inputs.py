@@ -140,7 +140,7 @@ def test_a_urdf_and_a_map_of_ones_own_go_all_the_way(
     # Once the profile is a person's, a proposal's flags are said to change nothing.
     (out / "profile.toml").write_text((out / "profile.toml").read_text() + "\n# mine\n")
     assert cli.main(["start", *argv, *up_to_the_panel(tmp_path)]) == 3
-    assert "--urdf and --footprint apply only to a proposed profile" in capsys.readouterr().out
+    assert "was edited: --urdf can only change a proposal" in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

@@ -28,7 +28,7 @@ BLOCKED = "blocked_aisle"
 DRIVERS = "behaviour_policies"  # of a row of the coverage
 INSIDE = 0.5  # of the ticks: with returns inside the outline at more, it is not the robot's
 NOT_AGAIN = ("paths", "out", "dry_run", "json")  # of a call: not what the way depends on
-OF_ONE_ROBOT = ("urdf", "footprint")
+OF_ONE_ROBOT = ("urdf", "footprint", "robot")
 
 
 def fullest(document: Document) -> str | None:
@@ -311,6 +311,7 @@ def robot_line(profile: Path | str | None) -> str:
 
 
 __all__ = [
+    "OF_ONE_ROBOT",
     "edited",
     "fit_is_worse",
     "floor_settings",

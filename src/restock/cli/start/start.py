@@ -39,6 +39,9 @@ class StartCommand:
     """For the proposal: the robot's length and width in metres, for example 0.6x0.5."""
     urdf: Path | None = None
     """For the proposal: the robot's URDF. It replaces the recording's /robot_description."""
+    robot: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """For the proposal: which robot, if the recordings are of several: its namespace, for example
+    /robot2."""
     odometry_as_command: bool = False
     """Let the proposal use odometry as the command if no command was recorded."""
     map: Path | None = None

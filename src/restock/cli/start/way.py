@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from restock.cli.start import stages
 from restock.cli.start.decisions import (
+    OF_ONE_ROBOT,
     edited,
     fit_is_worse,
     floor_settings,
@@ -112,10 +113,10 @@ class Way:
         proposed = not own and not edited(to.profile, asked.out)
         if proposed:
             self._propose(asked.paths if len(readable) > 1 else (recording,))
-        elif asked.urdf is not None or asked.footprint is not None:
+        elif given := [name for name in OF_ONE_ROBOT if getattr(asked, name) is not None]:
+            options, why = " and ".join(f"--{n}" for n in given), "given" if own else "edited"
             self._warn(
-                f"{to.profile} was edited: --urdf and --footprint apply only to a proposed "
-                "profile, and have no effect"
+                f"{to.profile} was {why}: {options} can only change a proposal, and has no effect"
             )
         others = [] if own or self.work.plan else of_other_kinds(asked.out)
         mine = [row for row in readable if row["path"] not in others]
@@ -140,6 +141,7 @@ class Way:
         asked, to = self.asked, self.to
         flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
         flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
+        flags += [] if asked.robot is None else ["--robot", asked.robot]
         flags += [ODOMETRY] * asked.odometry_as_command
         flags.append("--hindsight-goals")  # without a goal there is no success to train for
         proposed = self.work.do(stages.propose(to, sources, flags, asked.urdf))
