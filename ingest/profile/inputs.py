@@ -27,7 +27,10 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "heading": {"orientation": False, "yaw_rad": False},  # of a pose by fix
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
     "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
-    "scan": {"ranges_m": True, "angle_min_rad": True, "angle_increment_rad": True},
+    "scan": {
+        **{"ranges_m": True, "angle_min_rad": True},
+        **{"angle_increment_rad": False, "angle_max_rad": False},  # one of them
+    },
     "goal": {"x_m": True, "y_m": True},
     "plan": {"x_m": True, "y_m": True},
     "bumper": {"pressed": True},
@@ -144,6 +147,11 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             unknown.append("steering_rad beside yaw_rate_radps")
         elif not steered and "yaw_rate_radps" not in source.fields:
             missing.append("yaw_rate_radps")
+    if name == "scan":
+        if {"angle_increment_rad", "angle_max_rad"} <= source.fields.keys():
+            unknown.append("angle_max_rad beside angle_increment_rad")
+        elif not {"angle_increment_rad", "angle_max_rad"} & source.fields.keys():
+            missing.append("angle_increment_rad")
     _check_wheelbase(f"inputs.{name}", source, where)
     if unknown or missing:
         problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]

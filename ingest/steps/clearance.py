@@ -37,8 +37,9 @@ def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reducti
 class _ScanReducer:
     def __init__(self, task: Task, topic: str, fields: Mapping[str, str]) -> None:
         self.task, self.topic = task, topic
-        keys = ("ranges_m", "angle_min_rad", "angle_increment_rad")
-        self.paths = [fields[key] for key in keys]
+        self.by_last = "angle_max_rad" in fields
+        last = "angle_max_rad" if self.by_last else "angle_increment_rad"
+        self.paths = [fields[key] for key in ("ranges_m", "angle_min_rad", last)]
         self._maps: dict[tuple[float, float, int], SectorMap] = {}
 
     def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
@@ -48,6 +49,9 @@ class _ScanReducer:
             beams = ranges.lengths
         else:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
+        if self.by_last:
+            with np.errstate(invalid="ignore", over="ignore"):
+                increment = (increment - first) / np.maximum(beams - 1, 1)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
         blind = np.zeros(len(beams), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -53,22 +53,19 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
     latest = aligned.latest("scan")
     ranges = aligned.inputs.column("scan", "ranges_m")
     first = aligned.inputs.numbers("scan", "angle_min_rad")
-    increment = aligned.inputs.numbers("scan", "angle_increment_rad")
+    by_last = "angle_max_rad" in aligned.inputs.by_name["scan"].fields
+    step = aligned.inputs.numbers("scan", "angle_max_rad" if by_last else "angle_increment_rad")
     scans: list[SeenScan | None] = []
     for row, age, fresh, stamp in zip(latest.row, latest.age_ns, latest.fresh, stamps, strict=True):
         if not fresh:
             scans.append(None)
             continue
         one = ranges[row]
-        values = one.values if isinstance(one, Ragged) else one
-        scans.append(
-            SeenScan(
-                int(stamp) - int(age),
-                np.atleast_1d(np.asarray(values, np.float64)),
-                float(first[row]),
-                float(increment[row]),
-            )
-        )
+        values = np.atleast_1d(np.asarray(one.values if isinstance(one, Ragged) else one, float))
+        start, increment = float(first[row]), float(step[row])
+        if by_last:
+            increment = (increment - start) / max(len(values) - 1, 1)
+        scans.append(SeenScan(int(stamp) - int(age), values, start, increment))
     return scans
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.profile_texts import WAREHOUSE
 
-from restock.errors import RecordingError
+from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
-from restock.ingest.profile.profile import load_profile
+from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.steps import clearance
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.task.scan import SectorMap
@@ -92,3 +93,30 @@ def test_an_angle_that_is_no_number_is_named() -> None:
     fields = scans([30], [-3.0], 4)
     with pytest.raises(RecordingError, match="'angle_min' of /scan is not one number per message"):
         REDUCE.apply({**fields, "angle_min": fields["ranges"]})
+
+
+def test_the_last_angle_says_what_the_increment_says() -> None:
+    """As of foxglove.LaserScan, which has no increment."""
+    fields = scans([120, 9, 1, 0], [-3.1, 0.0, -3.1, 0.0], seed=3)
+    first, step = (
+        np.asarray(fields[name], np.float64) for name in ("angle_min", "angle_increment")
+    )
+    ends = {"start": first, "end": first + step * np.array([119, 8, 0, 0])}
+    by_last = {"ranges_m": "ranges", "angle_min_rad": "start", "angle_max_rad": "end"}
+    found = scan_reduction(TASK, "/scan", by_last).apply({"ranges": fields["ranges"], **ends})
+    expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
+        assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
+
+
+@pytest.mark.parametrize(
+    ("last", "told"),
+    [
+        ("", "missing 'angle_increment_rad'"),
+        (', angle_max_rad = "angle_max", angle_increment_rad = "b"', "angle_max_rad beside"),
+    ],
+)
+def test_a_scan_has_an_increment_or_a_last_angle(last: str, told: str) -> None:
+    text = WAREHOUSE.replace(', angle_increment_rad = "angle_increment"', last)
+    with pytest.raises(ConfigError, match=told):
+        parse_profile(text, where="p")
