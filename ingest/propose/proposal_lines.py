@@ -30,6 +30,9 @@ from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import unseen
 from restock.ingest.task.signals import Noise
 
+# The fields of what nothing fills, for a person to name.
+BY_HAND = {"command": ("speed_mps", "yaw_rate_radps"), "pose": ("x_m", "y_m", "yaw_rad")}
+
 
 def in_one_recording(robots: Sequence[str]) -> str:
     """Whose profile it is, where a recording is of several robots."""
@@ -255,9 +258,15 @@ def _input_lines(
             fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
             if role == "pose":
                 fits += ", or transforms that join two frames"
+            named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
             return [
                 f"# MISSING, and required: no topic of {fits}.",
+                "# If one of another type has it (JSON, protobuf, the robot's own), name it here:",
                 f"# [inputs.{role}]",
+                '# topic = "/TOPIC"',
+                '# type = "ITS TYPE"',
+                f"# fields = {{ {named} }}",
+                "# max_age_s = 0.5",
                 "",
             ]
         if role == "wheels":

@@ -204,6 +204,8 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
     assert "or transforms that join two frames" in out
     assert "no topic for pose" in err
+    named = out[out.index("# [inputs.pose]") :].split("\n\n")[0].replace("# ", "")
+    assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
     assert main(["profile", "new", str(bag), "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["missing"] == ["pose"]
 
