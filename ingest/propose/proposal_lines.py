@@ -105,7 +105,7 @@ def _conditions(seen: Evidence) -> list[str]:
 
 def _shows_slip(seen: Evidence) -> bool:
     """Whether anything beside its wheels says how the robot moved."""
-    return seen.motion is None and not _slip_lines(seen)
+    return bool(seen.roles["wheels"]) and seen.motion is None and not _slip_lines(seen)
 
 
 def _slip_lines(seen: Evidence) -> list[str]:
@@ -270,7 +270,12 @@ def _input_lines(
                 "",
             ]
         if role == "wheels":
-            return ["# [inputs.wheels]  # no odometry seen; instead: speeds from poses", ""]
+            by_hand = ["# [motion]", "# window_s = 0.5"] if seen.motion is None else []
+            return [
+                "# [inputs.wheels]  # no odometry seen; instead: speeds from poses",
+                *by_hand,
+                "",
+            ]
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
     topic, kind = fitting[0]

@@ -204,7 +204,8 @@ def test_a_proposal_says_what_no_topic_fills(tmp_path, capsys):
     assert "# [inputs.imu]  # no topic seen; instead: gyro yaw rate taken from the wheels" in out
     assert "or transforms that join two frames" in out
     assert "no topic for pose" in err
-    named = out[out.index("# [inputs.pose]") :].split("\n\n")[0].replace("# ", "")
+    lines = out[out.index("# [inputs.pose]") : out.index("# [inputs.imu]")].splitlines()
+    named = "\n".join(line[2:] for line in lines if "[inputs.wheels]" not in line)
     assert parse_profile(out + named, where="p").inputs.pose.fields["yaw_rad"] == "FIELD"
     assert main(["profile", "new", str(bag), "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["missing"] == ["pose"]
