@@ -13,8 +13,10 @@ from pathlib import Path
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
+from restock.ingest.propose.evidence.commands import commanded
 from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
 from restock.ingest.propose.evidence.gather import Evidence, gather
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
@@ -28,6 +30,7 @@ from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.proposal_lines import in_one_recording, profile_lines, steered_by
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
+from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.needs import as_recorded, read_topics
 
@@ -144,7 +147,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.command", steered_by(seen)))
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
-    advice += _seldom_poses(seen)
+    advice += [*_seldom_poses(seen), *_odd_commands(seen)]
     if seen.commands.steered and not seen.robot.wheelbase_from:
         told = "a guess, and with it every yaw rate that was commanded: measure it"
         advice.append(Advice("inputs.command.wheelbase_m", told))
@@ -175,6 +178,24 @@ def _seldom_poses(seen: Evidence) -> list[Advice]:
         "the robot needs a topic)"
     )
     return [Advice("inputs.pose", text)]
+
+
+def _odd_commands(seen: Evidence) -> list[Advice]:
+    """Where commands ask for what no action has, or for nothing at all."""
+    if not seen.roles["command"]:
+        return []
+    topic, kind = seen.roles["command"][0]
+    told = Input(topic.name, topic.type, dict(kind.fields))
+    path, found = sideways_path(told), []
+    if path in seen.recording.leaves(topic.name):
+        fields = seen.recording.read({topic.name: [path]})[topic.name].fields
+        notes = sideways_notes(told, fields)
+        found = [Advice("inputs.command", note.removeprefix("command: ")) for note in notes]
+    _, _, speed, turn = commanded(seen.recording, seen.roles["command"][0], None)
+    if len(speed) and not speed.any() and not turn.any():
+        text = f"{topic.name} never asks the robot to move: the actions are a guess"
+        found.append(Advice("task.actions", text))
+    return found
 
 
 def _by_rate(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from support.driven_robot import Drive, typed_topics, write_topics
 
+from restock.cli import main
 from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 
@@ -28,3 +32,21 @@ def test_commands_with_a_speed_sideways_are_counted() -> None:
     assert "2 of 4 messages of /cmd_vel contain a sideways speed, up to 0.45 m/s" in notes[0]
     assert sideways_notes(command("linear.x"), {"linear.y": np.zeros(4)}) == []
     assert sideways_notes(command("drive.speed"), {}) == []
+
+
+def test_a_proposal_says_what_is_asked_for_in_vain_or_that_nothing_is(tmp_path, capsys) -> None:
+    """`start` shows what a proposal advises, and not what an ingest notes."""
+    said = {}
+    for name, mps in (("aside", 0.3), ("never", 0.0)):
+        topics = typed_topics(Drive(duration_s=3.0))
+        fields = topics["/cmd_vel"][1].fields
+        count = len(topics["/cmd_vel"][1])
+        fields["linear.y"] = np.full(count, mps)
+        if not mps:
+            fields |= {"linear.x": np.zeros(count), "angular.z": np.zeros(count)}
+        assert main(["profile", "new", str(write_topics(topics, tmp_path / name)), "--json"]) == 0
+        advice = json.loads(capsys.readouterr().out)["advice"]
+        said[name] = {one["key"]: one["text"] for one in advice}
+    assert "of /cmd_vel contain a sideways speed, up to 0.3 m/s" in said["aside"]["inputs.command"]
+    assert "never asks the robot to move: the actions are a guess" in said["never"]["task.actions"]
+    assert not {"task.actions", "inputs.command"} <= said["aside"].keys()
