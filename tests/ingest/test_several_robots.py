@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from support.driven_robot import Drive, typed_topics, up_to_the_panel, write_topics
+from numpy.typing import NDArray
+from support.driven_robot import Drive, columns, typed_topics, up_to_the_panel, write_topics
 
 from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.roles import choose_robot, robots_in, usable_topics
 from restock.ingest.propose.propose import propose_profile
+from restock.replay.store.store import Store
 
 NEEDED = ("/cmd_vel", "/amcl_pose", "/odom")
 
@@ -83,6 +88,49 @@ def test_a_robot_whose_topics_have_names_of_their_own_can_be_named(tmp_path: Pat
             *("/front/scan", "/robot1/base/amcl_pose", "/robot1/base/cmd_vel"),
             "/robot1/base/odom",
         ]
+
+
+def transforms(time_s: NDArray[Any], x_m: NDArray[Any]) -> TopicColumns:
+    """map -> odom, which is 5 m aside, and odom -> base_link, in each message."""
+    count = len(time_s)
+    stamp = columns(time_s, {}).fields["header.stamp"]
+    pairs: dict[str, tuple[Any, Any]] = {
+        "header.stamp": (stamp, stamp),
+        "header.frame_id": ("map", "odom"),
+        "child_frame_id": ("odom", "base_link"),
+        "transform.translation.x": (0.0, x_m),
+        "transform.translation.y": (5.0, 1.0),
+        "transform.rotation.w": (1.0, 1.0),
+    }
+    fields: dict[str, FieldColumn] = {}
+    for path, pair in pairs.items():
+        values = np.stack([np.broadcast_to(np.asarray(one), count) for one in pair], axis=1)
+        values = values.astype(object) if values.dtype.kind == "U" else values
+        fields[f"transforms[].{path}"] = Ragged(values.reshape(-1), np.arange(count + 1) * 2)
+    return columns(time_s, fields, stamped=False)
+
+
+@pytest.mark.parametrize("robots", [(1, 2), (2,)])
+def test_transforms_of_a_robots_own_namespace_are_its_transforms(
+    robots: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Nav2 has them where several robots are on one graph: `/robot2/tf`."""
+    drive, topics = Drive(duration_s=4.0), {}
+    at_s = np.arange(0, 4, 0.05)
+    for n in robots:
+        own = typed_topics(drive)
+        topics |= {f"/robot{n}{name}": own[name] for name in ("/cmd_vel", "/odom")}
+        tf = transforms(at_s, drive.x_at(at_s) + n)
+        topics[f"/robot{n}/tf"] = ("tf2_msgs/msg/TFMessage", tf)
+    bag, file, store = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml", tmp_path / "s"
+    assert main(["profile", "new", str(bag), "--robot", "/robot2", "--out", str(file)]) == 0
+    frames = parse_profile(file.read_text(), where="p").frames
+    assert frames is not None
+    assert (frames.fixed, frames.topic) == ("map", "/robot2/tf")
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    with Store(store) as opened:
+        x, y = opened.sql("SELECT min(pose_x_m), max(pose_y_m) FROM transitions").fetchall()[0]
+    assert (x, y) == (pytest.approx(3.0, abs=0.2), pytest.approx(6.0))
 
 
 def test_of_one_robot_its_namespace_changes_nothing(tmp_path: Path) -> None:

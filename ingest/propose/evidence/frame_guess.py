@@ -21,29 +21,58 @@ class FrameGuess:
     base: str
     chain: str
     localised: bool  # it leads to a map
+    topic: str = Frames().topic
+    static_topic: str = Frames().static_topic
+
+    @property
+    def frames(self) -> Frames:
+        """The `[frames]` of a profile."""
+        return Frames(self.fixed, self.base, topic=self.topic, static_topic=self.static_topic)
 
     def lines(self, *, used: bool) -> list[str]:
         """The `[frames]` of a profile, commented out where it is not `used`."""
         mark = "" if used else "# "
-        why = "poses from /tf and /tf_static" if used else "instead of inputs.pose, from /tf"
-        return [
-            f"{mark}[frames]  # {why}: {self.chain}",
-            f'{mark}fixed = "{self.fixed}"',
-            f'{mark}base = "{self.base}"',
-            f"{mark}max_age_s = 0.5",
-            "",
+        why = f"instead of inputs.pose, from {self.topic}"
+        if used:
+            why = f"poses from {self.topic} and {self.static_topic}"
+        topics = [f'topic = "{self.topic}"', f'static_topic = "{self.static_topic}"']
+        lines = [
+            f"[frames]  # {why}: {self.chain}",
+            f'fixed = "{self.fixed}"',
+            f'base = "{self.base}"',
+            "max_age_s = 0.5",
+            *(topics if self.topic != Frames().topic else []),
         ]
+        return [*(mark + line for line in lines), ""]
+
+
+def transform_topics(recording: Recording) -> tuple[str, str]:
+    """The topics of the moving and the static transforms of the robot to propose for: of its own
+    namespace, else `/tf` and `/tf_static`, else of the only namespace that has any."""
+    names = Frames().topic, Frames().static_topic
+    held = {
+        end: [name.removesuffix(end) for name in recording.topics if name.endswith(end)]
+        for end in names
+    }
+    for end in names:
+        spaces = [space for space in held[end] if set(FIELDS) <= set(recording.leaves(space + end))]
+        one = spaces if len(spaces) == 1 else []
+        for space in (*robots_in(recording)[:1], "", *one):
+            if space in spaces:
+                return space + names[0], space + names[1]
+    return names
 
 
 def transform_edges(recording: Recording) -> Edges:
-    """The transforms of /tf and /tf_static; none where it has no such topics."""
-    usual = Frames()
+    """The transforms of `transform_topics`; none where it has no such topics."""
+    topic, static_topic = transform_topics(recording)
     wanted = {
         name: list(FIELDS)
-        for name in (usual.topic, usual.static_topic)
+        for name in (topic, static_topic)
         if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
     }
-    return Edges.of(usual, recording.read(wanted) if wanted else {})
+    frames = Frames(topic=topic, static_topic=static_topic)
+    return Edges.of(frames, recording.read(wanted) if wanted else {})
 
 
 def transform_frames(recording: Recording) -> FrameGuess | None:
@@ -56,7 +85,8 @@ def transform_frames(recording: Recording) -> FrameGuess | None:
         for base in named_frames(BASE_FRAMES, frames):
             if fixed in upward(base, edges.parents):
                 chain = " -> ".join(_chain(base, fixed, edges))
-                return FrameGuess(fixed, base, chain, fixed.split("/")[-1] == "map")
+                localised = fixed.split("/")[-1] == "map"
+                return FrameGuess(fixed, base, chain, localised, *transform_topics(recording))
     return None
 
 

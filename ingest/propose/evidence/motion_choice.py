@@ -13,7 +13,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
-from restock.ingest.profile.tables import Clock, Frames
+from restock.ingest.profile.tables import Clock
 from restock.ingest.propose.evidence.frame_guess import FrameGuess
 from restock.ingest.propose.evidence.roles import FIX, FIX_FIELDS, Roles
 from restock.ingest.steps.align import align
@@ -86,7 +86,7 @@ def pose_series(
 ) -> tuple[PoseSeries, str]:
     """Every pose at its log time, and where it is from in words."""
     if frames is not None:
-        usual = Frames(fixed=frames.fixed, base=frames.base)
+        usual = frames.frames
         topics = [t for t in (usual.topic, usual.static_topic) if t in recording.topics]
         edges = Edges.of(usual, recording.read({name: list(FIELDS) for name in topics}))
         edges = edges.only({usual.base, usual.fixed})

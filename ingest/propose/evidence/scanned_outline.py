@@ -19,7 +19,11 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.frame_guess import named_frames, transform_edges
+from restock.ingest.propose.evidence.frame_guess import (
+    named_frames,
+    transform_edges,
+    transform_topics,
+)
 from restock.ingest.steps.align import align
 from restock.ingest.steps.frames import Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries
@@ -178,7 +182,8 @@ def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
     for base in named_frames(BASE_FRAMES, frames):
         if base not in upward(plain(scan_frame), edges.parents):
             continue
-        usual = Frames(fixed=base, base=scan_frame)
+        topic, static_topic = transform_topics(recording)
+        usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
         kept = edges.only({base, scan_frame})
         segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
         last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))

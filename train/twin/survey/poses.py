@@ -144,7 +144,7 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     guess = transform_frames(recording)
     along = None
     if guess is not None:
-        along = along_transforms(recording, Frames(fixed=guess.fixed, base=guess.base))
+        along = along_transforms(recording, guess.frames)
     kinds = topics_for(usable, KINDS["pose"])
     fixes = [topic.name for topic, _ in kinds if topic.type == FIX]
     found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
