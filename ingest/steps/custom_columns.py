@@ -158,7 +158,7 @@ def _texts(values: NDArray[Any]) -> list[str]:
 def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
     """The finite elements of each message as one number; a message without any has none."""
     finite = np.isfinite(read.values)
-    values, owner = np.asarray(read.values, np.float64)[finite], read.message[finite]
+    values, owner = np.asarray(read.values[finite], np.float64), read.message[finite]
     message, start, counts = np.unique(owner, return_index=True, return_counts=True)
     if not len(message):
         return PathValues(message, values)

@@ -95,6 +95,14 @@ def test_reductions_are_of_the_finite_elements(how, want):
     assert column(signal("s", "r[]", f'reduce = "{how}"'), {"r": ranges}, [0.0])[5] == want
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_nan_that_signals_is_no_finite_element():
+    """As a flipped bit makes one."""
+    values = np.array([[1.0, 3.0, 3.0]], np.float32)
+    values.view(np.uint32)[0, 2] = 0x7F800001
+    assert column(signal("s", "r[]", 'reduce = "max"'), {"r": values}, [0.0])[5] == 3.0
+
+
 def test_scale_and_offset():
     """Fahrenheit, say."""
     table = signal("s", "v", "scale = 1.8", "offset = 32", 'unit = "°F"')
