@@ -19,10 +19,15 @@ import numpy as np
 
 from restock.arrays import Bools, Ints
 from restock.ingest.steps.align import BY_LOG_TIME
+from restock.ingest.steps.routing import TOO_LARGE
 from restock.ingest.steps.steps import Steps
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
 
+FAR = (
+    "record poses in a frame that begins near the robot (of UTM coordinates, subtract an origin): "
+    "a store's positions would be rounded to decimetres"
+)
 RELEASE_S = 1.0  # that the bumper must have been free for before a robot drives on
 
 
@@ -82,7 +87,8 @@ def why_none(steps: Steps, episodes: Split) -> tuple[str, str | None]:
             f"{off[one.topic]:,} of {one.messages:,} messages of {one.topic} were left out: their "
             f"header stamps do not fit the clock{zero}"
         )
-    return "; ".join(why), BY_LOG_TIME if mostly else None
+    remedy = FAR if reasons and reasons[0][0] == f"pose: {TOO_LARGE}" else None
+    return "; ".join(why), BY_LOG_TIME if mostly else remedy
 
 
 def changed_route(steps: Steps) -> Ints:

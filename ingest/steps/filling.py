@@ -21,7 +21,14 @@ from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.steps.motion import motion_at
-from restock.ingest.steps.routing import LARGEST, Routing, plan_ends, plan_problems, same_goals
+from restock.ingest.steps.routing import (
+    LARGEST,
+    TOO_LARGE,
+    Routing,
+    plan_ends,
+    plan_problems,
+    same_goals,
+)
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.signals import Signals, localised_velocity
@@ -172,7 +179,8 @@ class Filling:
 
     def _set(self, name: str, signal: str, values: F64, known: Bools) -> None:
         sane = np.abs(values) <= LARGEST  # False for NaN
-        self._mark_invalid(~sane, f"{name}: not finite")
+        self._mark_invalid(~np.isfinite(values), f"{name}: not finite")
+        self._mark_invalid(~sane, f"{name}: {TOO_LARGE if name == 'pose' else 'not finite'}")
         self.signals[signal] = np.where(sane & known, values, 0.0)
 
     def _wheels(self) -> F64 | None:

@@ -13,8 +13,10 @@ from restock.ingest.task.signals import Signals
 from restock.ingest.task.surroundings import PLAN_PARTS, plan_distances_m, returns_on_plan
 from restock.ingest.task.task import Task, clearance_ahead
 
-# A number beyond this, in any unit that a signal has, is a fault and counts as not finite.
+# A number beyond this, in any unit that a signal has, is a fault: of a position, a store's float32
+# could not tell centimetres apart.
 LARGEST = 1e6
+TOO_LARGE = "beyond a million"
 _CHUNK = 4096  # poses at a time: bounds memory whatever the recording's length
 
 

@@ -17,6 +17,7 @@ from support.driven_robot import (
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
+from restock.ingest.steps.episodes import split, why_none
 from restock.ingest.steps.filling import parse_policy
 from restock.ingest.steps.steps import steps_of
 
@@ -120,6 +121,18 @@ def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
     assert blind.sum() == 5  # of 1 s
     assert ((at_s[blind] >= 3.0) & (at_s[blind] < 4.0)).all()
     assert set(np.array(steps.problem)[~blind]) == {""}
+
+
+def test_positions_far_from_their_origin_are_refused_with_what_to_do():
+    """UTM northings: finite, but float32 tells no centimetres there."""
+    topics = Drive().topics()
+    topics["/amcl_pose"].fields["pose.pose.position.y"][:] += 5.2e6
+    steps = steps_of(PROFILE, topics)
+    assert set(steps.problem) == {"pose: beyond a million"}
+    why, remedy = why_none(steps, split(PROFILE.task, steps))
+    assert f"pose: beyond a million: {len(steps)} of {len(steps)} ticks" in why
+    assert remedy is not None
+    assert "subtract an origin" in remedy
 
 
 def test_a_pose_without_an_orientation_looks_nowhere():
