@@ -31,6 +31,20 @@ LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
 ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
 
+def recording_path(path: Path | str) -> Path:
+    """The path that is given, which is refused where it is empty: to Path, the working directory.
+
+    Raises:
+        RecordingError: it is empty.
+    """
+    if not str(path).strip():
+        raise RecordingError(
+            "the path of a recording is empty",
+            remedy='is a variable of the shell not set? "." is the working directory',
+        )
+    return Path(path)
+
+
 def recordings_in(path: Path | str) -> list[Path]:
     """The recordings at a path: a file, a bag's folder, a folder of many (searched deeply), or a
     glob. A bag with all its split files is one recording, named by its folder.
@@ -38,12 +52,7 @@ def recordings_in(path: Path | str) -> list[Path]:
     Raises:
         RecordingError: no such path, or no recording in it.
     """
-    if not str(path).strip():  # to Path, the working directory
-        raise RecordingError(
-            "the path of a recording is empty",
-            remedy='is a variable of the shell not set? "." is the working directory',
-        )
-    path = Path(path)
+    path = recording_path(path)
     try:
         return _found(path)
     except OSError as error:  # the folder itself; one within it is named as a recording would be

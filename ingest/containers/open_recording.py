@@ -50,7 +50,7 @@ def open_recording(
         RecordingError: no such file, empty, a Git LFS pointer, no recording, cut short (unless
             `salvage`), or in a serialisation that is not CDR.
     """
-    path = Path(path)
+    path = discover.recording_path(path)
     distro = typestore or DEFAULT_DISTRO
     refuse_unknown(distro)  # before anything is opened
     return _Opening(path, distro, salvage, watch or unwatched).open()

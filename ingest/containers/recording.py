@@ -102,7 +102,7 @@ class Recording:
         self._storages = tuple(storages)
         self.notes = [*notes, *(note for storage in self._storages for note in storage.notes)]
         self._bag_damage, self._cleanup = list(damage), tuple(cleanup)
-        self._bag_metadata = tuple(metadata)
+        self._bag_metadata, self._closed = tuple(metadata), False
         self._streams: dict[str, list[_Stream]] = {}
         # By storage and channel: what its messages are, or why they cannot be decoded.
         self._types: dict[tuple[int, int], MessageType | CannotDecode] = {}
@@ -179,7 +179,7 @@ class Recording:
 
     def qos(self, topic: str) -> str:
         """The quality of service that a topic's publishers offered, as its file has it: YAML."""
-        return next((one.channel.qos for one in self._streams[topic] if one.channel.qos), "")
+        return next((one.channel.qos for one in self._channels(topic) if one.channel.qos), "")
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
@@ -237,7 +237,7 @@ class Recording:
     def fields(self, topic: str) -> list[Leaf]:
         """Every field of a topic's messages, with its type; empty where it cannot be decoded."""
         try:
-            return self._type(self._streams[topic][0]).leaves()
+            return self._type(self._channels(topic)[0]).leaves()
         except CannotDecode:
             return []
 
@@ -253,15 +253,11 @@ class Recording:
         fields that are wide, and of which little is needed.
 
         Raises:
-            RecordingError: the recording has no such topic, or its messages no such field.
+            RecordingError: it has no such topic, or its messages no such field, or it is closed.
         """
-        unknown = [topic for topic in wanted if topic not in self._streams]
-        if unknown:
-            raise RecordingError(
-                f"no topic named {unknown[0]!r}",
-                where=str(self.path),
-                remedy=f"it has {', '.join(sorted(self._streams)) or 'no topics'}",
-            )
+        for topic in wanted:
+            self._channels(topic)
+        self._expect_open()
         readings = {
             topic: TopicReading(self.topics[topic], paths, (reductions or {}).get(topic))
             for topic, paths in wanted.items()
@@ -283,9 +279,10 @@ class Recording:
     def batches(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[Ints, Fields]]:
         """Some messages of a topic after the other, in the order they lie in: their log times (N,),
         and columns of these fields. What cannot be decoded is left out; `read` accounts for it."""
+        self._expect_open()
         for storage in self._storages:
             decoders: dict[int, Decoder] = {}
-            for stream in self._streams[topic]:
+            for stream in self._channels(topic):
                 if stream.storage is storage:
                     with suppress(CannotDecode):
                         decoders[stream.channel.id] = self._decoder(topic, stream, fields)
@@ -300,6 +297,7 @@ class Recording:
         In force is each topic's last message before it, and of `/tf_static`, on which several
         nodes publish, all of them.
         """
+        self._expect_open()
         before: dict[str, list[RawMessage]] = {}
         inside: list[RawMessage] = []
         for storage in self._storages:
@@ -317,6 +315,16 @@ class Recording:
                         before[channel.topic] = list(_messages(channel, batch, np.array([latest])))
         held = [message for messages in before.values() for message in messages]
         return sorted([*held, *inside], key=lambda message: message.log_time_ns)
+
+    def _channels(self, topic: str) -> list[_Stream]:
+        if topic not in self._streams:
+            has, where = ", ".join(sorted(self._streams)) or "no topics", str(self.path)
+            raise RecordingError(f"no topic named {topic!r}", where=where, remedy=f"it has {has}")
+        return self._streams[topic]
+
+    def _expect_open(self) -> None:
+        if self._closed:  # its files would give nothing, as if it had no messages
+            raise RecordingError("it is closed", where=str(self.path), remedy="open it again")
 
     def _read_storage(
         self,
@@ -368,7 +376,8 @@ class Recording:
         return lost
 
     def close(self) -> None:
-        """Close its files."""
+        """Close its files; it cannot be read after it."""
+        self._closed = True
         for storage in self._storages:
             storage.close()
         for clean in self._cleanup:

@@ -322,6 +322,30 @@ def test_a_missing_file_topic_field_and_type_store(mcap: Path, tmp_path: Path) -
             recording.read({"/odom": ["pose.pose"]})
         with pytest.raises(RecordingError, match=r"write poses\[\]"):
             recording.read({"/plan": ["poses.pose.position.x"]})
+        for ask in (
+            lambda: recording.qos("/odm"),
+            lambda: recording.leaves("/odm"),
+            lambda: recording.fields("/odm"),
+            lambda: next(recording.batches("/odm", ["x"])),
+        ):
+            with pytest.raises(RecordingError, match="no topic named '/odm'"):
+                ask()
+    with pytest.raises(RecordingError, match="the path of a recording is empty"):
+        open_recording("")
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_closed_recording_is_not_an_empty_one(container: str, tmp_path: Path) -> None:
+    with open_recording(CONTAINERS[container](tmp_path)) as recording:
+        assert len(recording.raw_between(0, 2**62))
+    recording.close()  # again: nothing happens
+    for read in (
+        lambda: recording.read({"/odom": ["twist.twist.linear.x"]}),
+        lambda: next(recording.batches("/odom", ["twist.twist.linear.x"])),
+        lambda: recording.raw_between(0, 2**62),
+    ):
+        with pytest.raises(RecordingError, match="it is closed\n  open it again"):
+            read()
 
 
 def test_a_cut_mcap_is_refused_and_salvaged(mcap: Path, tmp_path: Path) -> None:
