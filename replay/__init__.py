@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from restock.replay.sampling.gather import gather_rows as gather_rows
     from restock.replay.sampling.priorities import Lap as Lap
     from restock.replay.sampling.priorities import Per as Per
+    from restock.replay.sampling.priorities import PrioritySampler as PrioritySampler
     from restock.replay.sampling.sampler import QuotaSampler as QuotaSampler
     from restock.replay.sampling.sampler import Sampler as Sampler
     from restock.replay.store.audit import load_audits as load_audits
@@ -65,7 +66,7 @@ else:
             "restock.replay.sampling.chunked": ["ChunkedSampler"],
             "restock.replay.sampling.device": ["DeviceSampler"],
             "restock.replay.sampling.gather": ["gather_rows"],
-            "restock.replay.sampling.priorities": ["Lap", "Per"],
+            "restock.replay.sampling.priorities": ["Lap", "Per", "PrioritySampler"],
             "restock.replay.sampling.sampler": ["QuotaSampler", "Sampler"],
             "restock.replay.store.audit": ["load_audits", "load_thresholds", "run_audits"],
             "restock.replay.store.capacity": ["recommend_capacity"],

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
+from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.represented import stands_for_others
 from restock.replay.plan.plan import outcome_column
@@ -228,7 +229,7 @@ def sampler_for(
 
     Args:
         batch_size: logged rows of a batch.
-        seed: of the draws.
+        seed: of the draws: an integer of at least 0, or several.
         planned: what will be drawn, which `max_replays_per_row` is shared out by; default: what the
             mixture says under [planned].
         logs_share: of an online batch, in place of the mixture's.
@@ -236,13 +237,13 @@ def sampler_for(
 
     Raises:
         MixtureError: rows too few for what is planned, where the mixture refuses that; too little
-            memory for a panel that is read in chunks.
+            memory for a panel that is read in chunks; a seed that is none.
     """
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
     within = [stratum.within for stratum in panel.strata]
     controller = controller_for(panel, planned or planned_by(mixture), logs_share)
-    seeds = [seed] if isinstance(seed, int) else list(seed)
+    seeds = _seeds(seed)
     rng = np.random.default_rng([*seeds, 2])
     sampler: Sampler
     if mixture.sampling == "chunked":
@@ -266,6 +267,13 @@ def sampler_for(
         rng=np.random.default_rng([*seeds, 3]),
         needs_td=needs_td(panel),
     )
+
+
+def _seeds(seed: int | Sequence[int]) -> list[int]:
+    given = cast("list[int]", [seed] if np.ndim(seed) == 0 else list(cast("Sequence[int]", seed)))
+    if all(isinstance(one, int | np.integer) and one >= 0 for one in given):
+        return [int(one) for one in given]
+    raise MixtureError(f"seed must be an integer of at least 0, or several, got {seed!r}")
 
 
 def sampler_by_shares(

@@ -186,10 +186,17 @@ class Panel:
         return self._meta
 
     def meta_column(self, name: str) -> NDArray[Any]:
-        """One column of `meta` (n,), without reading the others."""
-        if self._meta is not None:
-            return np.asarray(self._meta[name].to_numpy())
-        return np.asarray(self._read(META, [name])[name].to_numpy())
+        """One column of `meta` (n,), without reading the others.
+
+        Raises:
+            PanelError: it has no such column.
+        """
+        table = self._read(META, [name]) if self._meta is None else self._meta
+        if name not in table.column_names:
+            has = ", ".join(self.meta.column_names)
+            what = f"its meta has no column {name!r}"
+            raise PanelError(what, where=str(self.path), remedy=f"it has {has}")
+        return np.asarray(table[name].to_numpy())
 
     def _read(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Raises PanelError where the file is damaged."""

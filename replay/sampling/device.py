@@ -12,6 +12,7 @@ sampler.update(rows, td.abs())                            # nor does this wait f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -139,8 +140,8 @@ class DeviceSampler(Stateful):
         """|TD error| (n,) of rows (n,) just learnt from, on the device; counts from the next block.
 
         Of a row that is there more than once the largest: which is written last is not defined
-        on a GPU, and a run is to repeat itself. A TD error that is not finite is refused when the
-        next block is drawn: to look at it here would wait for the device.
+        on a GPU, and a run is to repeat itself. A TD error that is negative or not finite is
+        refused when the next block is drawn: to look at it here would wait for the device.
         """
         if not self._ruled:
             return
@@ -150,7 +151,7 @@ class DeviceSampler(Stateful):
         self._priority.scatter_reduce_(0, place, priority, "amax", include_self=False)
         self._new[place] = False
         self._largest.scatter_reduce_(0, stratum, priority, "amax")
-        self._finite &= torch.isfinite(errors).all()
+        self._finite &= ((errors >= 0) & (errors < math.inf)).all()
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
         """Other shares (S,) from the next batch on; what was drawn ahead goes back.
@@ -244,12 +245,13 @@ class DeviceSampler(Stateful):
         """Rows not drawn yet get the largest priority so far. Waits for the device, once a block.
 
         Raises:
-            MixtureError: there were TD errors that are not finite.
+            MixtureError: there were TD errors that are negative or not finite.
         """
         if not bool(self._finite):
             raise MixtureError(
-                "TD errors are not finite",
-                remedy="training has diverged: lower the learning rate, or slow the target down",
+                "TD errors are negative, or not finite",
+                remedy="give their absolute values; where they are not finite, training has "
+                "diverged: lower the learning rate, or slow the target down",
             )
         self._priority = torch.where(self._new, self._largest[self._stratum], self._priority)
 

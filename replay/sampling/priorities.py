@@ -15,7 +15,6 @@ the block, and the weights are those of that distribution.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -27,7 +26,7 @@ from restock import native
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Prioritised, Within
-from restock.replay.sampling.sampler import QuotaSampler, Sampler
+from restock.replay.sampling.sampler import QuotaSampler, Sampler, checked_errors
 from restock.state import Stateful
 
 # Of batches drawn from one state of the priorities. A block draws at most a sixteenth of the rows,
@@ -170,19 +169,14 @@ class Priorities(Stateful):
         """New |TD error| (n,) of rows (n,); those of strata without a rule are left alone.
 
         Raises:
-            MixtureError: a TD error that is not finite.
+            MixtureError: a TD error that is negative or not finite, or not one a row.
         """
-        place, errors = self._place[rows], np.asarray(td_abs, np.float32)
+        place, errors = self._place[rows], checked_errors(td_abs, rows)
         if self._some_unruled:
             place, errors = place[place >= 0], errors[place >= 0]
         stratum: Any = self._stratum[place] if len(self.rules) > 1 else 0
         priority = self.exponents.priority(errors, stratum)
         largest = float(priority.max(initial=0.0))
-        if not math.isfinite(largest):  # max passes NaN on
-            raise MixtureError(
-                f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
-                remedy="training has diverged: lower the learning rate, or slow the target down",
-            )
         self._priority[place] = priority
         if self._any_new:
             self._new[place] = False
@@ -332,7 +326,7 @@ class PrioritySampler(QuotaSampler):
         """|TD error| (n,) of rows (n,) just learnt from: their priorities from the next block on.
 
         Raises:
-            MixtureError: a TD error that is not finite.
+            MixtureError: a TD error that is negative or not finite, or not one a row.
         """
         self.priorities.update(rows, td_abs)
 

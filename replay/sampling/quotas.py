@@ -76,9 +76,9 @@ class Quotas(Stateful):
 
     def set_batch_size(self, batch_size: int) -> None:
         """Another size from the next batch on."""
-        if batch_size < 1:
-            raise MixtureError(f"batch_size must be at least 1, got {batch_size}")
-        self.batch_size = batch_size
+        if not isinstance(batch_size, int | np.integer) or batch_size < 1:
+            raise MixtureError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
+        self.batch_size = int(batch_size)
         self._mean = (self.shares * batch_size).tolist()
 
     def restored(self) -> None:

@@ -6,6 +6,7 @@ of 12, and a share of 0.003 of a batch is met over time, because the rounding is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
@@ -18,6 +19,32 @@ from restock.replay.sampling.quotas import Quotas
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
+
+
+def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
+    """|TD error| (n,) of rows (n,): what a priority or a share can follow.
+
+    Raises:
+        MixtureError: one that is negative or not finite, or not one a row.
+    """
+    errors = np.asarray(td_abs, np.float32)
+    if errors.shape != np.shape(rows):
+        raise MixtureError(
+            f"TD errors of shape {errors.shape} for rows of shape {np.shape(rows)}",
+            remedy="give one for each row that was drawn, in their order",
+        )
+    low, high = float(errors.min(initial=0.0)), float(errors.max(initial=0.0))  # pass NaN on
+    if not math.isfinite(low + high):
+        raise MixtureError(
+            f"{int((~np.isfinite(errors)).sum())} TD errors are not finite",
+            remedy="training has diverged: lower the learning rate, or slow the target down",
+        )
+    if low < 0:
+        raise MixtureError(
+            f"{int((errors < 0).sum())} TD errors are negative, the least {low:g}",
+            remedy="give their absolute values",
+        )
+    return errors
 
 
 class Sampler(Protocol):

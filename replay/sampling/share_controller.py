@@ -25,6 +25,7 @@ from restock.replay.mixture.shares import (
     wanted_shares,
     within_limits,
 )
+from restock.replay.sampling.sampler import checked_errors
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # shares with a schedule are worked out again after so many
@@ -245,10 +246,15 @@ class ShareController(Stateful):
         """A batch was learnt from: |TD error| (n,) of its rows of these strata (n,).
 
         True where the shares changed.
+
+        Raises:
+            MixtureError: where shares follow them, an error that is negative or not finite, or not
+                one a row.
         """
         rule = self.mixture.adaptive
         if rule is None:
             return False
+        td_abs = checked_errors(td_abs, stratum)
         self.learnt += 1
         stepping = self.learnt > rule.after_updates and self.learnt % rule.every_updates == 0
         for source in self.sources:

@@ -59,13 +59,16 @@ def test_weights_are_those_of_the_distribution_drawn_from(
         )
 
 
-def test_errors_that_are_not_finite_are_refused_at_the_next_block(device: torch.device) -> None:
-    drawing = sampler(device, rule=Per())
-    for _ in range(64):
-        drawn, _ = drawing.draw()
-    drawing.update(drawn, torch.full((50,), float("nan"), device=device))
-    with pytest.raises(MixtureError, match="not finite"):
-        drawing.draw()
+def test_errors_that_are_negative_or_not_finite_are_refused_at_the_next_block(
+    device: torch.device,
+) -> None:
+    for wrong in (float("nan"), float("inf"), -0.5):
+        drawing = sampler(device, rule=Per())
+        for _ in range(64):
+            drawn, _ = drawing.draw()
+        drawing.update(drawn, torch.full((50,), wrong, device=device))
+        with pytest.raises(MixtureError, match="negative, or not finite"):
+            drawing.draw()
 
 
 def test_a_row_in_two_strata_is_refused() -> None:
