@@ -91,7 +91,7 @@ class IngestJob:
 
 
 def ingest_all(
-    paths: Sequence[Path],
+    paths: Sequence[Path | str],
     job: IngestJob,
     *,
     workers: int = 1,
@@ -112,16 +112,17 @@ def ingest_all(
     from restock.ingest.prepared import CommitGroup
     from restock.ingest.store.writer import StoreWriter
 
+    taken = [Path(path) for path in paths]
     group = CommitGroup(StoreWriter(job.store) if job.store is not None else None)
-    some = min(workers, len(paths))
+    some = min(workers, len(taken))
     if engine == "ray":
         from restock.ingest.on_ray import prepare_on_ray
 
-        read = prepare_on_ray(job, paths, workers=workers, patience_s=group.due_in_s)
+        read = prepare_on_ray(job, taken, workers=workers, patience_s=group.due_in_s)
     elif some <= 1:
-        read = _one_by_one(job, paths, group, watch)
+        read = _one_by_one(job, taken, group, watch)
     else:
-        read = side_by_side(job.prepare, paths, some, died=_died, patience_s=group.due_in_s)
+        read = side_by_side(job.prepare, taken, some, died=_died, patience_s=group.due_in_s)
     next_up = 0
     try:
         with closing(read):
@@ -131,11 +132,11 @@ def ingest_all(
                 else:
                     group.add(*arrived)
                 while next_up in group.results:
-                    yield paths[next_up], group.results.pop(next_up)
+                    yield taken[next_up], group.results.pop(next_up)
                     next_up += 1
         group.commit()
-        for place in range(next_up, len(paths)):
-            yield paths[place], group.results.pop(place)
+        for place in range(next_up, len(taken)):
+            yield taken[place], group.results.pop(place)
     finally:
         group.discard()
 

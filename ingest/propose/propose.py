@@ -75,7 +75,7 @@ def propose_profile(
     name: str,
     *,
     footprint: Footprint | None = None,
-    urdf: Path | None = None,
+    urdf: Path | str | None = None,
     odometry_as_command: bool = False,
     hindsight_goals: bool = False,
 ) -> Proposal:
@@ -94,7 +94,7 @@ def propose_profile(
         ConfigError: the URDF cannot be used; says why.
     """
     seen = gather(
-        *(recording, footprint, urdf),
+        *(recording, footprint, None if urdf is None else Path(urdf)),
         odometry_as_command=odometry_as_command,
         hindsight_goals=hindsight_goals,
     )

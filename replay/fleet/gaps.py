@@ -54,7 +54,7 @@ def find_gaps(
     mixture: Mixture,
     *,
     name: str,
-    folder: Path | None = None,
+    folder: Path | str | None = None,
     kinds: Sequence[str] = (),
     thresholds: Thresholds | None = None,
     min_rows: int = 0,
@@ -73,7 +73,7 @@ def find_gaps(
         ConfigError, MixtureError, StoreError: as `plan_panel` does.
     """
     asked = _without_split(store, uncorrected(mixture))
-    with open_source(store, asked, folder=folder) as source:
+    with open_source(store, asked, folder=None if folder is None else Path(folder)) as source:
         plan = plan_panel(source.connection, asked, source.conditions, source.others)
     yields = read_yields(store.connection, kinds)
     gaps = _of_strata(plan, yields, f"mixture {name}")

@@ -84,13 +84,14 @@ class _Episode:
     recording_start_ns: int
 
 
-def read_verdicts(path: Path, store: Store) -> Verdicts:
+def read_verdicts(path: Path | str, store: Store) -> Verdicts:
     """The corrections that a file gives, every line of it checked.
 
     Raises:
         LabelError: the file cannot be read, a line names rows or a condition that are not there,
             or two lines contradict each other; names the lines.
     """
+    path = Path(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

@@ -82,7 +82,7 @@ def find_moment(
     *,
     before_s: float = 5.0,
     after_s: float = 5.0,
-    recording: Path | None = None,
+    recording: Path | str | None = None,
     profile: str | None = None,
 ) -> Moment:
     """The seconds around a row of a store.

@@ -69,7 +69,7 @@ def find_origin(
     sources: Sequence[StoreVersion],
     transition: int,
     *,
-    recording: Path | None = None,
+    recording: Path | str | None = None,
     profile: str | None = None,
 ) -> Origin:
     """Look a transition up in the stores, first to last.
@@ -218,7 +218,7 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
     return [f"ingested or labelled again since (version {now.store['version']}): {changes}"]
 
 
-def _interpret(origin: Origin, recording: Path | None, name: str | None) -> None:
+def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -> None:
     """What the profile says of the recording: which topics were read, and what they held."""
     manifest, row = origin.recording, origin.transition
     if manifest is None:

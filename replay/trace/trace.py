@@ -39,8 +39,8 @@ class TracePlaces:
     """New places of what was moved, and the recording and profile to read."""
 
     store: str | None = None
-    panel: Path | None = None
-    recording: Path | None = None
+    panel: Path | str | None = None
+    recording: Path | str | None = None
     profile: str | None = None
     version: Version | None = None  # of the store that a trace begins at
 
@@ -107,7 +107,7 @@ def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
         _of_twin(trace, run, document, audit)
         return
     run_panel = document.get("panel") or {}
-    panel_path = where.panel or Path(run_panel.get("path", ""))
+    panel_path = Path(where.panel or run_panel.get("path", ""))
     if not (panel_path / HEADER).is_file():
         raise PanelError(
             "the run's panel does not exist",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from restock.public import FACES, imported, rewrite
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
 EXAMPLES = sorted((ROOT / "docs" / "examples").glob("*.py"))
 ROOMS = [face for face in FACES if face not in ("restock", "restock.report")]
+# Made by an `open` of their own, or by a function; and what a study's folders are.
+HOLD_PATHS = {"Panel", "Recording", "Run", "StudyPlan"}
 ROOM_FOLDERS = ("ingest", "replay", "train")
 # What a path may begin with, and the names that may follow.
 KNOWN = {face: set(importlib.import_module(face).__all__) for face in FACES}
@@ -43,6 +46,22 @@ def test_importing_restock_is_enough_to_reach_a_room() -> None:
     assert python(code) == "EpisodeSpec train"
     with pytest.raises(AttributeError, match="module 'restock' has no attribute 'nothing'"):
         restock.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("face", [*ROOMS, "restock.report"])
+def test_whatever_takes_a_path_takes_its_text(face: str) -> None:
+    """A notebook has its paths as text: one function that takes no text is one to remember."""
+    module, only_paths = importlib.import_module(face), []
+    for name in module.__all__:
+        value = getattr(module, name)
+        asks = [] if name in HOLD_PATHS or name == "FeedOptions" else [value]
+        asks += [getattr(value, way) for way in ("open", "create") if hasattr(value, way)]
+        for ask in filter(callable, asks):
+            for argument in inspect.signature(ask).parameters.values():
+                words = set(re.findall(r"\w+", str(argument.annotation)))
+                if "Path" in words and "str" not in words:
+                    only_paths.append(f"{name}({argument})")
+    assert not only_paths
 
 
 @pytest.mark.parametrize("face", ROOMS)

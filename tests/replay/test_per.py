@@ -288,7 +288,7 @@ def test_what_cannot_be_a_priority_is_refused() -> None:
         sampler(Per()).update(np.array([0, 2]), np.array([1.0, np.nan]))
     for rule in (Per(), Lap()):
         # Signed, rows of a negative error were not drawn again.
-        with pytest.raises(MixtureError, match="1 TD errors are negative, the least -0.5"):
+        with pytest.raises(MixtureError, match=r"1 TD errors are negative, the least -0\.5"):
             sampler(rule).update(np.array([0, 2]), np.array([1.0, -0.5]))
         for wrong in (np.ones(1), np.ones(()), np.ones((2, 1))):
             with pytest.raises(MixtureError, match=r"for rows of shape \(2,\)"):

@@ -303,5 +303,7 @@ def test_seeds_and_batch_sizes_of_numpy_are_those_of_python(panels: Callable[[st
 
 
 def test_a_column_that_a_panel_has_not_is_named(panels: Callable[[str], Panel]) -> None:
-    with pytest.raises(PanelError, match="no column 'rewards'\n  it has transition_id, .*, reward"):
+    with pytest.raises(
+        PanelError, match=r"no column 'rewards'\n  it has transition_id, .*, reward"
+    ):
         panels("uniform").meta_column("rewards")

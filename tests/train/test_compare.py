@@ -11,6 +11,9 @@ import pytest
 from support.finished_runs import UPDATES, document, make_run
 
 from restock.cli import main
+from restock.errors import RunError
+from restock.train.comparison.compare import compare
+from restock.train.comparison.diagnose import diagnose
 from restock.train.run.run import Run
 from restock.train.study.page import as_markdown
 
@@ -216,6 +219,18 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     ):
         assert main(["compare", *words]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_comparison_without_runs_or_of_an_unknown_treatment_is_refused(tmp_path) -> None:
+    first, second = arm(tmp_path, "a", range(2)), arm(tmp_path, "b", range(2))
+    paths = [[Path(text) for text in texts] for texts in (first, second)]
+    assert compare(first, second).verdict == compare(*paths).verdict
+    with pytest.raises(RunError, match="no run was given\n  give at least one of each"):
+        compare([], second)
+    with pytest.raises(RunError, match="no run was given"):
+        diagnose([])
+    with pytest.raises(RunError, match="no treatment 'algorithms'\n  choose from algorithm, "):
+        compare(first, second, treatment="algorithms")
 
 
 def test_runs_that_are_not_independent_seeds_are_refused(tmp_path, capsys) -> None:

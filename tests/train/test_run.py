@@ -76,6 +76,16 @@ def test_a_row_with_a_missing_or_unknown_column_is_refused(tmp_path: Path) -> No
         run.append_columns("policies", {"rows": [1]})
 
 
+def test_a_run_is_named_by_its_path_or_its_text_and_an_unknown_table_is_refused(
+    tmp_path: Path,
+) -> None:
+    Run.create(str(tmp_path / "a"), {"seed": 1})
+    run = Run.open(str(tmp_path / "a"))
+    assert run.path == tmp_path / "a"
+    with pytest.raises(RunError, match=r"a: there is no table 'audits'\n  it has .*audit"):
+        run.table("audits")
+
+
 def test_reopening_truncates_to_the_checkpoint(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     run.append("policies", [policies(1, 10)])

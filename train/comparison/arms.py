@@ -101,7 +101,7 @@ class Difference:
 class Arm:
     """Runs of one method. Raises RunError where they are not, or have not learnt anything."""
 
-    def __init__(self, name: str, paths: Sequence[Path]) -> None:
+    def __init__(self, name: str, paths: Sequence[Path | str]) -> None:
         self.name = name
         self.runs = [Run.open(path) for path in paths]
         for run in self.runs:
@@ -153,8 +153,11 @@ def refuse_dependent(runs: Sequence[Run]) -> None:
     """Runs of one method are independent seeds of it, or their spread is too small.
 
     Raises:
-        RunError: two are one run (or copies of it) or have one seed, or their settings differ.
+        RunError: there is none, two are one run (or copies of it) or have one seed, or their
+            settings differ.
     """
+    if not runs:
+        raise RunError("no run was given", remedy="give at least one of each method")
     by_seed: dict[Any, Run] = {}
     for run in runs:
         unlike = [

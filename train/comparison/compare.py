@@ -84,8 +84,8 @@ class Comparison:
 
 
 def compare(
-    first: Sequence[Path],
-    second: Sequence[Path],
+    first: Sequence[Path | str],
+    second: Sequence[Path | str],
     *,
     treatment: Treatment = "algorithm",
     limits: ComparabilityLimits = ComparabilityLimits(),  # noqa: B008  (frozen)
@@ -97,8 +97,12 @@ def compare(
 
     Raises:
         RunError: a run is missing, has no updates, or does not belong to its arm; two of an arm
-            are one run or have one seed; or only some of the runs are in both arms.
+            are one run or have one seed; an arm has no run; or only some of the runs are in both
+            arms. Also an unknown treatment.
     """
+    if treatment not in ALLOWED:
+        what = f"there is no treatment {treatment!r}"
+        raise RunError(what, remedy=f"choose from {', '.join(ALLOWED)}")
     arms = Arm("first", first), Arm("second", second)
     identical = _identical(*arms)
     rng = np.random.default_rng(seed)

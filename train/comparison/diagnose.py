@@ -56,8 +56,8 @@ def diagnose(
     """Diagnose runs of one method, which differ in their seed.
 
     Raises:
-        RunError: a run has no evaluation after its updates; or two of them are one run, have one
-            seed or differ in more than it.
+        RunError: no run is given, a run has no evaluation after its updates; or two of them are
+            one run, have one seed or differ in more than it.
     """
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]

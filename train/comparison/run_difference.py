@@ -29,7 +29,7 @@ Rows = list[dict[str, Any]]
 _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 
 
-def diff_runs(first: Path, second: Path, *, seed: int = 0) -> dict[str, Any]:
+def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[str, Any]:
     """What is different in `second`, as plain values: what `restock diff --json` prints.
 
     Raises:
@@ -46,7 +46,7 @@ def diff_runs(first: Path, second: Path, *, seed: int = 0) -> dict[str, Any]:
         )
     settings = [asdict(difference) for difference in differences(a, b)]
     source, evaluation, note = _evaluations(a, b, np.random.default_rng(seed))
-    verdict = _verdict(first, second)
+    verdict = _verdict(a.path, b.path)
     return {
         "kind": "run",
         "different": bool(settings) or any(row["difference"] for row in evaluation),

@@ -84,7 +84,7 @@ def diagnose_before_training(
     twin: bool = True,
     perturbation: Perturbation | None = None,
     task_hash: str | None = None,
-    run: Path | None = None,
+    run: Path | str | None = None,
     seed: int = 0,
 ) -> RowDiagnosis:
     """Hold the rows of a panel or a store against the twin, and against the task's definitions.
@@ -106,7 +106,7 @@ def diagnose_before_training(
     own = opened.profile
     fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not requested")
     diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
-    places = [*([run] if run is not None else []), *opened.folders]
+    places = [*([Path(run)] if run is not None else []), *opened.folders]
     diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
     diagnosis.about.update(
         path=str(path), profile=own.name, task_hash=own.task.hash,

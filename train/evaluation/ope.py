@@ -124,7 +124,7 @@ def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
 
 
 def evaluate_run_off_policy(
-    path: Path,
+    path: Path | str,
     logs: str | None,
     config: OpeConfig = OpeConfig(),  # noqa: B008  (frozen)
     progress: Callable[[int], None] | None = None,
@@ -143,7 +143,7 @@ def evaluate_run_off_policy(
         RunError: no such run, no policy kept, or no episode that it did not learn from.
         StoreError, PanelError: no such logs.
     """
-    return evaluate_planned(plan_off_policy(path, logs, config), progress, write=write)
+    return evaluate_planned(plan_off_policy(Path(path), logs, config), progress, write=write)
 
 
 def evaluate_planned(

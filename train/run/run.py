@@ -65,12 +65,13 @@ class Run:
         self._on_disk: dict[str, int] = {}  # rows per table
 
     @classmethod
-    def create(cls, path: Path, document: Mapping[str, Any]) -> Run:
+    def create(cls, path: Path | str, document: Mapping[str, Any]) -> Run:
         """A new directory with `config.json`.
 
         Raises:
             RunError: there is something at `path` already.
         """
+        path = Path(path)
         check_free(path)
         path.mkdir(parents=True, exist_ok=True)
         whole = {"format": FORMAT, **document}
@@ -81,13 +82,14 @@ class Run:
         return run
 
     @classmethod
-    def open(cls, path: Path) -> Run:
+    def open(cls, path: Path | str) -> Run:
         """An existing run.
 
         Raises:
             RunError: there is none at `path`, or of a format this version does not know. What is
             wrong with one of its tables is said when that is asked for.
         """
+        path = Path(path)
         config = path / "config.json"
         if not config.exists():
             raise RunError(
@@ -144,8 +146,12 @@ class Run:
         """A table with all rows appended so far, flushed or not.
 
         Raises:
-            RunError: its file is damaged.
+            RunError: its file is damaged, or a run has no such table.
         """
+        if name not in TABLES:
+            has = ", ".join(TABLES)
+            where = str(self.path)
+            raise RunError(f"there is no table {name!r}", where=where, remedy=f"it has {has}")
         written = self._flushed(name)
         if self._pending[name]:
             self._written[name] = written = pa.concat_tables([written, *self._pending[name]])

@@ -198,14 +198,14 @@ class Study(Checked, frozen=True):
         return next(arm for arm in self.arms if arm.name == name)
 
 
-def load_study(path: Path) -> Study:
+def load_study(path: Path | str) -> Study:
     """A study from a TOML file.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
     remedy = "docs/study.md lists every key with its meaning"
-    study = typed(read_toml(path), Study, where=str(path), remedy=remedy)
+    study = typed(read_toml(Path(path)), Study, where=str(path), remedy=remedy)
     refuse_unknown_names(study.evaluation, str(path))
     for arm in study.arms:
         sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]

@@ -28,14 +28,16 @@ class ViewOptions:
 
     before_s: float = 5.0
     after_s: float = 5.0
-    recording: Path | None = None  # scans, plans and all other topics are in it
+    recording: Path | str | None = None  # scans, plans and all other topics are in it
     profile: str | None = None
     critic: str | None = None  # a run
     beside: str | None = None  # CONDITION/SEED of an episode of the evaluation of `beside_run`
-    beside_run: Path | None = None
+    beside_run: Path | str | None = None
 
 
-def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> dict[str, Any]:
+def write_view(
+    trace: Trace, path: Path | str, options: ViewOptions | None = None
+) -> dict[str, Any]:
     """Write the seconds around a traced row; returns what is in the file.
 
     Args:
@@ -48,7 +50,7 @@ def write_view(trace: Trace, path: Path, options: ViewOptions | None = None) -> 
         RunError: driven again that episode is not the recorded one.
         StoreError: the row is of the twin: no store has what was before and after it.
     """
-    options = options or ViewOptions()
+    options, path = options or ViewOptions(), Path(path)
     check_view(path)
     if trace.origin is None:
         raise StoreError(
@@ -119,7 +121,7 @@ def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
         )
     from restock.train.view.evaluated import Beside, evaluated_moment
 
-    run = options.beside_run
+    run = Path(options.beside_run)
     evaluated = evaluated_moment(run, options.beside, begins_ns=moment.window_ns[0])
     along = None if options.critic is None else critic_along(options.critic, evaluated.moment)
     return Beside(evaluated, along)

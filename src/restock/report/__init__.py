@@ -25,7 +25,9 @@ from restock.report.study.study import study_page
 from restock.train.twin.calibration.twin_gap import read_gap
 
 
-def build_report(run: Path, out: Path | None = None, figures: Path | None = None) -> Path:
+def build_report(
+    run: Path | str, out: Path | str | None = None, figures: Path | str | None = None
+) -> Path:
     """Write the report of a run directory; returns its path.
 
     Each figure is written into the folder `figures`, too, as SVG and PNG, where one is named.
@@ -33,11 +35,13 @@ def build_report(run: Path, out: Path | None = None, figures: Path | None = None
     Raises:
         RunError: no run there, or one with nothing to report on yet.
     """
-    content = page(gather(run))
-    return write_page(content, out if out is not None else run / "report.html", figures)
+    content = page(gather(Path(run)))
+    return write_page(content, out if out is not None else Path(run) / "report.html", figures)
 
 
-def write_gap_page(folder: Path, out: Path | None = None, figures: Path | None = None) -> Path:
+def write_gap_page(
+    folder: Path | str, out: Path | str | None = None, figures: Path | str | None = None
+) -> Path:
     """Write the page of a measured gap (`restock twin gap --out FOLDER`); returns its path.
 
     Each figure is written into the folder `figures`, too, where one is named.
@@ -45,17 +49,21 @@ def write_gap_page(folder: Path, out: Path | None = None, figures: Path | None =
     Raises:
         RunError: there is none in `folder`.
     """
-    content = gap_page(read_gap(folder))
-    return write_page(content, out if out is not None else folder / "index.html", figures)
+    content = gap_page(read_gap(Path(folder)))
+    return write_page(content, out if out is not None else Path(folder) / "index.html", figures)
 
 
-def write_drift_page(drift: Drift, out: Path) -> Path:
+def write_drift_page(drift: Drift, out: Path | str) -> Path:
     """Write the page of what `measure_drift` found; returns its path."""
     return write_page(drift_page(drift), out)
 
 
 def write_coverage_page(
-    store: Store, gaps: dict[str, Any], drift: Drift | str, out: Path, figures: Path | None = None
+    store: Store,
+    gaps: dict[str, Any],
+    drift: Drift | str,
+    out: Path | str,
+    figures: Path | str | None = None,
 ) -> Path:
     """Write the page of a store's coverage; returns its path.
 
@@ -67,23 +75,26 @@ def write_coverage_page(
 
 
 def write_study_page(
-    study: dict[str, Any], out: Path, name: str = "", figures: Path | None = None
+    study: dict[str, Any], out: Path | str, name: str = "", figures: Path | str | None = None
 ) -> Path:
     """Write the page of a study from its findings (`study.json`); returns its path."""
     return write_page(study_page(study, name), out, figures)
 
 
-def write_comparison_page(found: dict[str, Any], out: Path, figures: Path | None = None) -> Path:
+def write_comparison_page(
+    found: dict[str, Any], out: Path | str, figures: Path | str | None = None
+) -> Path:
     """Write the page of a comparison (`restock compare --json`); returns its path."""
     return write_page(comparison_page(found), out, figures)
 
 
-def write_card(run: Path) -> tuple[dict[str, Any], str]:
+def write_card(run: Path | str) -> tuple[dict[str, Any], str]:
     """Write the replay card into a run directory; returns it as JSON values and as Markdown.
 
     Raises:
         RunError: as `build_report`.
     """
+    run = Path(run)
     card = replay_card(gather(run))
     markdown = as_markdown(card)
     write_text(run / "replay_card.json", json.dumps(card, indent=1, default=str) + "\n")

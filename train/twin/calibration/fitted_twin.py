@@ -110,7 +110,7 @@ def fleet_schedule(fits: Sequence[FittedTwin]) -> Schedule:
     )
 
 
-def write_fit(path: Path, fits: Sequence[FittedTwin]) -> None:
+def write_fit(path: Path | str, fits: Sequence[FittedTwin]) -> None:
     """Write the perturbation of one fit, or the schedule of several, whole or not at all.
 
     Raises:
@@ -119,7 +119,7 @@ def write_fit(path: Path, fits: Sequence[FittedTwin]) -> None:
     """
     text = fits[0].toml() if len(fits) == 1 else _schedule_toml(fits)
     try:
-        write_text(path, text, exclusive=True)
+        write_text(Path(path), text, exclusive=True)
     except FileExistsError as error:
         raise ConfigError(
             "already exists", where=str(path), remedy="choose another --out"

@@ -181,12 +181,13 @@ def check_place(folder: Path) -> None:
         raise RunError("already exists", where=str(folder), remedy="choose another --out")
 
 
-def write_gap(gap: TwinGap, folder: Path) -> None:
+def write_gap(gap: TwinGap, folder: Path | str) -> None:
     """Write a gap; one measured before is replaced.
 
     Raises:
         RunError: there is something else at `folder`.
     """
+    folder = Path(folder)
     check_place(folder)
     for name, schema in TABLES.items():
         rows = getattr(gap, name)

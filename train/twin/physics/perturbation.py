@@ -96,14 +96,14 @@ class Schedule(Checked, frozen=True):
         return msgspec.structs.replace(self.base, name=self.name, **drawn)
 
 
-def load_perturbation(path: Path) -> Perturbation:
+def load_perturbation(path: Path | str) -> Perturbation:
     """Read a perturbation from TOML: one `field = number` a line.
 
     Raises:
         ConfigError: no such file, a field that does not exist, a value out of its range, or a
             schedule.
     """
-    values = read_toml(path)
+    values = read_toml(Path(path))
     if "ranges" in values:
         raise is_schedule(str(path))
     return typed(values, Perturbation, where=str(path), remedy=_FIELDS)

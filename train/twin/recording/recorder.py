@@ -222,7 +222,7 @@ class RecordingSummary:
 
 
 def record(
-    path: Path,
+    path: Path | str,
     plan: RecordingPlan,
     *,
     policy: Policy | None = None,
@@ -237,7 +237,7 @@ def record(
         RecordingError: there is something at `path`, or its folder cannot be written to.
         ConfigError: the plan names no script, and no policy was given.
     """
-    begun = time.perf_counter()
+    begun, path = time.perf_counter(), Path(path)
     external = None
     if policy is not None:
         external = ExternalPolicy(policy, epsilon=plan.epsilon or 0.0, seed=plan.seed)

@@ -21,14 +21,14 @@ from restock.report.look.theme import dark_rules
 PNG_SCALE = 2.0  # pixels a CSS pixel
 
 
-def write_page(content: dict[str, Any], out: Path, figures: Path | None = None) -> Path:
+def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | None = None) -> Path:
     """Write a page, and its figures into the folder `figures`; returns the page's path.
 
     Args:
         content: what the template asks for: kicker, title, headline, lead, cards, sections,
             footer, and a verdict where there is one.
     """
-    folder = files("restock.report.look")
+    out, folder = Path(out), files("restock.report.look")
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -45,7 +45,7 @@ def write_page(content: dict[str, Any], out: Path, figures: Path | None = None) 
     }
     write_text(out, template.render({"verdict": None, **content, **own}))
     if figures is not None:
-        write_figures(content["sections"], figures)
+        write_figures(content["sections"], Path(figures))
     return out
 
 
