@@ -27,20 +27,30 @@ T = TypeVar("T")
 _STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # of a message's path, and what follows it
 
 
+class ValueRefused(ConfigError, ValueError):
+    """A value that a struct refuses. A ValueError too, which msgspec gives the key in a file."""
+
+
 class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A struct whose ranges also hold for values given in Python.
+    """A struct whose ranges also hold for values given in Python; NumPy's numbers become Python's.
 
     Raises:
-        ValueError: a value outside the range of its type, or refused by `check`.
+        ValueRefused: a value outside the range of its type, or refused by `check`.
     """
 
     def check(self) -> None:
         """Raises ValueError where values do not go together."""
 
     def __post_init__(self) -> None:
-        for name, kind in _ranges(type(self)).items():
-            _check(name, kind, getattr(self, name))
-        self.check()
+        try:
+            for name, kind in _ranges(type(self)).items():
+                given = getattr(self, name)
+                if (value := _plain(given)) is not given:
+                    msgspec.structs.force_setattr(self, name, value)
+                _check(name, kind, value)
+            self.check()
+        except ValueError as error:
+            raise ValueRefused(str(error)) from error
 
 
 def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str, Any]:
@@ -97,7 +107,7 @@ def typed(
                 remedy=f"it is now called `{_join(prefix, new)}`: rename it",
             )
     try:
-        return msgspec.convert(document, kind)
+        return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
         what = _in_words(str(error), document, kind, prefix)
         raise ConfigError(what, where=where, remedy=remedy) from error
@@ -195,6 +205,20 @@ def _item(kind: inspect.Type) -> inspect.Type | None:
     return None
 
 
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of NumPy as Python's, which JSON and TOML can hold; the rest as it is."""
+    if type(value).__module__ == "numpy":
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        items = [_plain(one) for one in value]
+        same = all(one is other for one, other in zip(items, value, strict=True))
+        return value if same else type(value)(items)
+    if isinstance(value, Mapping):
+        held = {key: _plain(one) for key, one in value.items()}
+        return value if all(held[key] is one for key, one in value.items()) else held
+    return value
+
+
 def _check(name: str, kind: inspect.Type, value: Any) -> None:
     if value is None:
         return
@@ -216,6 +240,8 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
         for place, one in items:
             _check(f"{name}.{place}" if isinstance(place, str) else f"{name}[{place}]", item, one)
         return
+    if not isinstance(value, int | float):
+        raise ValueError(f"{name} must be a number, got {value!r}")
     bounds = _bounds(kind)
     if bounds and not _inside(value, bounds):
         raise ValueError(f"{name} must be {_range_in_words(bounds)}, got {value}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,8 +20,15 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.replay.mixture.mixture import Mixture
 from restock.toml import Checked, parse_toml, read_toml, toml_value, typed, with_value
-from restock.train.dqn.config import TrainConfig, apply_overrides, as_overrides
+from restock.train.dqn.config import (
+    NetworkConfig,
+    TrainConfig,
+    apply_overrides,
+    as_overrides,
+    parse_config,
+)
 from restock.train.study.study import Study
+from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
 plain = st.recursive(
     st.booleans()
@@ -32,6 +40,32 @@ plain = st.recursive(
     ),
     max_leaves=8,
 )
+
+
+def test_numbers_of_numpy_are_pythons_in_a_struct() -> None:
+    """A sweep takes its values from `np.linspace`, `np.arange` or a generator."""
+    config = TrainConfig(seed=np.int64(3), network=NetworkConfig(hidden=np.array([64, 32])))  # type: ignore[arg-type]
+    assert parse_config(msgspec.to_builtins(config), where="test").seed == 3
+    assert config.network.hidden == [64, 32]
+    schedule = Schedule({"payload_kg": (np.float32(0), np.float64(30))})  # type: ignore[dict-item]
+    for one in (
+        Perturbation(payload_kg=np.float32(30)),  # type: ignore[arg-type]
+        typed({"payload_kg": np.float64(30)}, Perturbation, where="test"),
+        schedule.draw(np.random.default_rng(0)),
+    ):
+        assert type(msgspec.to_builtins(one)["payload_kg"]) is float
+
+
+def test_a_value_refused_in_python_is_an_error_of_restock() -> None:
+    for make, says in (
+        (lambda: TrainConfig(seed=-1), r"seed must be in \[0, 2147483647\], got -1"),
+        (lambda: TrainConfig(seed="1"), "seed must be a number, got '1'"),  # type: ignore[arg-type]
+        (lambda: Mixture(), "no strata"),
+        (lambda: Schedule({"nothing": (0, 1)}), "unknown range 'nothing'"),
+    ):
+        with pytest.raises(ConfigError, match=says) as refused:
+            make()
+        assert isinstance(refused.value, ValueError)
 
 
 @given(plain)
