@@ -63,9 +63,9 @@ class IngestJob:
         from restock.ingest.pipeline import Reading, prepare
         from restock.ingest.store.writer import StoreWriter
 
-        how = Reading(self.force, self.salvage, self.typestore, self.repeated, self.tags)
-        store = StoreWriter(self.store) if self.store is not None else None
         try:
+            how = Reading(self.force, self.salvage, self.typestore, self.repeated, self.tags)
+            store = StoreWriter(self.store) if self.store is not None else None
             return prepare(path, self.profile, how, store=store, watch=watch, settle=settle)
         except RestockError as error:
             return error

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, RecordingError, visible
+from restock.errors import ConfigError, RecordingError, expect, visible
 from restock.ingest.camera.frame_rows import KeptFrames, frame_rows, kept_frames
 from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
@@ -78,6 +78,7 @@ def ingest(
             no transition, its sources contradict each other about a tag, or it is repeated and to
             be refused. The store is as it was.
         StoreError: the store cannot be written.
+        ConfigError: an argument that is of another kind, or no rule for `repeated`.
     """
     how = Reading(force, salvage, typestore, repeated, tags or {})
     prepared = prepare(path, profile, how, store=store, watch=watch)
@@ -99,6 +100,16 @@ class Reading:
     repeated: OnRepeat = "keep"
     tags: Mapping[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError for what the command line cannot say."""
+        if self.repeated not in get_args(OnRepeat):
+            has = ", ".join(get_args(OnRepeat))
+            raise ConfigError(f"no rule for repeated: {self.repeated!r}", remedy=f"give {has}")
+        expect("tags", self.tags, Mapping, 'give them by name, as {"robot": "amr-07"}')
+        for name, value in self.tags.items():
+            expect("the name of a tag", name, str, "write it as text")
+            expect(f"the tag {name}", value, str, "write it as text")
+
 
 def prepare(
     path: Path | str,
@@ -116,6 +127,9 @@ def prepare(
 
     Raises as `ingest`, which does both.
     """
+    expect("profile", profile, Profile, "`load_profile(NAME_OR_FILE)` gives one")
+    if store is not None:
+        expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
     with open_recording(
         path, typestore=how.typestore, salvage=how.salvage, watch=watch
     ) as recording:

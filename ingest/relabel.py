@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from restock.errors import ConfigError, StoreError
+from restock.errors import ConfigError, StoreError, expect
 from restock.ingest.profile.profile_text import (
     profile_toml,
     read_profile_toml,
@@ -83,6 +83,7 @@ def relabel_store(
         StoreError: rows were written before their episodes' ends were kept, or changed meanwhile.
         ConfigError: a condition's SQL does not run over the signals that are stored.
     """
+    expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
     if version is not None and not dry_run:
         raise StoreError(
             "an earlier version cannot be labelled",

@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import Any
 
-from restock.errors import StoreError
+from restock.errors import StoreError, expect
 from restock.ingest.store.writer import StoreWriter
 from restock.words import counted
 
@@ -59,6 +59,7 @@ def remove_recordings(
         StoreError: a name is of no recording in the store, or of several; one was ingested again
             meanwhile; the store cannot be written. Nothing is removed.
     """
+    expect("store", store, StoreWriter, 'make it as StoreWriter("store")')
     store.expect_store()
     live = sorted(store.live().to_pylist(maps_as_pydicts="strict"), key=_by_path)
     chosen = _chosen(live, names, str(store.path))

@@ -26,7 +26,7 @@ from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.fs import DeltaStorageHandler
 
-from restock.errors import StoreError
+from restock.errors import StoreError, expect
 from restock.files import first_line
 from restock.ingest.store.version import (
     LOG,
@@ -87,6 +87,7 @@ class Location:
         """
         if isinstance(place, Location):
             return place
+        expect("a store's place", place, (str, Path), "give a folder, or s3://bucket/prefix")
         text = str(place)
         if not text.strip():
             raise StoreError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, expect
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
@@ -57,6 +57,7 @@ def measure_drift(
     Raises:
         ConfigError: no such period, or a number below its least.
     """
+    expect("store", store, Store, 'open it as Store("store")')
     if every not in PERIODS:
         raise ConfigError(
             f"no period {every!r}", where="drift", remedy=f"give one of {', '.join(PERIODS)}"

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from restock.arrays import F64
+from restock.errors import expect
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
@@ -72,6 +73,8 @@ def find_gaps(
     Raises:
         ConfigError, MixtureError, StoreError: as `plan_panel` does.
     """
+    expect("store", store, Store, 'open it as Store("store")')
+    expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
     asked = _without_split(store, uncorrected(mixture))
     with open_source(store, asked, folder=None if folder is None else Path(folder)) as source:
         plan = plan_panel(source.connection, asked, source.conditions, source.others)

@@ -18,7 +18,7 @@ import msgspec
 import pyarrow as pa
 
 from restock import __version__
-from restock.errors import PanelError, RestockError, StoreError
+from restock.errors import ArgumentError, PanelError, RestockError, StoreError, expect
 from restock.files import building, expect_place
 from restock.ingest.store.location import Location
 from restock.ingest.task.condition_files import shipped
@@ -138,9 +138,15 @@ def build_panel(
         advance: called with the number of source rows read, as packing goes on.
 
     Raises:
-        ConfigError, MixtureError, StoreError: see `plan_panel`.
+        ConfigError, MixtureError, StoreError: see `plan_panel`; also for arguments of other kinds.
         PanelError: `out` already exists.
     """
+    expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
+    if isinstance(transitions, str | Path | duckdb.DuckDBPyRelation):
+        raise ArgumentError(
+            f"transitions must be a Store or a table, got {repr(transitions)[:80]}",
+            remedy='open a store as Store("store"); of a relation take `.to_arrow_table()`',
+        )
     check_free(Path(out), force)
     with open_source(transitions, mixture, task=task, conditions=conditions) as source:
         plan = plan_panel(source.connection, mixture, source.conditions, source.others)

@@ -62,8 +62,24 @@ class RestockError(Exception):
         super().__init__("\n  ".join(parts))
 
 
+def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str) -> None:
+    """Refuse an argument of another kind, such as the name of what is to be given itself.
+
+    Raises:
+        ArgumentError: it is none of `kind`.
+    """
+    if not isinstance(given, kind):
+        kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        what = f"{name} must be a {kinds}, got {repr(given)[:80]}"
+        raise ArgumentError(what, remedy=remedy)
+
+
 class ConfigError(RestockError):
     """A profile, mixture or other TOML file that says something Restock cannot use."""
+
+
+class ArgumentError(ConfigError, TypeError):
+    """An argument of a Python function that is of another kind than it takes."""
 
 
 class RecordingError(RestockError):
