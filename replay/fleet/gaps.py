@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from restock.arrays import F64
-from restock.errors import expect
+from restock.errors import ConfigError, expect
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
@@ -71,8 +71,15 @@ def find_gaps(
         by: the columns that make a cell.
 
     Raises:
-        ConfigError, MixtureError, StoreError: as `plan_panel` does.
+        ConfigError, MixtureError, StoreError: as `plan_panel` does; columns that make none.
     """
+    unknown = sorted(set(by) - set(CELL))
+    if isinstance(by, str) or unknown or len(set(by)) != len(by) or not by:
+        raise ConfigError(
+            f"{', '.join(unknown) or list(by)!r} cannot define a cell",
+            where="--by",
+            remedy=f"name one or more of {', '.join(CELL)}, each once",
+        )
     expect("store", store, Store, 'open it as Store("store")')
     expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
     asked = _without_split(store, uncorrected(mixture))

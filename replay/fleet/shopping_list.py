@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -101,6 +101,9 @@ def shopping_list(
     """
     if unit is None:
         unit = "missions" if yields.simulated else "hours"
+    if unit not in get_args(Unit):
+        has = ", ".join(get_args(Unit))
+        raise ConfigError(f"no unit {unit!r}", where="shopping list", remedy=f"give {has}")
     if not 0 < confidence < 1:
         raise ConfigError(f"must be between 0 and 1, got {confidence:g}", where="--confidence")
     rng = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -18,7 +19,7 @@ import duckdb
 import msgspec
 import pyarrow as pa
 
-from restock.errors import StoreError
+from restock.errors import QueryError, StoreError
 from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
@@ -81,6 +82,7 @@ class Store:
         recordings = self.path.open_table(RECORDINGS)
         self.version: int = transitions.version()
         self._spill = tempfile.TemporaryDirectory(prefix="restock-")
+        self._asking = threading.RLock()  # a query is several calls: none comes between them
         self.bare = duckdb.connect(
             config={
                 "temp_directory": self._spill.name,
@@ -150,13 +152,23 @@ class Store:
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
         """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 
-        Raises QueryError with DuckDB's message, or where the query would write; ConfigError where
-        it names a mixture that there is not.
+        Raises QueryError with DuckDB's message, where the query would write, or while another
+        thread reads what it asked for; ConfigError where it names a mixture that there is not.
         """
-        self._definitions.make(text)
-        for check in self.checks:
-            check(text)
-        return query(self.bare, text, where=str(self.path))
+        try:
+            with self._asking:
+                self._definitions.make(text)
+                for check in self.checks:
+                    check(text)
+                return query(self.bare, text, where=str(self.path))
+        except (duckdb.Error, QueryError) as error:
+            if "connection is busy" not in str(error):
+                raise
+            raise QueryError(
+                "another thread is reading from it",
+                where=str(self.path),
+                remedy="open a Store in each thread",
+            ) from error
 
     def conditions(self) -> tuple[Condition, ...]:
         """The conditions that labelled the store's rows, of the newest ingest.

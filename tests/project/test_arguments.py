@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from support.paths import ROOT
 from support.stores import one
 
 import restock
-from restock.errors import ArgumentError, ConfigError
+from restock.errors import ArgumentError, ConfigError, QueryError
 from restock.ingest import (
     IngestJob,
     StoreWriter,
@@ -79,6 +80,28 @@ def test_a_name_in_place_of_what_bears_it_is_refused_by_name(store: Path, tmp_pa
         assert refused.value.remedy
         assert isinstance(refused.value, TypeError)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["store"]
+
+
+def test_a_store_that_another_thread_reads_from_says_so(store: Path) -> None:
+    opened, reading, go_on = Store(store), threading.Event(), threading.Event()
+
+    def wait(value: int) -> int:
+        reading.set()
+        go_on.wait(60)
+        return value
+
+    opened.connection.create_function("wait_for", wait, ["INTEGER"], "INTEGER")
+    answer = opened.sql("SELECT wait_for(7)")
+    other = threading.Thread(target=lambda: answer.fetchall())
+    other.start()
+    try:
+        assert reading.wait(60)
+        with pytest.raises(QueryError, match="another thread is reading from it"):
+            opened.sql("SELECT avg(reward) FROM transitions")
+    finally:
+        go_on.set()
+        other.join()
+    assert len(opened.sql("SELECT avg(reward) FROM transitions").fetchall()) == 1
 
 
 def test_a_job_of_many_recordings_says_it_of_each(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +20,8 @@ from restock.replay.fleet.gaps import Gap, find_gaps
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
 from restock.replay.fleet.shopping_list import shopping_list
 from restock.replay.fleet.yields import Yields
-from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle")
@@ -233,6 +235,18 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
 def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
     assert "'aisle' cannot define a cell" in capsys.readouterr().err
+    mixture: Any = load_mixture("uniform")
+    with Store(store) as opened:
+        by: Any
+        for by in (["aisle"], "zone", [], ["zone", "zone"]):
+            with pytest.raises(ConfigError, match="cannot define a cell\n  name one"):
+                find_gaps(opened, mixture, name="steps", min_rows=3, by=by)
+        found: Any = find_gaps(opened, mixture, name="steps")
+        with pytest.raises(ConfigError, match="no unit 'days'\n  give missions, hours"):
+            shopping_list(*found, unit="days")
+        for share, episodes in ((2.0, 50.0), (0.9, -1.0), (float("nan"), 50.0)):
+            with pytest.raises(ConfigError, match=r"cells_share must be in \[0, 1\]"):
+                recommend_capacity(opened.connection, share, episodes)
 
 
 def test_gaps_are_a_table_of_sql(store: Path, tmp_path: Path) -> None:
