@@ -62,13 +62,6 @@ class _Broken(IngestJob):
         return super().prepare(path)
 
 
-class _Defect(IngestJob):
-    """A job that meets a defect of Restock's: it has no profile."""
-
-    def prepare(self, *args):
-        return IngestJob(None, None).prepare(*args)
-
-
 def test_a_killed_worker_costs_its_recording_only(bags, tmp_path):
     job = _Broken(load_profile("warehouse_amr"), tmp_path / "s")
     paths = sorted(bags.iterdir())
@@ -131,8 +124,11 @@ def test_a_disk_that_fails_is_no_bug_of_restock(monkeypatch):
 
 
 def test_developers_see_where_a_recording_failed(bags, monkeypatch, capsys):
+    def prepare(path, *args, **kwargs):
+        return path.no_such_attribute
+
+    monkeypatch.setattr("restock.ingest.pipeline.prepare", prepare)
     arguments = ["ingest", str(bags / "drive1"), "--dry-run", "--json"]
-    monkeypatch.setattr("restock.ingest.batch.IngestJob", _Defect)
     assert main(arguments) == 2
     said = capsys.readouterr().err
     assert "drive1: a bug in Restock: AttributeError" in said
