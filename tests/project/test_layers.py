@@ -230,6 +230,13 @@ def test_a_folder_has_one_purpose_and_room_for_it(folder: str) -> None:
     assert len(purpose.splitlines()[0]) > 20
 
 
+@pytest.mark.parametrize("room", ["ingest", "replay", "train", "train/twin"])
+def test_the_map_for_contributors_names_every_folder(room: str) -> None:
+    told = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    folders = [path.parent.name for path in (ROOT / room).glob("*/__init__.py")]
+    assert [folder for folder in folders if f" {folder}/" not in told] == []
+
+
 def test_there_are_no_cycles() -> None:
     TopologicalSorter({folder: allowed(folder) for folder in MAY_IMPORT}).prepare()
 
