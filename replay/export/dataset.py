@@ -16,7 +16,7 @@ from typing import Any
 
 from restock.errors import StoreError
 from restock.files import building
-from restock.imports import installed
+from restock.imports import install_command, installed
 from restock.ingest.store.version import Version
 from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
@@ -75,7 +75,7 @@ def export_dataset(
     if needs and not installed(needs):
         raise StoreError(
             f"the format {to} needs {needs}, which is not installed",
-            remedy=f"pip install {needs}, or `pip install restock[libraries]`",
+            remedy=f"pip install {needs}, or {install_command('libraries')}",
         )
     check_license(license)
     if cameras and to not in WITH_IMAGES:

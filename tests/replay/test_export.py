@@ -7,7 +7,9 @@ CUDA), so those two are read with the Python that RESTOCK_NEIGHBOURS_PYTHON name
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -29,6 +31,7 @@ from support.stores import TASK, recording_transitions, write_store
 
 from restock import cli
 from restock.errors import ExitCode, PanelError, QueryError, StoreError
+from restock.imports import install_command
 from restock.replay.export.dataset import FORMATS, export_dataset
 from restock.replay.export.selection import open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, trajectories
@@ -551,3 +554,16 @@ def test_a_card_without_a_licence_says_so(store_path: Path, tmp_path: Path) -> N
     with pytest.raises(StoreError, match="not an identifier of a licence"):
         export_dataset(store_path, "lerobot", tmp_path / "b", license="CC BY 4.0")
     assert not (tmp_path / "b").exists()
+
+
+def test_a_library_that_is_missing_is_named_with_how_it_is_installed(
+    store_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+
+    def absent(name: str, package: str | None = None) -> Any:
+        return None if name == "h5py" else find(name, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", absent)
+    with pytest.raises(StoreError, match=re.escape(install_command("libraries"))):
+        export_dataset(store_path, "d3rlpy", tmp_path / "logs.h5")

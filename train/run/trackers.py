@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import ConfigError
-from restock.imports import installed
+from restock.imports import install_command, installed
 from restock.toml import by_path
 from restock.train.run.events import Sink, tracked
 from restock.train.run.run import Run
@@ -38,7 +38,7 @@ def require_trackers(names: Sequence[str]) -> None:
             raise ConfigError(
                 f"{name} is not installed",
                 where="record.trackers",
-                remedy="pip install 'restock[track]', or leave it out",
+                remedy=f"{install_command('track')}, or leave it out",
             )
 
 
