@@ -253,6 +253,8 @@ def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on
     assert found["status"] == "failed"
     assert "--salvage" in found["errors"][0]
     assert "recordings of 2 kinds of robots" in document["stopped"]["why"]
+    assert ": 2 recordings (" in document["stopped"]["why"]
+    assert " | 1 recording (" in document["stopped"]["why"]
     options = shlex.join(up_to_the_panel(tmp_path))
     assert document["stopped"]["remedies"][:2] == [
         f"restock start {bags / 'a'} {bags / 'b'} --out {out} {options}",

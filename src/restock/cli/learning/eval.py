@@ -200,6 +200,7 @@ class EvalCommand:
         from restock.cli.output import print_json, progress, say
         from restock.errors import ConfigError
         from restock.train.evaluation.ope import OpeConfig, evaluate_planned, plan_off_policy
+        from restock.words import counted
 
         try:
             config = OpeConfig(epsilon=self.epsilon, horizon=self.horizon)
@@ -211,7 +212,7 @@ class EvalCommand:
             print_json(document)
             return 0
         say(
-            f"off-policy evaluation on {document['episodes']:,} episodes"
+            f"off-policy evaluation on {counted(document['episodes'], 'episode')}"
             f" ({document['rows']:,} rows): {plan.updates:,} updates of models fitted on"
             f" {document['fitted_rows']:,} other rows"
         )

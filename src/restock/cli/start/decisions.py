@@ -15,6 +15,7 @@ from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import FOLDER, Ended
 from restock.errors import ConfigError
 from restock.files import read_json
+from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand
@@ -62,7 +63,7 @@ def several_kinds(kinds: list[Any], asked: StartCommand) -> Stop:
     """
     out = asked.out
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
-    told = [f"{len(kind['recordings'])} of {kind['robot']}" for kind in kinds]
+    told = [f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds]
     calls = []
     for kind, folder in zip(kinds, folders, strict=True):
         options = _options(asked, but=() if folder == out else OF_ONE_ROBOT)
