@@ -64,8 +64,9 @@ class RecordCommand:
     epsilon: float | None = None
     """Share of random actions. Default: the scripted drivers' own share; 0 for a learned policy."""
     perturbation: str | None = None
-    """Effective parameters that replace the default ones: a name as in `restock eval`, or a TOML
-    file with a perturbation, or with a schedule that draws one for every mission."""
+    """Effective parameters that replace the default ones: nominal, friction, latency, payload,
+    wheels, sensors, or a TOML file with a perturbation, or with a schedule that draws one for every
+    mission."""
     layouts: str = "default"
     """The floors, as for `restock train`: default, generated:train, FILE.toml, map.yaml, … The
     floor of each mission is drawn by its seed."""
