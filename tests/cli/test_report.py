@@ -324,6 +324,21 @@ def test_the_headline_is_a_comparison_with_its_interval(html: str) -> None:
     assert "between training seeds" in lead  # what the interval does not hold
 
 
+def test_what_training_took_counts_the_steps_without_an_update(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "run")
+    offline = filled("progress", gradient_steps=300, env_steps=0, phase="offline", wall_s=4.0)
+    warmup = filled("progress", gradient_steps=300, env_steps=2016, phase="warmup", wall_s=11.0)
+    schema = pa.schema(TABLES["progress"])
+    rows = [offline, warmup | {"updates": 0, "loss": None}]
+    pq.write_table(pa.Table.from_pylist(rows, schema), copy / "progress.parquet")
+    html = build_report(copy).read_text(encoding="utf-8")
+    assert (
+        "trained on logs alone, without an update in the twin, for 2,016 environment steps and"
+        " 300 updates in 11 s"
+    ) in html
+    assert '2,016</div><div class="label">environment steps' in html
+
+
 def test_without_a_baseline_the_headline_says_so(run: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(run, tmp_path / "run")
     file = copy / "eval" / "episodes.parquet"

@@ -51,6 +51,7 @@ class Facts:
     td: Rows
     lag: Rows
     loss: Rows
+    trained: dict[str, Any]  # steps, updates and time in all
     cells: Rows  # of `restock eval`, with Wilson intervals as low and high
     failures: Rows
     panel: Panel | None = None
@@ -141,7 +142,14 @@ def gather(path: Path) -> Facts:
     for row in rows["ways"]:
         row |= measures(row.pop("driven"))
     kept = rows.pop("kept")
-    facts = Facts(run=path, config=run.document, kept=kept[0] if kept else None, **rows)  # type: ignore[arg-type]
+    (trained,) = rows.pop("trained")
+    facts = Facts(
+        run=path,
+        config=run.document,
+        kept=kept[0] if kept else None,
+        trained=trained,
+        **rows,  # type: ignore[arg-type]
+    )
     facts.evaluation, facts.evaluation_on_ways = shown, ways
     facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)

@@ -162,16 +162,18 @@ def _distrust(facts: Facts) -> str:
 
 def lead(facts: Facts) -> str:
     """What the headline's numbers are of, and what they cost."""
-    last = facts.loss[-1]
+    took = facts.trained
     if not facts.twin:
         return (
-            f"A DQN trained on logs alone, without a twin, for {last['gradient_steps']:,} updates"
-            f" in {span(last['wall_s'])}. Nothing has driven yet."
+            f"A DQN trained on logs alone, without a twin, for {took['gradient_steps']:,} updates"
+            f" in {span(took['wall_s'])}. Nothing has driven yet."
         )
     fed = "logs and fresh experience" if facts.panel is not None else "fresh experience alone"
+    if not took["updated_online"]:
+        fed = "logs alone, without an update in the twin,"
     text = (
-        f"Cost: a DQN trained on {fed} for {last['env_steps']:,} environment steps and"
-        f" {last['gradient_steps']:,} updates in {span(last['wall_s'])}."
+        f"Cost: a DQN trained on {fed} for {took['env_steps']:,} environment steps and"
+        f" {took['gradient_steps']:,} updates in {span(took['wall_s'])}."
     )
     if not facts.clean_cells() or facts.no_goal:
         return text

@@ -65,7 +65,7 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
     if not facts.twin:
         return [
             *cards,
-            {"value": f"{facts.loss[-1]['gradient_steps']:,}", "label": "updates"},
+            {"value": f"{facts.trained['gradient_steps']:,}", "label": "updates"},
             {"value": facts.target_rule, "label": "target rule"},
         ]
     cards += [
@@ -75,7 +75,7 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
         },
         {"value": _sampling(facts), "label": "of each online batch from logs, by quotas"},
         {"value": facts.target_rule, "label": "target rule"},
-        {"value": f"{facts.loss[-1]['env_steps']:,}", "label": "environment steps"},
+        {"value": f"{facts.trained['env_steps']:,}", "label": "environment steps"},
     ]
     if kept is not None:
         cards.append(

@@ -115,6 +115,12 @@ FROM progress
 WHERE updates > 0
 ORDER BY gradient_steps;
 
+-- name: trained
+-- What training took in all, with the steps in which no update was made.
+SELECT max(env_steps) AS env_steps, max(gradient_steps) AS gradient_steps, max(wall_s) AS wall_s,
+       coalesce(bool_or(phase <> 'offline' AND updates > 0), false) AS updated_online
+FROM progress;
+
 -- name: cells
 -- `restock eval`: success per policy, perturbation and condition, blocks apart.
 SELECT policy, perturbation,
