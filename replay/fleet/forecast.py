@@ -17,7 +17,6 @@ from restock.arrays import F64, Ints
 
 REPLICATES = 200
 _SIMULATED = 2000  # expected missions up to which they are drawn one by one
-_SURE = 0.95
 
 
 @dataclass(frozen=True)
@@ -95,10 +94,10 @@ def _needed(
 def missions_to_see_one(without: int) -> int:
     """Missions that would show what `without` missions did not, with 95 %, at best.
 
-    At best: at the highest rate that such a silence leaves likely, 3 in `without` (rule of three).
+    At best: at the highest rate that such a silence leaves likely, the exact (Clopper-Pearson)
+    bound at which `without` missions show none with 5 %. As many again then show one with 95 %.
     """
-    most = min(3.0 / max(without, 1), 1.0)
-    return 1 if most >= 1 else math.ceil(math.log(1 - _SURE) / math.log(1 - most))
+    return max(without, 1)
 
 
 def probability_to_close(

@@ -214,6 +214,9 @@ def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: 
     assert "at least 9 more episodes of blocked aisle" in shopping.intro
     (row,) = shopping.tables[-1].rows
     assert row["best"] == "no rate is known: at least 9 more episodes of blocked aisle"
+    with Store(store_path) as store:
+        _, sections = coverage_of(store, missing({**NEVER_SEEN, "at_least": 1}))
+    assert "at least 1 more episode of blocked aisle" in sections["shopping"].intro
     assert both["gaps"] == "2"
     label = "missions to log next (95 %: 0 to 0); 1 gap has no rate and is not in it"
     assert both[label] == "3"

@@ -190,7 +190,9 @@ def test_a_rare_find_leaves_much_open_and_silence_leaves_only_a_bound() -> None:
     once = forecast(np.array([3.0] + [0.0] * 49), np.ones(50), 30, rng=rng)
     assert once.quantile(0.975) / once.quantile(0.5) > 3
     assert not forecast(np.zeros(50), np.ones(50), 30, rng=rng).known
-    assert missions_to_see_one(100) == 99  # 1 - .97^99 = .951
+    # (1 - rate)^without = .05 gives the highest rate that is likely: .632 after 3 without.
+    assert missions_to_see_one(3) == 3  # 1 - .368^3 = .95
+    assert missions_to_see_one(100) == 100
     assert missions_to_see_one(1) == 1
     always = probability_to_close([(np.ones(50) * 2, 30)], 30, rng=rng)
     assert always > 0.99

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from restock.words import plural
+
 SHOWN = 15  # lines of a table on a terminal; --json has all
 
 
@@ -193,7 +195,8 @@ def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
                 "gap": ", ".join(str(part) for part in (condition, zone, robot) if part),
                 "actions": ", ".join(map(str, actions)),
                 "asked by": asked_by,
-                "to see one, with 95 %": f"at least {least['at_least']:,} more episodes of"
+                "to see one, with 95 %": f"at least {least['at_least']:,} more"
+                f" {plural(least['at_least'], 'episode')} of"
                 f" {least['never_seen_in']}",
             }
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from restock.report.look.blocks import Rows, Section, Table, count, words
-from restock.words import counted
+from restock.words import counted, plural
 
 MOST_GAPS = 20  # in the table
 
@@ -18,9 +18,11 @@ def to_log(gaps: dict[str, Any]) -> dict[str, str]:
         return {"value": "0", "label": f"{unit} to log next"}
     if unknown and not plan["orders"]:
         least = _to_see_one(unknown)
+        most = sum(least.values())
         return {
-            "value": f"at least {sum(least.values()):,}",
-            "label": f"more episodes of {' and '.join(least)}, to see what was never logged (95 %)",
+            "value": f"at least {most:,}",
+            "label": f"more {plural(most, 'episode')} of {' and '.join(least)}, to see what was"
+            " never logged (95 %)",
         }
     label = (
         f"{unit} to log next (95 %: {amount(plan['total_low'])} to {amount(plan['total_high'])})"
@@ -73,7 +75,7 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
     ]
     left = len(gaps["gaps"]) - len(table)
     unknown = _to_see_one([gap for gap in gaps["gaps"] if gap["best"] is None])
-    never = " and ".join(f"{least:,} more episodes of {kind}" for kind, least in unknown.items())
+    never = " and ".join(_more_of(kind, least) for kind, least in unknown.items())
     intro = []
     if orders:
         which = "every gap that has a rate" if unknown else "every gap"
@@ -105,7 +107,12 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
 
 def _no_rate(gap: dict[str, Any]) -> str:
     ((kind, least),) = _to_see_one([gap]).items()
-    return f"no rate is known: at least {least:,} more episodes of {kind}"
+    return f"no rate is known: at least {_more_of(kind, least)}"
+
+
+def _more_of(kind: str, episodes: int) -> str:
+    """`9 more episodes of blocked aisle`."""
+    return f"{episodes:,} more {plural(episodes, 'episode')} of {kind}"
 
 
 def _without_empty(rows: Rows) -> Rows:
