@@ -30,6 +30,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
 from restock.replay.store.store import Store
 from restock.report import build_report
+from restock.report.look.charts import POLICY_COLOURS, lines
 from restock.report.look.queries import ask, statements
 from restock.report.look.theme import DARK
 from restock.report.run import shares
@@ -289,6 +290,23 @@ def test_its_charts_are_drawn_again_by_vega_with_what_the_pointer_asks(html: str
     assert [one["title"] for one in told][-3:] == ["success", "95 %, low", "95 %, high"]
     assert told[-1]["format"] == ".1~%"
     assert "alert(1)" in text  # a hostile name is text there, too
+
+
+def test_a_policy_has_one_colour_in_all_charts(html: str) -> None:
+    scales = re.findall(r'"scale":({"domain":\[[^]]*\],"range":\[[^]]*\]})', html)
+    told = [dict(zip(one["domain"], one["range"], strict=True)) for one in map(json.loads, scales)]
+    planner = [colours["planner"] for colours in told if "planner" in colours]
+    assert len(planner) >= 4  # success and behaviour, each at several widths
+    assert set(planner) == {POLICY_COLOURS["planner"]}
+
+
+def test_names_that_begin_alike_are_told_apart_in_a_legend() -> None:
+    names = [f"coverage-with-practice-where-it-fails-{seed}" for seed in (1, 2)]
+    rows = [{"env_steps": n, "success": 0.5, "who": name} for name in names for n in (0, 2000)]
+    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success", marker=0)
+    texts = {one.text: one for one in ElementTree.fromstring(drawn.svg[470]).iter() if one.text}
+    assert [text for text in texts if text.startswith("coverage")] == names
+    assert texts["kept"].get("text-anchor") == "start"  # beside its line, not over the axis
 
 
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:

@@ -140,7 +140,8 @@ def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     """Above the chart, in as many columns as fit beside the labels of its vertical axis."""
     each = max((len(name) for name in names), default=1) * LETTER_PX + 36
     columns = max(1, min(len(names), int((width - labels_px) // each)))
-    return alt.Legend(columns=columns, symbolOpacity=1)
+    # Names that begin alike end apart: as much of one is shown as there is room for.
+    return alt.Legend(columns=columns, symbolOpacity=1, labelLimit=max(width - labels_px - 30, 160))
 
 
 def coloured(
@@ -248,10 +249,16 @@ def lines(
         layers = [line]
         if marker is not None:
             at = plot([{"at": marker, "text": "kept"}]).encode(x="at:Q")
+            early = marker < max(row[x] for row in rows) / 2  # before it, no room beside the axis
             layers.append(at.mark_rule(strokeDash=[4, 3], color="#0f172a"))
             layers.append(
                 at.mark_text(
-                    align="right", dx=-4, dy=-6, baseline="bottom", fontSize=12, color="#475569"
+                    align="left" if early else "right",
+                    dx=4 if early else -4,
+                    dy=-6,
+                    baseline="bottom",
+                    fontSize=12,
+                    color="#475569",
                 ).encode(y=alt.value(230), text="text:N")
             )
         return (alt.layer(*layers) if len(layers) > 1 else line).properties(height=230)
@@ -285,20 +292,23 @@ def ages(rows: Sequence[Row]) -> Drawing:
     return draw(chart)
 
 
-def stacked(rows: Sequence[Row], *, group: str, part: str, value: str) -> Drawing:
+def stacked(
+    rows: Sequence[Row], *, group: str, part: str, value: str, colours: Mapping[str, str]
+) -> Drawing:
     """One horizontal bar per group, split into parts that sum to one."""
     parts = list(dict.fromkeys(row[part] for row in rows))
     groups = list(dict.fromkeys(row[group] for row in rows))
 
     def chart(width: int) -> Any:
         quiet = alt.Axis(grid=False, ticks=False)
+        percent = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
         return (
             plot(rows)
             .mark_bar()
             .encode(
                 y=alt.Y(f"{group}:N", sort=groups, title=None, axis=quiet),
-                x=alt.X(f"{value}:Q", stack="normalize", title=None, axis=alt.Axis(format="%")),
-                color=coloured(part, parts, CONDITION_COLOURS, width),
+                x=alt.X(f"{value}:Q", stack="normalize", title=None, axis=percent),
+                color=coloured(part, parts, colours, width),
             )
             .properties(height=30 * max(len(groups), 1))
         )

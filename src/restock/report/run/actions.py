@@ -28,7 +28,7 @@ def actions_section(facts: Facts) -> Section | None:
         "fresh rows, and the share of fresh rows in which the policy would take it (from "
         "audited batches, in the last quarter of the updates). The logs do not show the "
         "outcome of an action that is preferred but not in the logs; `restock diagnose` tells "
-        "whether that causes failures.",
+        "whether that causes failures. Actions are named by their m/s and rad/s.",
         figures=[Figure(_heatmap(cells), "Share of a condition's rows by action")],
         tables=_table(facts.actions),
     )

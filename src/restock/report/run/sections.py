@@ -147,7 +147,9 @@ def sampled(facts: Facts) -> Section:
         )
     if facts.policies:
         policies = [{**row, "who": row["behaviour_policy"]} for row in facts.policies]
-        stacked = charts.stacked(policies, group="source", part="who", value="share")
+        stacked = charts.stacked(
+            policies, group="source", part="who", value="share", colours=charts.POLICY_COLOURS
+        )
         figures.append(Figure(stacked, "Behaviour policies of the sampled rows"))
     return Section(
         "fed",
