@@ -2,7 +2,7 @@
 over. It knows no ROS: the node, a played recording and the tests all drive by it.
 
 What cannot be acted on is a stop, with its reason: an input that is silent, stale or unreadable, a
-clock that went back, a scan in which no beam says anything.
+clock that went back, a scan in which no beam says anything, a policy without numbers.
 """
 
 from __future__ import annotations
@@ -119,8 +119,11 @@ class Pilot:
         action, proposal = None, (0.0, 0.0)
         if not reason:
             action = self.policy.act(observed.observation)
-            speed, turn = self.profile.task.actions[action]
-            proposal = float(speed), float(turn)
+            if action is None:
+                reason = "policy: the value of its action is not a finite number"
+            else:
+                speed, turn = self.profile.task.actions[action]
+                proposal = float(speed), float(turn)
         command, rule = self._limit(observed, proposal, unknown=bool(reason))
         taken = self.taken_over(now_ns)
         self.counts["decisions"] += 1

@@ -59,17 +59,18 @@ class PolicyFile:
             )
         self._input = taken.name
 
-    def act(self, observation: F32) -> int:
-        """The best action for one observation (D,).
+    def act(self, observation: F32) -> int | None:
+        """The best action for one observation (D,); None if its value is no finite number.
 
         Raises:
             ConfigError: the network's output is none of the task's actions.
         """
-        (output,) = self._session.run(["action"], {self._input: observation[None]})
-        action = int(np.asarray(output).reshape(-1)[0])
+        outputs = self._session.run(["action", "values"], {self._input: observation[None]})
+        (action,), (values,) = outputs
         if not 0 <= action < len(self.profile.task.actions):
             raise ConfigError(f"chose action {action}, which does not exist", where=str(self.path))
-        return action
+        # Of values that are not numbers the first is the largest: the action would mean nothing.
+        return int(action) if np.isfinite(values[action]) else None
 
 
 def open_session(path: Path) -> Any:

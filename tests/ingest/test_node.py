@@ -189,6 +189,23 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
     assert all(np.isfinite(pair).all() for pair in speeds(graph))
 
 
+def test_a_policy_whose_weights_are_no_numbers_is_a_stop_with_its_reason(
+    policy: Path, tmp_path: Path
+) -> None:
+    import onnx
+
+    model = onnx.load(policy)
+    (weight,) = [each for each in model.graph.initializer if each.name == "weight"]
+    damaged = np.full(tuple(weight.dims), np.nan, np.float32)
+    weight.CopyFrom(onnx.numpy_helper.from_array(damaged, "weight"))
+    onnx.save(model, tmp_path / "damaged.onnx")
+    graph, node = started(tmp_path / "damaged.onnx")
+    node.trigger_activate()
+    driven(TwinRobot(graph, SPEC), steps=8)
+    assert node.policy.pilot.reason == "policy: the value of its action is not a finite number"
+    assert speeds(graph)[-1] == (0.0, 0.0)
+
+
 def test_a_policy_that_does_not_fit_leaves_it_unconfigured_and_says_why(
     policy: Path, tmp_path: Path
 ) -> None:
