@@ -67,6 +67,7 @@ def test_a_fleet_with_nothing_to_compare_says_so(
     page = tmp_path / "drift.html"
     assert cli.main(["drift", str(store), "--out", str(page), "--exit-code"]) == 0
     out = capsys.readouterr().out
+    assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
     assert "Too little to compare" in page.read_text("utf-8")

@@ -121,6 +121,7 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     file = tmp_path / "review.csv"
     assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 0
     shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 120  # what does not fit is a second table
     with file.open(newline="") as text:
         rows = list(csv.DictReader(text))
     assert len(rows) == 3

@@ -49,7 +49,11 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     if not rows:
         output.stdout().print(nothing, markup=False, soft_wrap=True)
         return ExitCode.OK
-    output.print_table([_line(row) for row in rows], title="events, the most uncertain first")
+    output.print_parted(
+        [_line(row) for row in rows],
+        key=["condition", "restock trace STORE"],
+        title="events, the most uncertain first",
+    )
     output.say(f"to see the first: {rows[0]['open']}")
     output.say(
         f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "

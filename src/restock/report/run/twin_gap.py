@@ -183,7 +183,7 @@ def gap_section(gap: TwinGap) -> Section:
         else [],
         tables=[
             Table(rows, numbers={"segments", "episodes"}),
-            Table([{"notes": note.replace("`", "")} for note in gap.not_done]),
+            Table([{"notes": note} for note in gap.not_done]),
         ],
     )
 
