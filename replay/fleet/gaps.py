@@ -165,7 +165,7 @@ def _of_audits(
         gaps.append(Gap(by, cell, "rows", asked.get("min_rows", 0), rows, found))
         gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), held_in, met))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
-        if rows and effective < least:
+        if effective and effective < least:  # 0 of one that names no row
             # As many more as would do if they were as uneven as those that there are.
             needed = math.ceil(least * episodes / effective)
             by = "audit few_effective_episodes"

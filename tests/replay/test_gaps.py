@@ -39,6 +39,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_store(tmp_path_factory.mktemp("gaps") / "store", rows)
 
 
+FEW = {"min_effective_episodes": 5}
 ASKING = """
 max_replays_per_row = 2
 planned = { updates = 100, batch_size = 10 }
@@ -112,6 +113,23 @@ def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store
         if one.best is None:
             assert one.see_one is not None
             assert one.see_one[1] >= 1
+
+
+def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path: Path) -> None:
+    rows = recording_transitions(0)
+    place = rows.schema.get_field_index("condition")
+    rarer = {"wheel_slip": "blocked_aisle"}
+    named = [rarer.get(name, name) for name in rows["condition"].to_pylist()]
+    field = rows.schema.field(place)
+    rows = rows.set_column(place, field, pa.array(named).cast(field.type))
+    with Store(write_store(tmp_path / "store", [rows])) as store:
+        mixture, limits = parse_mixture(ASKING), {"few_effective_episodes": FEW}
+        _, gaps = find_gaps(store, mixture, name="mine", kinds=KINDS, thresholds=limits)
+        query = "FROM coverage_by_condition SELECT rows, rows_held WHERE condition = 'wheel_slip'"
+        ((names, holds),) = store.sql(query).fetchall()
+    assert names == 0 < holds
+    by = {gap.asked_by for gap in gaps if "wheel_slip" in gap.cell.values()}
+    assert by == {"mixture mine"}  # its stratum is empty
 
 
 def test_hours_of_logging_where_no_recording_knew_the_truth(tmp_path: Path) -> None:
