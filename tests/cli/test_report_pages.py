@@ -196,6 +196,38 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     assert {row["robot"]: row["hours"] for row in table.rows} == expected
 
 
+def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: Path) -> None:
+    # Names whose first choice is the same colour; one occurs in the table of conditions alone.
+    own = {"wheel_slip": "zz_idle", "blocked_aisle": "zz_tight", "near_collision": "zz_ulhgs"}
+    with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as store:
+        facts = coverage_facts(store)
+    for rows in facts.values():
+        for row in rows:
+            if "condition" in row:
+                row["condition"] = own.get(row["condition"], row["condition"])
+    few = {"condition": "zz_aaa", "rows": 0, "rows_held": 7, "share": 0.0, "episodes": 0}
+    facts["shelves"].append({**facts["shelves"][0], **few})
+    page = coverage_page(facts, missing(NEVER_SEEN), "nothing to compare")
+    assert "never seen: zz" not in page["headline"]  # it holds where a rarer one names the row
+    sections = {section.id: section for section in page["sections"]}
+    text = "".join(
+        json.dumps(figure.drawing.spec)
+        for name in ("shelves", "weeks")
+        for figure in sections[name].figures
+    )
+    told: dict[str, set[str]] = {}
+    for one in re.findall(r'"scale": ({"domain": \[[^]]*\], "range": \[[^]]*\]})', text):
+        scale = json.loads(one)
+        for name, colour in zip(scale["domain"], scale["range"], strict=True):
+            told.setdefault(name, set()).add(colour)
+    swatches = r'background:(#\w+)"></span>([^<]*)<'
+    for colour, name in re.findall(swatches, str(sections["map"].figures[1].caption)):
+        told[name].add(colour)
+    assert len(told) >= 4
+    assert all(len(colours) == 1 for colours in told.values())
+    assert len(set.union(*told.values())) == len(told)  # and nobody else's
+
+
 @pytest.mark.long
 def test_a_gap_without_a_rate_says_how_many_episodes_would_show_one(store_path: Path) -> None:
     with Store(store_path) as store:

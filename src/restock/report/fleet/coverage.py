@@ -62,12 +62,15 @@ def coverage_page(
         drift: what was measured, or why nothing was.
     """
     (totals,) = found["totals"]
+    named = (row["condition"] for rows in ("shelves", "weeks", "rare") for row in found[rows])
+    colours = charts.palette(set(named))
+    in_words = {words(name): colour for name, colour in colours.items()}
     sections = [
-        _shelves(found["shelves"]),
+        _shelves(found["shelves"], in_words),
         shopping_section(gaps),
-        _weeks(found["weeks"]),
+        _weeks(found["weeks"], in_words),
         _robots(found["robots"]),
-        _map(found),
+        _map(found, colours),
         _drift(drift),
     ]
     robots = {row["robot"] for row in found["robots"]}
@@ -107,7 +110,7 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
             f"Largest gap: {words(worst['cell'])}, {worst['there']:,} of {worst['needed']:,} "
             f"{worst['counted']}"
         )
-    never = [words(row["condition"]) for row in shelves if row["rows"] == 0]
+    never = [words(row["condition"]) for row in shelves if row["rows_held"] == 0]
     if never:
         text += f"; never seen: {', '.join(never)}"
     unknown = [words(row["condition"]) for row in shelves if row["rows"] is None]
@@ -122,7 +125,7 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     return text.removeprefix("; ")
 
 
-def _shelves(rows: Rows) -> Section:
+def _shelves(rows: Rows, colours: dict[str, str]) -> Section:
     unknown = [words(row["condition"]) for row in rows if row["rows"] is None]
     rows = [row for row in rows if row["rows"] is not None]
     table = [
@@ -152,13 +155,15 @@ def _shelves(rows: Rows) -> Section:
             if unknown
             else ""
         ),
-        figures=[Figure(_bars(rows), "Rows of each condition (logarithmic)")] if rows else [],
+        figures=[Figure(_bars(rows, colours), "Rows of each condition (logarithmic)")]
+        if rows
+        else [],
         two=True,
         tables=[Table(table, set(table[0]) - {"condition", "who drove"} if table else set())],
     )
 
 
-def _bars(rows: Rows) -> Drawing:
+def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
     shown = [
         {
             "condition": words(row["condition"]),
@@ -182,9 +187,7 @@ def _bars(rows: Rows) -> Drawing:
         bars = base.mark_bar(cornerRadiusEnd=2).encode(
             x=x,
             x2="from:Q",
-            color=alt.Color(
-                "condition:N", scale=charts.scale(names, charts.WORDS_COLOURS), legend=None
-            ),
+            color=alt.Color("condition:N", scale=charts.scale(names, colours), legend=None),
         )
         texts = base.mark_text(align="left", dx=5, fontSize=12, color="#475569").encode(
             x=x, text="text:N"
@@ -194,7 +197,7 @@ def _bars(rows: Rows) -> Drawing:
     return charts.draw(chart)
 
 
-def _weeks(rows: Rows) -> Section | None:
+def _weeks(rows: Rows, colours: dict[str, str]) -> Section | None:
     if not rows:
         return None
     shown = [
@@ -214,7 +217,7 @@ def _weeks(rows: Rows) -> Section | None:
             .encode(
                 x=alt.X("week:O", title=None, axis=alt.Axis(labelAngle=-60, grid=False)),
                 y=alt.Y("rows:Q", title="rows", axis=alt.Axis(format="~s")),
-                color=charts.coloured("condition", names, charts.WORDS_COLOURS, width),
+                color=charts.coloured("condition", names, colours, width),
             )
             .properties(height=200)
         )
@@ -262,7 +265,7 @@ def _robots(rows: Rows) -> Section | None:
     )
 
 
-def _map(found: dict[str, Rows]) -> Section | None:
+def _map(found: dict[str, Rows], colours: dict[str, str]) -> Section | None:
     (bounds,) = found["bounds"]
     if not found["visited"] or bounds["x0"] is None:
         return None
@@ -287,9 +290,9 @@ def _map(found: dict[str, Rows]) -> Section | None:
                 f" ({x0:.1f}, {y0:.1f}) m.",
             ),
             Figure(
-                floor_map.events(plan, moved(found["rare"]), []),
+                floor_map.events(plan, moved(found["rare"]), [], colours),
                 "Where rare conditions were met",
-                Markup(floor_map.legend(conditions)),
+                Markup(floor_map.legend(conditions, colours)),
             ),
         ],
         two=True,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -132,8 +132,24 @@ def own_names(svg: str) -> str:
 
 def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
     """A colour scale over the names that occur, known ones in their own colour."""
-    spare = iter(SPARE_COLOURS * (1 + len(names)))
-    return alt.Scale(domain=list(names), range=[colours.get(name) or next(spare) for name in names])
+    all_of_them = palette(names, colours)
+    return alt.Scale(domain=list(names), range=[all_of_them[name] for name in names])
+
+
+def palette(
+    names: Collection[str], colours: Mapping[str, str] = CONDITION_COLOURS
+) -> dict[str, str]:
+    """A colour for each name, whatever their order: its own, else a spare one that it begins to
+    look for at the same place in every chart, the first that is free as long as one is."""
+    found = {name: colours[name] for name in names if name in colours}
+    free: list[str] = []
+    for name in sorted(set(names) - set(found)):
+        free = free or list(SPARE_COLOURS)
+        first = sum(map(ord, words(name))) % len(SPARE_COLOURS)
+        likes = SPARE_COLOURS[first:] + SPARE_COLOURS[:first]
+        found[name] = next(colour for colour in likes if colour in free)
+        free.remove(found[name])
+    return found
 
 
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:

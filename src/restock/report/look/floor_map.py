@@ -9,7 +9,6 @@ from html import escape
 from typing import Any
 
 from restock.report.look.blocks import Drawing, words
-from restock.report.look.charts import CONDITION_COLOURS, SPARE_COLOURS
 
 Row = Mapping[str, Any]
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 in metres
@@ -73,13 +72,15 @@ def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> Drawing:
     return floor.draw(marks, "where the logs have been")
 
 
-def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> Drawing:
+def events(
+    floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row], colours: Mapping[str, str]
+) -> Drawing:
     """Dots where a rare condition was logged, crosses where the agent's episodes failed."""
     marks = []
     for row in logged:
         x, y = floor.at(row["x_m"], row["y_m"])
         marks.append(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{colour(row["condition"])}"'
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.2" fill="{colours[row["condition"]]}"'
             ' fill-opacity="0.55"/>'
         )
     crosses = []
@@ -89,22 +90,17 @@ def events(floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row]) -> D
             f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14" stroke="#ffffff"'
             ' stroke-width="7"/>'
             f'<path d="M{x - 7:.1f} {y - 7:.1f} l14 14 m0 -14 l-14 14"'
-            f' stroke="{colour(row["condition"])}" stroke-width="3.4"/>'
+            f' stroke="{colours[row["condition"]]}" stroke-width="3.4"/>'
         )
     # Crosses lie above the racks: a robot may end right at their face.
     label = "rare conditions in the logs, and where the agent failed"
     return floor.draw(marks, label, above=crosses)
 
 
-def legend(conditions: Sequence[str]) -> str:
+def legend(conditions: Sequence[str], colours: Mapping[str, str]) -> str:
     """Swatches, as HTML."""
     return " ".join(
         f'<span class="key"><span class="swatch"'
-        f' style="background:{colour(name)}"></span>{escape(words(name))}</span>'
+        f' style="background:{colours[name]}"></span>{escape(words(name))}</span>'
         for name in conditions
     )
-
-
-def colour(condition: str) -> str:
-    spare = SPARE_COLOURS[sum(map(ord, condition)) % len(SPARE_COLOURS)]
-    return CONDITION_COLOURS.get(condition, spare)

@@ -298,6 +298,7 @@ def floor_section(facts: Facts) -> Section | None:
     names = charts.ordered(
         [{"condition": name} for name in conditions], "condition", charts.CONDITION_COLOURS
     )
+    colours = charts.palette(names)
     steps = sum(row["rows"] for row in facts.visited)
     return Section(
         "map",
@@ -324,9 +325,9 @@ def floor_section(facts: Facts) -> Section | None:
                 ),
             ),
             Figure(
-                floor_map.events(plan, facts.rare, failures),
+                floor_map.events(plan, facts.rare, failures, colours),
                 "Rare conditions in the logs (dots), the agent's failures (crosses)",
-                Markup(floor_map.legend(names))
+                Markup(floor_map.legend(names, colours))
                 + Markup("<br>")
                 + f"{len(failures)} failed clean episodes there.",
             ),
