@@ -29,7 +29,14 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floor_file import read_floor
 from restock.train.twin.floors.occupancy_grid import OccupancyGrid, floor_of_grid, out_of_frame
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.survey.picture import LONG_SIDE, MARGIN, PLACE, WAY, write_picture
+from restock.train.twin.survey.picture import (
+    LONG_SIDE,
+    MARGIN,
+    PLACE,
+    WAY,
+    moved_apart,
+    write_picture,
+)
 from restock.train.twin.survey.survey import survey
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -418,3 +425,9 @@ def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could()
     assert len(floor.goals_m) > 20
     assert all(np.hypot(*(around - start).T).min() < 0.3 for start in floor.starts_m)
     assert "nominal" in describe_floor(floor)["episodes"]
+
+
+def test_names_of_zones_that_overlap_are_drawn_below_each_other() -> None:
+    boxes = [(0.0, 0.0, 80.0, 13.0), (10.0, 2.0, 90.0, 15.0), (5.0, 1.0, 85.0, 14.0)]
+    apart = (200.0, 0.0, 280.0, 13.0)
+    assert moved_apart([*boxes, apart]) == [0.0, 11.0, 25.0, 0.0]

@@ -3,6 +3,7 @@ and crossings, where the robot drove and where missions go, with a scale."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -136,10 +137,17 @@ class _Picture:
 
     def _names(self, draw: ImageDraw.ImageDraw) -> None:
         font = ImageFont.load_default(13 * SMOOTH)
-        for name, area in self.floor.zones.items():
+        zones = self.floor.zones
+        texts = [name.replace("_", " ") for name in zones]
+        centres = [self._at(*area.center) for area in zones.values()]
+        boxes = [
+            draw.textbbox(at, text, font, anchor="mm", stroke_width=2 * SMOOTH)
+            for at, text in zip(centres, texts, strict=True)
+        ]
+        for (x, y), text, down in zip(centres, texts, moved_apart(boxes), strict=True):
             draw.text(
-                self._at(*area.center),
-                name.replace("_", " "),
+                (x, y + down),
+                text,
                 fill=INK,
                 font=font,
                 anchor="mm",
@@ -192,6 +200,27 @@ class _Picture:
                 draw.rectangle(square, fill=color, outline=(120, 124, 130, 255), width=SMOOTH)
             draw.text((x + 22 * SMOOTH, y + 7 * SMOOTH), text, fill=INK, font=font, anchor="lm")
             y += 24 * SMOOTH
+
+
+def moved_apart(boxes: Sequence[tuple[float, float, float, float]]) -> list[float]:
+    """How far down each box (left, top, right, bottom) has to go to be below those that it covers:
+    the names of zones that overlap, such as the ends of two aisles, have nearly one centre."""
+    placed: list[tuple[float, float, float, float]] = []
+    found = []
+    for left, top, right, bottom in boxes:
+        down = 0.0
+        while below := [
+            other[3] - top
+            for other in placed
+            if left < other[2]
+            and other[0] < right
+            and top + down < other[3]
+            and other[1] < bottom + down
+        ]:
+            down = max(below)
+        placed.append((left, top + down, right, bottom + down))
+        found.append(down)
+    return found
 
 
 def _round_length(floor: Warehouse) -> float:
