@@ -71,6 +71,8 @@ def test_a_fleet_with_nothing_to_compare_says_so(
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
     assert "Too little to compare" in page.read_text("utf-8")
+    assert "too little to compare" in out
+    assert "no change that matters" not in out
 
 
 @pytest.mark.parametrize(

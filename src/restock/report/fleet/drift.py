@@ -19,7 +19,7 @@ from restock.report.fleet.drift_signals import (
 )
 from restock.report.look import charts
 from restock.report.look.blocks import MOST_ROWS, Figure, Rows, Section, Table, words
-from restock.words import counted
+from restock.words import counted, plural
 
 MOST_ROBOTS = 12  # in a chart: those with findings first
 MOST_PERIODS = 26  # the newest
@@ -59,7 +59,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
             {"value": f"{number:,}", "label": label}
             for number, label in (
                 (len(robots), "robots"),
-                (len(periods), f"{drift.every}s with driving"),
+                (len(periods), f"{plural(len(periods), drift.every)} with driving"),
                 (sum(row["p"] is not None for row in own), "tests against a robot's own reference"),
                 (len(drift.findings), "changes: a signal of a robot"),
                 (
