@@ -205,7 +205,7 @@ def test_a_gap_is_read_back_as_written_and_is_a_page(gap: TwinGap, tmp_path: Pat
     (tmp_path / "other" / "mine.txt").write_text("mine")
     with pytest.raises(RunError, match="already exists"):
         write_gap(gap, tmp_path / "other")
-    with pytest.raises(RunError, match="no readable gap"):
+    with pytest.raises(RunError, match="no gap of the twin has been measured"):
         read_gap(tmp_path / "other")
 
 
