@@ -67,7 +67,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     # The same directory, another question.
     (tmp_path / "s.toml").write_text(SMALL.replace("400", "500", 1))
     assert main(argv) == 2
-    assert "made with other settings" in capsys.readouterr().err
+    assert "was made otherwise" in capsys.readouterr().err
 
 
 @pytest.mark.long
