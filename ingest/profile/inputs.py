@@ -28,8 +28,10 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
     "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
     "scan": {
-        **{"ranges_m": True, "angle_min_rad": True},
-        **{"angle_increment_rad": False, "angle_max_rad": False},  # one of them
+        "ranges_m": True,
+        "angle_min_rad": True,
+        "angle_increment_rad": False,  # either this one
+        "angle_max_rad": False,  # or this one
     },
     "goal": {"x_m": True, "y_m": True},
     "plan": {"x_m": True, "y_m": True},

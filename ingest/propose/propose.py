@@ -16,7 +16,6 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
-from restock.ingest.propose.evidence.commands import commanded
 from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
 from restock.ingest.propose.evidence.gather import Evidence, gather
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
@@ -191,8 +190,7 @@ def _odd_commands(seen: Evidence) -> list[Advice]:
         fields = seen.recording.read({topic.name: [path]})[topic.name].fields
         notes = sideways_notes(told, fields)
         found = [Advice("inputs.command", note.removeprefix("command: ")) for note in notes]
-    _, _, speed, turn = commanded(seen.recording, seen.roles["command"][0], None)
-    if len(speed) and not speed.any() and not turn.any():
+    if seen.commands.still:
         text = f"{topic.name} never asks the robot to move: the actions are a guess"
         found.append(Advice("task.actions", text))
     return found

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, cut, take
@@ -34,24 +35,35 @@ def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reducti
     return Reduction(tuple(dict.fromkeys(reducer.paths)), reducer)
 
 
+def angle_keys(fields: Mapping[str, str]) -> tuple[str, str]:
+    """The fields that say at which angles a scan's beams are, as `increment_rad` takes them."""
+    last = "angle_max_rad" if "angle_max_rad" in fields else "angle_increment_rad"
+    return "angle_min_rad", last
+
+
+def increment_rad(fields: Mapping[str, str], first: F64, last: F64, beams: Ints) -> F64:
+    """From a beam to the next (N,): as scans say, or by the angle of the last of so many beams."""
+    if "angle_max_rad" not in fields:
+        return last
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray((last - first) / np.maximum(beams - 1, 1))
+
+
 class _ScanReducer:
     def __init__(self, task: Task, topic: str, fields: Mapping[str, str]) -> None:
         self.task, self.topic = task, topic
-        self.by_last = "angle_max_rad" in fields
-        last = "angle_max_rad" if self.by_last else "angle_increment_rad"
-        self.paths = [fields[key] for key in ("ranges_m", "angle_min_rad", last)]
+        self.fields = fields
+        self.paths = [fields[key] for key in ("ranges_m", *angle_keys(fields))]
         self._maps: dict[tuple[float, float, int], SectorMap] = {}
 
     def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
         ranges = fields[self.paths[0]]
-        first, increment = (self._angle(fields, path) for path in self.paths[1:])
+        first, last = (self._angle(fields, path) for path in self.paths[1:])
         if isinstance(ranges, Ragged):
             beams = ranges.lengths
         else:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
-        if self.by_last:
-            with np.errstate(invalid="ignore", over="ignore"):
-                increment = (increment - first) / np.maximum(beams - 1, 1)
+        increment = increment_rad(self.fields, first, last, beams)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
         blind = np.zeros(len(beams), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):

@@ -255,12 +255,8 @@ def check_free(out: Path, force: bool) -> None:
             where=str(out),
             remedy="choose another --out" + ("; --force replaces a panel" if is_panel else ""),
         )
-    foreign = (
-        sorted({item.name for item in out.iterdir()} - {HEADER, ROWS, META, EVALUATION_SPLIT})
-        if is_panel
-        else []
-    )
-    if foreign:
+    own = {HEADER, ROWS, META, EVALUATION_SPLIT}
+    if is_panel and (foreign := sorted({item.name for item in out.iterdir()} - own)):
         raise PanelError(
             f"would be replaced with what is in it beside the panel: {', '.join(foreign[:3])}"
             + (" …" if len(foreign) > 3 else ""),

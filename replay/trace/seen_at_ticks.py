@@ -11,6 +11,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
+from restock.ingest.steps.clearance import angle_keys, increment_rad
 from restock.ingest.steps.needs import read_topics
 
 
@@ -52,9 +53,8 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
         return [None] * len(stamps)
     latest = aligned.latest("scan")
     ranges = aligned.inputs.column("scan", "ranges_m")
-    first = aligned.inputs.numbers("scan", "angle_min_rad")
-    by_last = "angle_max_rad" in aligned.inputs.by_name["scan"].fields
-    step = aligned.inputs.numbers("scan", "angle_max_rad" if by_last else "angle_increment_rad")
+    fields = aligned.inputs.by_name["scan"].fields
+    first, last = (aligned.inputs.numbers("scan", key) for key in angle_keys(fields))
     scans: list[SeenScan | None] = []
     for row, age, fresh, stamp in zip(latest.row, latest.age_ns, latest.fresh, stamps, strict=True):
         if not fresh:
@@ -62,10 +62,9 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
             continue
         one = ranges[row]
         values = np.atleast_1d(np.asarray(one.values if isinstance(one, Ragged) else one, float))
-        start, increment = float(first[row]), float(step[row])
-        if by_last:
-            increment = (increment - start) / max(len(values) - 1, 1)
-        scans.append(SeenScan(int(stamp) - int(age), values, start, increment))
+        this, beams = slice(row, row + 1), np.array([len(values)])
+        (increment,) = increment_rad(fields, first[this], last[this], beams).tolist()
+        scans.append(SeenScan(int(stamp) - int(age), values, float(first[row]), increment))
     return scans
 
 

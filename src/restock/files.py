@@ -160,7 +160,7 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} is a file"
     elif not os.access(parent, os.W_OK | os.X_OK):
         why = f"cannot be made: {parent} may not be written"
-    elif any("\udc80" <= one <= "\udcff" for one in str(absolute)):
+    elif any(map(is_undecoded, str(absolute))):
         why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
     for folder in absolute.parents:
         for mark, kind in _MARKS.items():
@@ -168,6 +168,11 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
                 why = f"is within {kind} {folder}: what replaces or removes that removes this, too"
     if why is not None:
         raise error(why, where=str(path), remedy="choose another --out")
+
+
+def is_undecoded(letter: str) -> bool:
+    """Whether it stands for a byte that Python could not decode, of a path or a command line."""
+    return "\udc80" <= letter <= "\udcff"
 
 
 def _temporary(path: Path, *, replaces: bool = True) -> Path:
@@ -241,6 +246,7 @@ __all__ = [
     "building",
     "expect_place",
     "first_line",
+    "is_undecoded",
     "is_running",
     "read_json",
     "read_table",

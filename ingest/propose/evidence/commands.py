@@ -46,6 +46,7 @@ class Commands:
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
     reverse_mps: tuple[float, ...] = ()  # slowest first; none where it was never told to back up
+    still: bool = False  # it was told nothing but to stand
     count: int = 0
     topic: str = ""
     measured: bool = False  # they are odometry, in place of commands
@@ -76,6 +77,7 @@ class Commands:
             speed_mps=most,
             yaw_rate_radps=sharp or Commands.yaw_rate_radps,
             reverse_mps=_reverse_speeds(-speed_mps[speed_mps < -0.05 * fast], most),
+            still=not (speed_mps.any() or yaw_rate_radps.any()),
         )
 
 

@@ -179,10 +179,10 @@ def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
         return None
     edges = transform_edges(recording)
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
+    topic, static_topic = transform_topics(recording)
     for base in named_frames(BASE_FRAMES, frames):
         if base not in upward(plain(scan_frame), edges.parents):
             continue
-        topic, static_topic = transform_topics(recording)
         usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
         kept = edges.only({base, scan_frame})
         segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from restock.cli import command_of
 from restock.errors import TRACEBACK, RestockError, StoreError, print_traceback
-from restock.files import first_line
+from restock.files import first_line, is_undecoded
 
 _CHECK = "a file is damaged, or is of another kind than the command expects"
 _OF_A_STORE = f"{_CHECK}; `restock compact STORE --drop-damaged --dry-run` looks for one in a store"
@@ -107,7 +107,7 @@ def _out_of_memory(error: BaseException | None) -> str:
 
 def _undecoded(error: UnicodeEncodeError) -> bool:
     """Whether it is of bytes that Python could not decode, of a path or of the command line."""
-    return all("\udc80" <= one <= "\udcff" for one in error.object[error.start : error.end])
+    return all(map(is_undecoded, error.object[error.start : error.end]))
 
 
 def _in_gl(error: Exception) -> bool:

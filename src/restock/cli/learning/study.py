@@ -115,7 +115,8 @@ class StudyCommand:
                 for job in plan.jobs
                 if job.arm.mixture is not None
                 and not job.done.exists()
-                and not (out / "panels" / job.arm.name).exists()
+                and (packed := plan.panel(job.arm)) is not None
+                and not packed.exists()
             ]
             check_mixtures(plan.study.store, to_pack, plan.folder)
             against = {

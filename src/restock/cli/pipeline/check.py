@@ -59,7 +59,6 @@ class CheckCommand:
         from restock.cli.pipeline.findings import markdown
         from restock.files import refuse_folder, write_text
         from restock.replay.store.audit import junit_suites
-        from restock.train.evaluation.regression import check_margin
 
         if self.baseline is not None and self.run_dir is None:
             raise ConfigError(
@@ -68,7 +67,10 @@ class CheckCommand:
         if self.baseline is None:
             why = "has no effect without --baseline"
             refuse(self, ("margin",), why, remedy="name the run or the saved baseline")
-        check_margin(self.margin)
+        else:
+            from restock.train.evaluation.regression import check_margin
+
+            check_margin(self.margin)
         refuse_folder(self.junit, "--junit")
         refuse_folder(self.summary, "--summary")
         parts = self._parts()
