@@ -84,6 +84,7 @@ class Input(Checked, frozen=True):
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
     stop_holds: bool = False  # a command to stop holds until the next one
+    upside_down: bool = False  # a lidar: its scans turn clockwise, as seen from above
     # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
@@ -164,6 +165,8 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         )
     if source.stop_holds and name != "command":
         raise ConfigError(f"`inputs.{name}.stop_holds` applies only to a command", where=where)
+    if source.upside_down and name != "scan":
+        raise ConfigError(f"`inputs.{name}.upside_down` applies only to a scan", where=where)
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
             f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
@@ -218,10 +221,10 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             remedy="give the topic of this source's commands, before one of several sources is "
             "chosen",
         )
-    if source.stop_holds or source.optional:
+    if source.stop_holds or source.optional or source.upside_down:
         raise ConfigError(
-            f"`{key}` cannot have stop_holds or optional",
+            f"`{key}` cannot have stop_holds, optional or upside_down",
             where=where,
-            remedy="leave out both: a recording may always lack a source of commands",
+            remedy="leave them out: a recording may always lack a source of commands",
         )
     _check_wheelbase(key, source, where)

@@ -139,14 +139,14 @@ class Profile(Checked, frozen=True):
             if signal["length"] is None:
                 del signal["length"]
         for source in values["command_sources"].values():
-            for key in FIX_SETTINGS:
+            for key in ("upside_down", *FIX_SETTINGS):
                 del source[key]
         if self.command_through is None:
             apart |= {"command_through"}
         if self.inputs.heading is None:
             del values["inputs"]["heading"]
         for source in filter(None, values["inputs"].values()):
-            for key in ("stop_holds", "wheelbase_m", *FIX_SETTINGS):
+            for key in ("stop_holds", "wheelbase_m", "upside_down", *FIX_SETTINGS):
                 if not source[key]:
                     del source[key]
         rest = {key: value for key, value in values.items() if key not in apart}

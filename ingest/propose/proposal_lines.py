@@ -312,6 +312,8 @@ def _input_lines(
             f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}"
             f"  # {seen.commands.wheelbase_from}",
         ]
+    if role == "scan" and seen.footprint.upside_down:
+        lines.append("upside_down = true  # by its frame; not if its driver turns the scans over")
     if role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)
         age = float(np.clip(round(seen.clock.pace * 4 * pace_s, 2), 0.2, 1.0))

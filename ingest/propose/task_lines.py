@@ -9,7 +9,7 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, UPSIDE_DOWN
+from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
@@ -138,7 +138,6 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
             else []
         ),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
-        *([f"# {UPSIDE_DOWN}"] if footprint.upside_down else []),
         "",
         *_reward_lines(footprint.width_m),
     ]

@@ -12,6 +12,7 @@ from restock.arrays import F64, Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, cut, take
+from restock.ingest.profile.inputs import Input
 from restock.ingest.task.scan import SectorMap
 from restock.ingest.task.task import Task
 
@@ -26,33 +27,35 @@ _MAPS = 64  # geometries that are remembered; a lidar has one
 _TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
-def scan_reduction(task: Task, topic: str, fields: Mapping[str, str]) -> Reduction:
-    """What makes SECTORS, BEAMS, BLIND and UNAIMED of scans, by the profile input's `fields`.
+def scan_reduction(task: Task, source: Input) -> Reduction:
+    """What makes SECTORS, BEAMS, BLIND and UNAIMED of the scans of a profile's input.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
-    reducer = _ScanReducer(task, topic, fields)
+    reducer = _ScanReducer(task, source)
     return Reduction(tuple(dict.fromkeys(reducer.paths)), reducer)
 
 
 def angle_keys(fields: Mapping[str, str]) -> tuple[str, str]:
-    """The fields that say at which angles a scan's beams are, as `increment_rad` takes them."""
+    """The fields that say at which angles a scan's beams are, as `beam_angles` takes them."""
     last = "angle_max_rad" if "angle_max_rad" in fields else "angle_increment_rad"
     return "angle_min_rad", last
 
 
-def increment_rad(fields: Mapping[str, str], first: F64, last: F64, beams: Ints) -> F64:
-    """From a beam to the next (N,): as scans say, or by the angle of the last of so many beams."""
-    if "angle_max_rad" not in fields:
-        return last
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray((last - first) / np.maximum(beams - 1, 1))
+def beam_angles(source: Input, first: F64, last: F64, beams: Ints) -> tuple[F64, F64]:
+    """The angle of the first beam (N,) and from each to the next (N,), counter-clockwise as seen
+    from above: as scans say, or by the angle of the last of so many beams."""
+    increment = last
+    if "angle_max_rad" in source.fields:
+        with np.errstate(invalid="ignore", over="ignore"):
+            increment = np.asarray((last - first) / np.maximum(beams - 1, 1))
+    return (-first, -increment) if source.upside_down else (first, increment)
 
 
 class _ScanReducer:
-    def __init__(self, task: Task, topic: str, fields: Mapping[str, str]) -> None:
-        self.task, self.topic = task, topic
-        self.fields = fields
+    def __init__(self, task: Task, source: Input) -> None:
+        self.task, self.source = task, source
+        fields = source.fields
         self.paths = [fields[key] for key in ("ranges_m", *angle_keys(fields))]
         self._maps: dict[tuple[float, float, int], SectorMap] = {}
 
@@ -63,7 +66,7 @@ class _ScanReducer:
             beams = ranges.lengths
         else:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
-        increment = increment_rad(self.fields, first, last, beams)
+        first, increment = beam_angles(self.source, first, last, beams)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
         blind = np.zeros(len(beams), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -127,7 +130,7 @@ class _ScanReducer:
         column = fields[path]
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             raise RecordingError(
-                f"{path!r} of {self.topic} is not one number per message",
+                f"{path!r} of {self.source.topic} is not one number per message",
                 remedy="correct `inputs.scan.fields` in the profile",
             )
         return np.asarray(column, np.float64)

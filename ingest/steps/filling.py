@@ -235,7 +235,7 @@ class Filling:
             latest = self._required("scan")
             fields: Fields = self.inputs.topics[source.topic].fields
             if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
-                fields = scan_reduction(self.task, source.topic, source.fields).apply(fields)
+                fields = scan_reduction(self.task, source).apply(fields)
             fresh, rows = latest.fresh, latest.row[latest.fresh]
             if len(rows):
                 beams = np.zeros(count, np.int64)

@@ -143,9 +143,7 @@ def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Redu
     a camera's images are."""
     parts: dict[str, list[Reduction]] = {}
     if (scan := profile.inputs.scan) is not None and scan.topic in available:
-        parts.setdefault(scan.topic, []).append(
-            scan_reduction(profile.task, scan.topic, scan.fields)
-        )
+        parts.setdefault(scan.topic, []).append(scan_reduction(profile.task, scan))
     signals: dict[str, dict[str, CustomSignal]] = {}
     for name, signal in profile.signals.items():
         if signal.topic in available:

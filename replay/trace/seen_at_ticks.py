@@ -11,13 +11,13 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
-from restock.ingest.steps.clearance import angle_keys, increment_rad
+from restock.ingest.steps.clearance import angle_keys, beam_angles
 from restock.ingest.steps.needs import read_topics
 
 
 @dataclass(frozen=True)
 class SeenScan:
-    """One lidar scan as it was recorded."""
+    """One lidar scan as it was recorded, its angles as seen from above."""
 
     stamp_ns: int  # when it was measured, on the alignment clock
     ranges_m: F64  # (B,); inf and NaN as the lidar has them
@@ -53,8 +53,8 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
         return [None] * len(stamps)
     latest = aligned.latest("scan")
     ranges = aligned.inputs.column("scan", "ranges_m")
-    fields = aligned.inputs.by_name["scan"].fields
-    first, last = (aligned.inputs.numbers("scan", key) for key in angle_keys(fields))
+    source = aligned.inputs.by_name["scan"]
+    first, last = (aligned.inputs.numbers("scan", key) for key in angle_keys(source.fields))
     scans: list[SeenScan | None] = []
     for row, age, fresh, stamp in zip(latest.row, latest.age_ns, latest.fresh, stamps, strict=True):
         if not fresh:
@@ -63,8 +63,8 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
         one = ranges[row]
         values = np.atleast_1d(np.asarray(one.values if isinstance(one, Ragged) else one, float))
         this, beams = slice(row, row + 1), np.array([len(values)])
-        (increment,) = increment_rad(fields, first[this], last[this], beams).tolist()
-        scans.append(SeenScan(int(stamp) - int(age), values, float(first[row]), increment))
+        angles = beam_angles(source, first[this], last[this], beams)
+        scans.append(SeenScan(int(stamp) - int(age), values, *(float(one[0]) for one in angles)))
     return scans
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +11,7 @@ from support.profile_texts import WAREHOUSE
 
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.decoding.columns import FieldColumn, Ragged, offsets_of, take
+from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.steps import clearance
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
@@ -21,7 +23,8 @@ FIELDS = {
     "angle_min_rad": "angle_min",
     "angle_increment_rad": "angle_increment",
 }
-REDUCE = scan_reduction(TASK, "/scan", FIELDS)
+SCAN = Input("/scan", "sensor_msgs/msg/LaserScan", FIELDS)
+REDUCE = scan_reduction(TASK, SCAN)
 
 
 def scans(beams: list[int], firsts: list[float], seed: int) -> dict[str, FieldColumn]:
@@ -103,10 +106,39 @@ def test_the_last_angle_says_what_the_increment_says() -> None:
     )
     ends = {"start": first, "end": first + step * np.array([119, 8, 0, 0])}
     by_last = {"ranges_m": "ranges", "angle_min_rad": "start", "angle_max_rad": "end"}
-    found = scan_reduction(TASK, "/scan", by_last).apply({"ranges": fields["ranges"], **ends})
+    source = msgspec.structs.replace(SCAN, fields=by_last)
+    found = scan_reduction(TASK, source).apply({"ranges": fields["ranges"], **ends})
     expected = REDUCE.apply(fields | {"angle_min": first, "angle_increment": step})
     for name in (SECTORS, BEAMS, BLIND, UNAIMED):
         assert np.allclose(np.asarray(found[name]), np.asarray(expected[name])), name
+
+
+@pytest.mark.parametrize("last", ["angle_increment", "angle_max"])
+def test_a_lidar_upside_down_sees_what_it_sees_upright_at_negated_angles(last: str) -> None:
+    """Points that an upright one has on its left, it reports on its right."""
+    named = {"ranges_m": "ranges", "angle_min_rad": "angle_min", f"{last}_rad": last}
+    upright = msgspec.structs.replace(SCAN, fields=named)
+    hanging = msgspec.structs.replace(upright, upside_down=True)
+    fields = scans([120, 60, 9, 1, 0], [-3.1, 0.1, 0.0, -3.1, 0.0], seed=3)
+    fields["angle_max"] = np.asarray(fields["angle_min"]) + np.float32(3.0)
+    negated = {name: -np.asarray(fields[name]) for name in ("angle_min", last)}
+    expected = scan_reduction(TASK, upright).apply(fields)
+    found = scan_reduction(TASK, hanging).apply(fields | negated)
+    for name in (SECTORS, BEAMS, BLIND, UNAIMED):
+        assert np.array_equal(np.asarray(found[name]), np.asarray(expected[name])), name
+    swapped = scan_reduction(TASK, upright).apply(fields | negated)
+    assert not np.array_equal(np.asarray(swapped[SECTORS]), np.asarray(expected[SECTORS]))
+
+
+def test_only_a_scan_can_be_upside_down() -> None:
+    text = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
+    turned, known = (parse_profile(one, where="p") for one in (text, WAREHOUSE))
+    assert turned.hash != known.hash
+    same = parse_profile(text.replace("upside_down = true", "upside_down = false"), where="p")
+    assert same.hash == known.hash
+    odd = WAREHOUSE.replace("[inputs.imu]", "[inputs.imu]\nupside_down = true")
+    with pytest.raises(ConfigError, match=r"inputs\.imu\.upside_down` applies only to a scan"):
+        parse_profile(odd, where="p")
 
 
 @pytest.mark.parametrize(

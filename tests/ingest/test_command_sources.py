@@ -265,7 +265,11 @@ def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
         ),
         ('pressed = "buttons[4]"', 'presed = "buttons[4]"', "unknown 'presed'"),
         ("[command_sources.teleop]", '[command_sources.""]', "1 to 64 printable"),
-        ("fields =", "optional = true\nfields =", "cannot have stop_holds or optional"),
+        (
+            "fields =",
+            "optional = true\nfields =",
+            "cannot have stop_holds, optional or upside_down",
+        ),
     ],
 )
 def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, capsys):

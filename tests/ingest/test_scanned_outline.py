@@ -14,6 +14,7 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile, parse_profile
+from restock.replay.store.store import Store
 
 NAMES = ("base_link", "lidar")
 TYPES = {
@@ -163,7 +164,7 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsy
     assert (body.length_m, body.width_m) == pytest.approx((0.7, 0.6), abs=1e-3)
     assert (body.lidar_x_m, body.lidar_yaw_rad) == pytest.approx((-0.35, -2.356), abs=1e-3)
     assert "that it is 0.30 m to the right is ignored" in text
-    assert "UPSIDE DOWN" not in text
+    assert "upside_down" not in text
 
 
 def test_a_lidar_outside_a_measured_outline_is_turned_as_transforms_say(tmp_path, capsys):
@@ -178,9 +179,31 @@ def test_a_lidar_outside_a_measured_outline_is_turned_as_transforms_say(tmp_path
     assert "; a guess; base_link has it 0.90 m ahead, outside" in text
 
 
-def test_a_lidar_that_hangs_upside_down_is_said(tmp_path, capsys):
-    more = {"/tf_static": lidar_at(0.1, 0.0, 0.0, np.pi)}
-    assert "# THE LIDAR HANGS UPSIDE DOWN" in proposed(tmp_path, capsys, Framed(12.0), **more)[1]
+def test_a_lidar_that_hangs_upside_down_gives_the_rows_that_it_gives_upright(tmp_path, capsys):
+    """By its frame. What it sees on the robot's left, it reports on its own right."""
+    found, texts = [], []
+    for roll, sign in ((0.0, 1), (np.pi, -1)):
+        drive = Framed(12.0, near_scans=60)
+        topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
+        scan = topics["/scan"][1].fields
+        for angle in ("angle_min", "angle_max", "angle_increment"):
+            if angle in scan:
+                scan[angle] = sign * np.asarray(scan[angle])
+        topics["/tf_static"] = (TYPES["/tf_static"], lidar_at(0.1, 0.0, 0.3, roll))
+        bag = write_topics(topics, tmp_path / f"bag{sign}", storage="mcap")
+        toml, store = tmp_path / f"{sign}.toml", tmp_path / f"store{sign}"
+        assert main(["profile", "new", str(bag), "--out", str(toml)]) in (0, 3)
+        said = capsys.readouterr()
+        assert ("hangs upside down by its frame" in said.out + said.err) == (sign < 0)
+        assert main(["ingest", str(bag), "--profile", str(toml), "--store", str(store)]) in (0, 3)
+        with Store(store) as opened:
+            found.append(opened.sql("SELECT observation, action FROM transitions").fetchall())
+        texts.append([one for one in toml.read_text().splitlines() if "bag" not in one])
+    assert found[0] == found[1]
+    assert len(found[0]) > 20
+    assert {one.split("  #")[0] for one in texts[1]} - {
+        one.split("  #")[0] for one in texts[0]
+    } == {"upside_down = true"}
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

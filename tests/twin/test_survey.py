@@ -16,10 +16,12 @@ from deltalake import DeltaTable
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.profile_texts import WAREHOUSE
 from support.stores import recording_transitions, with_clear_view, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
+from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tables import Zone
 from restock.ingest.propose.evidence.footprint import parse_footprint
 from restock.toml import Checked, read_toml, typed
@@ -90,11 +92,12 @@ def write_bag(
     scanned: np.ndarray | None = None,
     scanned_from: np.ndarray | None = None,
     scans_late_s: float = 0.0,
+    clockwise: bool = False,
 ) -> Path:
     """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own.
 
     `scanned` are cells (X, Y) that a lidar of 120 beams sees from each pose, by ray marching; its
-    stamps may be late.
+    stamps may be late, and its angles those of one that hangs upside down.
     """
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
 
@@ -133,9 +136,9 @@ def write_bag(
                 stamp_ns = 10**9 + index * 2 * 10**8
                 message = T[kind](
                     header=header(stamp_ns + int(scans_late_s * 1e9), "laser"),
-                    angle_min=-np.pi,
-                    angle_max=np.pi,
-                    angle_increment=2 * np.pi / 120,
+                    angle_min=np.pi if clockwise else -np.pi,
+                    angle_max=-np.pi if clockwise else np.pi,
+                    angle_increment=2 * np.pi / (-120 if clockwise else 120),
                     time_increment=0.0,
                     scan_time=0.2,
                     range_min=0.1,
@@ -172,6 +175,20 @@ def test_scans_make_the_map_that_was_scanned_by_the_clock_that_fits(
     assert made.agreement > 0.95
     assert len(made.floor.segments) == 4
     assert survey(bag).by == "map"  # which is better known
+
+
+def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
+    """No transform says so: the profile does."""
+    known = OccupancyGrid(hall(), CELL_M)
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=hall(), clockwise=True)
+    hanging = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
+    right, wrong = (
+        survey(bag, by="scans", profile=parse_profile(one, where="p"))
+        for one in (hanging, WAREHOUSE)
+    )
+    assert right.agreement is not None
+    assert wrong.agreement is not None
+    assert right.agreement > 0.95 > wrong.agreement
 
 
 def test_scans_that_do_not_fit_together_leave_the_corridor(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ _POLYGONS = ("geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/Polygon")
 
 DESCRIBED = "as described"  # where a lidar's place is from
 UPSIDE_DOWN = (
-    "THE LIDAR HANGS UPSIDE DOWN by its frame: left and right of its scans are swapped, unless its "
-    "driver turns them. No key does: record a scan whose frame is upright, or remove inputs.scan"
+    "the lidar hangs upside down by its frame, so its scans are turned over; if its driver does "
+    "that already, left and right are swapped now: remove upside_down"
 )
 
 

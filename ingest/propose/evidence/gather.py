@@ -147,7 +147,7 @@ def gather(
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, frame))
-    robot = propose_robot(recording, scan, frame, urdf)
+    robot = propose_robot(recording, scan, frame, urdf, upside_down=footprint.upside_down)
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
     robot = wheelbase_of(recording, roles, poses, robot)

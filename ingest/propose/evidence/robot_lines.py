@@ -160,9 +160,15 @@ def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
 
 
 def propose_robot(
-    recording: Recording, scan_topic: str | None, scan_frame: str, urdf: Path | None
+    recording: Recording,
+    scan_topic: str | None,
+    scan_frame: str,
+    urdf: Path | None,
+    *,
+    upside_down: bool = False,
 ) -> RobotProposal:
-    """The robot that a URDF file, else the recording's description, and its scans describe.
+    """The robot that a URDF file, else the recording's description, and its scans describe; its
+    lidar may hang upside down.
 
     Raises:
         ConfigError: the file cannot be used: it has no wheels, say.
@@ -199,7 +205,7 @@ def propose_robot(
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)
     if scan_topic is not None:
-        seen = _lidar(recording, scan_topic, notes)
+        seen = _lidar(recording, scan_topic, notes, upside_down)
         values |= seen
         origin |= dict.fromkeys(seen, "logs")
     return RobotProposal(values, origin, notes)
@@ -220,15 +226,17 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     return kept
 
 
-def _lidar(recording: Recording, topic: str, notes: list[str]) -> dict[str, Any]:
-    """Beams and field of view of the last scan."""
+def _lidar(recording: Recording, topic: str, notes: list[str], upside_down: bool) -> dict[str, Any]:
+    """Beams and field of view of the last scan, as seen from above."""
     paths = ["angle_min", "angle_max", "angle_increment"]
     if not set(paths) <= set(recording.leaves(topic)):
         return {}
     fields = recording.read({topic: paths})[topic].fields
     if not len(fields[paths[0]]):
         return {}
-    first, last, step = (float(np.asarray(fields[path])[-1]) for path in paths)
+    sign = -1 if upside_down else 1
+    # `+ 0.0`: no "-0.0" in a file
+    first, last, step = (sign * float(np.asarray(fields[path])[-1]) + 0.0 for path in paths)
     if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
         return {}
     count = round((last - first) / step) + 1

@@ -144,10 +144,17 @@ def _mount(
     notes: list[str],
 ) -> tuple[F64, F64]:
     """How the lidar sits on the robot: rotation (3, 3) and place (3,)."""
+    over = np.diag([1.0, -1.0, -1.0])
+    scan = None if profile is None else profile.inputs.scan
     bases = [profile.frames.base] if profile is not None and profile.frames is not None else []
     for base in (*bases, *BASE_FRAMES):
         if found := mount_of(recording, frame, base):
-            return found
+            turn, place = found
+            if scan is None or scan.upside_down == (turn[2, 2] < 0):
+                return found
+            way = "upside down" if scan.upside_down else "upright"
+            notes.append(f"the lidar is {way} by inputs.scan of the profile, and not by {frame}")
+            return turn @ over, place
     ahead: float | None = None
     yaw: float | None = None
     if profile is not None:
@@ -161,6 +168,8 @@ def _mount(
         )
     cos, sin = np.cos(yaw or 0.0), np.sin(yaw or 0.0)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    if scan is not None and scan.upside_down:
+        turn = turn @ over
     return turn, np.array([ahead or 0.0, 0.0, 0.0])
 
 
