@@ -13,6 +13,7 @@ from restock.ingest.profile.inputs import (
     COMMAND_THROUGH,
     check_command_source,
     check_input,
+    check_scans,
 )
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Kind, label_with_probabilities
@@ -45,6 +46,7 @@ def check_profile(profile: Profile, where: str) -> None:
         raise ConfigError(f"`conditions`: {', '.join(doubled)} is given twice", where=where)
     for name, source in profile.inputs.items():
         check_input(name, source, where, framed=profile.frames is not None)
+    check_scans(profile.inputs.scans, where)
     if profile.inputs.scan is not None and not profile.task.sectors:
         raise ConfigError(
             "`task.sectors` is 0 (a robot without a lidar), but `inputs.scan` is given",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated
 
 from msgspec import Meta
@@ -13,6 +13,13 @@ from restock.toml import Checked
 COMMAND_SOURCES = "command_sources"
 COMMAND_THROUGH = "command_through"
 MOST_NAME = 64  # characters of a behaviour policy
+SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
+_SCAN_FIELDS = {
+    "ranges_m": True,
+    "angle_min_rad": True,
+    "angle_increment_rad": False,  # either this one
+    "angle_max_rad": False,  # or this one
+}
 
 
 # What each input must and may say of a message: signal-side name -> whether it is required.
@@ -27,12 +34,7 @@ INPUT_FIELDS: dict[str, dict[str, bool]] = {
     "heading": {"orientation": False, "yaw_rad": False},  # of a pose by fix
     "wheels": {"speed_mps": True, "yaw_rate_radps": True},
     "imu": {"yaw_rate_radps": True, "accel_x_mps2": True},
-    "scan": {
-        "ranges_m": True,
-        "angle_min_rad": True,
-        "angle_increment_rad": False,  # either this one
-        "angle_max_rad": False,  # or this one
-    },
+    **dict.fromkeys(SCANS, _SCAN_FIELDS),
     "goal": {"x_m": True, "y_m": True},
     "plan": {"x_m": True, "y_m": True},
     "bumper": {"pressed": True},
@@ -71,6 +73,7 @@ HINDSIGHT = {
 
 
 FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
+SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad")
 
 
 class Input(Checked, frozen=True):
@@ -84,7 +87,11 @@ class Input(Checked, frozen=True):
     optional: bool = False
     wheelbase_m: Annotated[float, Meta(gt=0)] | None = None  # between the axles, for steering_rad
     stop_holds: bool = False  # a command to stop holds until the next one
-    upside_down: bool = False  # a lidar: its scans turn clockwise, as seen from above
+    # Of a lidar: whether its scans turn clockwise, as seen from above; where it is, from the middle
+    # of the outline (ahead, left), if not where [task.body] has it; and the angle of its zero.
+    upside_down: bool = False
+    lidar_at_m: tuple[float, float] | None = None
+    lidar_yaw_rad: float | None = None
     # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5
@@ -104,6 +111,9 @@ class Inputs(Checked, frozen=True):
     pose: Input | None = None
     heading: Input | None = None  # for fixes; None: the direction of driving
     scan: Input | None = None
+    scan_2: Input | None = None  # further lidars: what is nearest to any of them counts
+    scan_3: Input | None = None
+    scan_4: Input | None = None
     imu: Input | None = None
     goal: Input | None = None
     plan: Input | None = None
@@ -119,6 +129,11 @@ class Inputs(Checked, frozen=True):
             source = getattr(self, name)
             if source is not None:
                 yield name, source
+
+    @property
+    def scans(self) -> dict[str, Input]:
+        """The lidars, by name."""
+        return {name: source for name, source in self.items() if name in SCANS}
 
 
 def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
@@ -150,7 +165,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             unknown.append("steering_rad beside yaw_rate_radps")
         elif not steered and "yaw_rate_radps" not in source.fields:
             missing.append("yaw_rate_radps")
-    if name == "scan":
+    if name in SCANS:
         if {"angle_increment_rad", "angle_max_rad"} <= source.fields.keys():
             unknown.append("angle_max_rad beside angle_increment_rad")
         elif not {"angle_increment_rad", "angle_max_rad"} & source.fields.keys():
@@ -165,13 +180,62 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         )
     if source.stop_holds and name != "command":
         raise ConfigError(f"`inputs.{name}.stop_holds` applies only to a command", where=where)
-    if source.upside_down and name != "scan":
-        raise ConfigError(f"`inputs.{name}.upside_down` applies only to a scan", where=where)
+    if name not in SCANS:
+        _check_scan_settings(f"inputs.{name}", source, where)
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
             f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
             where=where,
             remedy=f"optional may be {', '.join(FALLBACKS)}, and pose where there is [frames]",
+        )
+
+
+def _check_scan_settings(key: str, source: Input, where: str) -> None:
+    for setting in SCAN_SETTINGS:
+        if getattr(source, setting) not in (None, False):
+            raise ConfigError(f"`{key}.{setting}` applies only to a scan", where=where)
+
+
+def check_scans(scans: Mapping[str, Input], where: str) -> None:
+    """That several lidars go together.
+
+    Raises:
+        ConfigError: they do not; names the key.
+    """
+    for name, source in scans.items():
+        if source.lidar_yaw_rad is not None and source.lidar_at_m is None:
+            raise ConfigError(
+                f"`inputs.{name}.lidar_yaw_rad` is given without lidar_at_m",
+                where=where,
+                remedy="give both, or lidar_x_m and lidar_yaw_rad of [task.body]",
+            )
+    if len(scans) < 2 and "scan" in scans:
+        return
+    if "scan" not in scans and scans:
+        raise ConfigError(
+            f"`inputs.{next(iter(scans))}` is given without `inputs.scan`",
+            where=where,
+            remedy="name the first lidar scan",
+        )
+    for name, source in scans.items():
+        if source.lidar_at_m is None:
+            raise ConfigError(
+                f"`inputs.{name}.lidar_at_m` is missing: of several lidars, each says where it is",
+                where=where,
+                remedy="give lidar_at_m = [AHEAD, LEFT], from the middle of the outline, and"
+                " lidar_yaw_rad",
+            )
+        if source.optional:
+            raise ConfigError(
+                f"`inputs.{name}.optional`: of several lidars, none is optional, as rows would"
+                " not tell what it alone sees",
+                where=where,
+                remedy="leave it out, and give recordings without it a profile of their own",
+            )
+    topics = [source.topic for source in scans.values()]
+    if len(set(topics)) < len(topics):
+        raise ConfigError(
+            f"`inputs.{list(scans)[-1]}.topic`: two of the lidars have one topic", where=where
         )
 
 
@@ -221,10 +285,11 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             remedy="give the topic of this source's commands, before one of several sources is "
             "chosen",
         )
-    if source.stop_holds or source.optional or source.upside_down:
+    if source.stop_holds or source.optional:
         raise ConfigError(
-            f"`{key}` cannot have stop_holds, optional or upside_down",
+            f"`{key}` cannot have stop_holds or optional",
             where=where,
-            remedy="leave them out: a recording may always lack a source of commands",
+            remedy="leave out both: a recording may always lack a source of commands",
         )
     _check_wheelbase(key, source, where)
+    _check_scan_settings(key, source, where)

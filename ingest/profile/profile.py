@@ -39,6 +39,8 @@ from restock.ingest.profile.inputs import (
     POLICY_FALLBACK,
     POSE_FALLBACK,
     ROUTE_FALLBACK,
+    SCAN_SETTINGS,
+    SCANS,
     STEERED,
     WHEELS_FALLBACK,
     Input,
@@ -139,14 +141,15 @@ class Profile(Checked, frozen=True):
             if signal["length"] is None:
                 del signal["length"]
         for source in values["command_sources"].values():
-            for key in ("upside_down", *FIX_SETTINGS):
+            for key in (*SCAN_SETTINGS, *FIX_SETTINGS):
                 del source[key]
         if self.command_through is None:
             apart |= {"command_through"}
-        if self.inputs.heading is None:
-            del values["inputs"]["heading"]
+        for name in ("heading", *SCANS[1:]):
+            if values["inputs"][name] is None:
+                del values["inputs"][name]
         for source in filter(None, values["inputs"].values()):
-            for key in ("stop_holds", "wheelbase_m", "upside_down", *FIX_SETTINGS):
+            for key in ("stop_holds", "wheelbase_m", *SCAN_SETTINGS, *FIX_SETTINGS):
                 if not source[key]:
                     del source[key]
         rest = {key: value for key, value in values.items() if key not in apart}
@@ -274,7 +277,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
     for name, table in cameras.items() if isinstance(cameras, dict) else ():
         typed(table, Camera, where=where, prefix=f"cameras.{name}")
     profile = typed(document, Profile, where=where)
-    if profile.inputs.scan is None:
+    if not profile.inputs.scans:
         profile = without_lidar(profile)  # whatever number of sectors it gives
     check_profile(profile, where)
     return profile
@@ -284,6 +287,6 @@ def without_lidar(profile: Profile) -> Profile:
     """The same of a robot without a lidar: no scan, and no sectors in its observation."""
     return msgspec.structs.replace(
         profile,
-        inputs=msgspec.structs.replace(profile.inputs, scan=None),
+        inputs=msgspec.structs.replace(profile.inputs, **dict.fromkeys(SCANS)),
         task=msgspec.structs.replace(profile.task, sectors=0),
     )

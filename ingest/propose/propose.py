@@ -153,8 +153,13 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
+    if len(seen.lidars) > 1:
+        scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)
+        advice.append(Advice("inputs.scan", f"the lidars of {scans} are put together"))
+    hanging = [name for name, lidar in seen.lidars.items() if lidar.upside_down]
     if seen.footprint.upside_down and seen.roles["scan"]:
-        advice.append(Advice("inputs.scan", UPSIDE_DOWN))
+        hanging = ["scan"]
+    advice += [Advice(f"inputs.{name}", UPSIDE_DOWN) for name in hanging]
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
         several_commands(usable_topics(recording)),

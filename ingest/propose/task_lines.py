@@ -134,9 +134,10 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
                 + ("; a guess" if x is None else "")
                 + ("" if x is None and not placed else f"; {footprint.lidar_source}")
             ]
-            if seen.roles["scan"]
+            if seen.roles["scan"] and not seen.lidars
             else []
         ),
+        *(["# Clearance is as from the middle: lidar_at_m of the inputs."] if seen.lidars else []),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
         "",
         *_reward_lines(footprint.width_m),

@@ -13,7 +13,7 @@ from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, cut, take
 from restock.ingest.profile.inputs import Input
-from restock.ingest.task.scan import SectorMap
+from restock.ingest.task.scan import MovedMap, SectorMap
 from restock.ingest.task.task import Task
 
 # What is made of a scan, beside the message's own fields (whose names hold no space).
@@ -57,7 +57,7 @@ class _ScanReducer:
         self.task, self.source = task, source
         fields = source.fields
         self.paths = [fields[key] for key in ("ranges_m", *angle_keys(fields))]
-        self._maps: dict[tuple[float, float, int], SectorMap] = {}
+        self._maps: dict[tuple[float, float, int], SectorMap | MovedMap] = {}
 
     def __call__(self, fields: Fields) -> dict[str, FieldColumn]:
         ranges = fields[self.paths[0]]
@@ -109,20 +109,27 @@ class _ScanReducer:
             table = np.asarray(values).reshape(stop - start, beams)
             found = sectors.clearance(table, task.range_min_m, task.range_max_m)
             clearance[here] = found
-            free = np.flatnonzero((found >= task.range_max_m).all(axis=1))
+            free = np.flatnonzero(
+                ~(found < task.range_max_m).any(axis=1)
+            )  # NaN: no beam ends there
             if len(free):
                 blind[start + free if rows is None else rows[start + free]] = ~(
                     table[free] >= task.range_min_m  # False for NaN
                 ).any(axis=1)
 
-    def _map(self, first: float, increment: float, beams: int) -> SectorMap:
+    def _map(self, first: float, increment: float, beams: int) -> SectorMap | MovedMap:
         key = (first, increment, beams)
         sectors = self._maps.get(key)
         if sectors is None:
             if len(self._maps) >= _MAPS:
                 self._maps.clear()
             bearings = first + increment * np.arange(beams)
-            sectors = SectorMap.build(bearings, self.task.sectors, self.task.body)
+            count, body, at_m = self.task.sectors, self.task.body, self.source.lidar_at_m
+            if at_m is None:
+                sectors = SectorMap.build(bearings, count, body)
+            else:
+                turned = bearings + (self.source.lidar_yaw_rad or 0.0)
+                sectors = MovedMap.build(turned, count, body, at_m)
             self._maps[key] = sectors
         return sectors
 
@@ -131,6 +138,6 @@ class _ScanReducer:
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             raise RecordingError(
                 f"{path!r} of {self.source.topic} is not one number per message",
-                remedy="correct `inputs.scan.fields` in the profile",
+                remedy="correct the `fields` of this scan in the profile's inputs",
             )
         return np.asarray(column, np.float64)

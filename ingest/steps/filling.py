@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.topic_reading import Fields
+from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
@@ -31,6 +32,7 @@ from restock.ingest.steps.routing import (
 )
 from restock.ingest.task.hindsight import missions
 from restock.ingest.task.perturbation_columns import Perturbed
+from restock.ingest.task.scan import with_unseen
 from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.surroundings import SCANNED, came_nearer, steps_remembered
 
@@ -66,7 +68,7 @@ class Filling:
         else:
             self.signals["gyro_yaw_rate_radps"] = self.signals["wheel_yaw_rate_radps"].copy()
             self.signals["accel_x_mps2"] = np.zeros(len(self.tick_ns))
-        self._scan()
+        self._scans()
         self._bumper()
         self._nav_command()
         if self.profile.goal_source == "hindsight":
@@ -223,34 +225,38 @@ class Filling:
         self.located = np.asarray(at.problem == "", np.bool_)
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
-    def _scan(self) -> None:
-        """Clearance by the scan. A robot without a lidar has none, and what has one may not go
-        without: recordings without scans are read by `as_recorded`, of a task without sectors."""
+    def _scans(self) -> None:
+        """Clearance by the scans: of several lidars, the nearest of any. A robot without a lidar
+        has none, and what has one may not go without: recordings without scans are read by
+        `as_recorded`, of a task without sectors."""
         count = len(self.tick_ns)
-        source = self.inputs.by_name.get("scan")
-        sectors = np.full((count, self.task.sectors), float(self.task.range_max_m))
-        if source is None and self.task.lidar:
+        sectors = np.full((count, self.task.sectors), np.nan)
+        if "scan" not in self.inputs.by_name and self.task.lidar:
             self._mark_invalid(np.ones(count, np.bool_), "scan: not yet received")
-        if source is not None:
-            latest = self._required("scan")
-            fields: Fields = self.inputs.topics[source.topic].fields
-            if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
-                fields = scan_reduction(self.task, source).apply(fields)
-            fresh, rows = latest.fresh, latest.row[latest.fresh]
-            if len(rows):
-                beams = np.zeros(count, np.int64)
-                beams[fresh] = np.asarray(fields[BEAMS])[rows]
-                self._mark_invalid(fresh & (beams == 0), "scan: no beams")
-                for flag, reason in (
-                    (BLIND, "no beam has a valid range"),
-                    (UNAIMED, "unusable angles"),
-                ):
-                    bad = np.zeros(count, np.bool_)
-                    bad[fresh] = np.asarray(fields[flag])[rows]
-                    self._mark_invalid(bad, f"scan: {reason}")
-                sectors[fresh] = np.asarray(fields[SECTORS])[rows]
+        for name, source in self.profile.inputs.scans.items():
+            if name in self.inputs.by_name:
+                self._scan(name, source, sectors)
+        sectors = with_unseen(sectors, float(self.task.range_max_m))
         nearest = sectors.min(axis=1) if self.task.sectors else np.full(count, np.nan)
         self.signals |= {"sector_clearance_m": sectors, "clearance_m": nearest}
+
+    def _scan(self, name: str, source: Input, sectors: F64) -> None:
+        """Put the clearance by one lidar into `sectors` (T, K), where it is less or not known."""
+        latest, count = self._required(name), len(self.tick_ns)
+        fields: Fields = self.inputs.topics[source.topic].fields
+        if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
+            fields = scan_reduction(self.task, source).apply(fields)
+        fresh, rows = latest.fresh, latest.row[latest.fresh]
+        if not len(rows):
+            return
+        beams = np.zeros(count, np.int64)
+        beams[fresh] = np.asarray(fields[BEAMS])[rows]
+        self._mark_invalid(fresh & (beams == 0), f"{name}: no beams")
+        for flag, reason in ((BLIND, "no beam has a valid range"), (UNAIMED, "unusable angles")):
+            bad = np.zeros(count, np.bool_)
+            bad[fresh] = np.asarray(fields[flag])[rows]
+            self._mark_invalid(bad, f"{name}: {reason}")
+        sectors[fresh] = np.fmin(sectors[fresh], np.asarray(fields[SECTORS])[rows])
 
     def _bumper(self) -> None:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]

@@ -16,7 +16,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.inputs import SCANS, Input
 from restock.ingest.profile.profile import Profile, without_lidar
 from restock.ingest.profile.signal_paths import element_of, offer
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
@@ -117,7 +117,7 @@ def wanted_fields(
         if source.topic not in available:
             continue
         paths = wanted.setdefault(source.topic, [])
-        if name != "scan":
+        if name not in SCANS:
             paths += field_paths(source)
         if name in ("pose", "goal", "plan"):
             frame = frame_path(source, {leaf.path for leaf in leaves[source.topic]})
@@ -142,8 +142,9 @@ def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Redu
     """topic -> what is made of its messages as they are read: clearance, custom signals, and what
     a camera's images are."""
     parts: dict[str, list[Reduction]] = {}
-    if (scan := profile.inputs.scan) is not None and scan.topic in available:
-        parts.setdefault(scan.topic, []).append(scan_reduction(profile.task, scan))
+    for scan in profile.inputs.scans.values():
+        if scan.topic in available:
+            parts.setdefault(scan.topic, []).append(scan_reduction(profile.task, scan))
     signals: dict[str, dict[str, CustomSignal]] = {}
     for name, signal in profile.signals.items():
         if signal.topic in available:

@@ -21,6 +21,9 @@ class Body(Checked, frozen=True):
     lidar_yaw_rad: float = 0.0  # angle of the scan's zero to the robot's forward axis
 
 
+UNSEEN_SECTORS = 3  # at most, that are taken to lie behind what is beside them
+
+
 @dataclass(frozen=True)
 class SectorMap:
     """Which beam belongs to which sector, and how far the body reaches along each beam.
@@ -65,6 +68,71 @@ class SectorMap:
             nearest = np.minimum.reduceat(near, self.starts, axis=1)
             clearance[:, self.filled] = np.maximum(nearest, 0.0)
         return clearance
+
+
+@dataclass(frozen=True)
+class MovedMap:
+    """The same of a lidar that is not where the body has its own: where its beams end is seen from
+    there, so the sector of a beam depends on its range."""
+
+    sectors: int
+    body: Body
+    from_m: tuple[float, float]  # of this lidar, ahead and left of the body's own
+    ways: NDArray[np.float64]  # (2, B) of the beams: cosines and sines, in the body's frame
+
+    @classmethod
+    def build(
+        cls, bearings_rad: NDArray[Any], sectors: int, body: Body, at_m: tuple[float, float]
+    ) -> MovedMap:
+        """Bearings (B,) of the beams in the body's frame, from a place in it (ahead, left)."""
+        ways = np.stack([np.cos(bearings_rad), np.sin(bearings_rad)])
+        return cls(sectors, body, (at_m[0] - body.lidar_x_m, at_m[1]), ways)
+
+    def clearance(
+        self, ranges_m: NDArray[Any], range_min_m: float, range_max_m: float
+    ) -> NDArray[np.float64]:
+        """As `SectorMap.clearance`, but NaN for sectors in which no beam ends (`with_unseen`);
+        `range_min_m` is from this lidar, `range_max_m` from the body's own."""
+        with np.errstate(invalid="ignore"):
+            ranges = np.asarray(ranges_m, np.float64)
+        farthest_m = range_max_m + float(np.hypot(*self.from_m))
+        valid = (ranges >= range_min_m) & (ranges <= farthest_m)
+        reached = np.where(valid, ranges, farthest_m)
+        x, y = (reached * way + start for way, start in zip(self.ways, self.from_m, strict=True))
+        bearing = np.arctan2(y, x)
+        near = np.clip(np.hypot(x, y) - outline_reach(bearing, self.body), 0.0, range_max_m)
+        np.copyto(near, range_max_m, where=~valid)
+        turn = (bearing + np.pi) * (self.sectors / (2 * np.pi))
+        sector = np.minimum(turn.astype(np.intp), self.sectors - 1)
+        clearance = np.full((len(ranges), self.sectors), np.inf)
+        row = np.broadcast_to(np.arange(len(ranges))[:, None], sector.shape)
+        np.minimum.at(clearance, (row, sector), near)
+        clearance[np.isinf(clearance)] = np.nan
+        return clearance
+
+
+def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray[np.float64]:
+    """Clearance per sector (N, K) with what no beam ended in, NaN, filled.
+
+    What lies behind a near thing, as a lidar beside the middle sees it, is as near as the nearer of
+    the sectors on either side, over up to UNSEEN_SECTORS. More are beyond the lidars' view: free up
+    to `range_max_m`, as a sector without beams is.
+    """
+    unseen = np.isnan(clearance_m)
+    if not unseen.any():
+        return clearance_m
+    beside = []
+    for way in (1, -1):
+        far, value = np.full(unseen.shape, UNSEEN_SECTORS + 1), np.full(unseen.shape, np.nan)
+        for step in range(UNSEEN_SECTORS, 0, -1):
+            there = np.roll(clearance_m, way * step, axis=1)
+            known = ~np.isnan(there)
+            far[known], value[known] = step, there[known]
+        beside.append((far, value))
+    (before, low), (after, high) = beside
+    short = unseen & (before + after - 1 <= UNSEEN_SECTORS)
+    filled = np.where(unseen, range_max_m, clearance_m)
+    return np.where(short, np.fmin(low, high), filled)
 
 
 def outline_reach(bearings_rad: NDArray[np.float64], body: Body) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,15 +10,19 @@ import numpy as np
 from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
+from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.aligned_inputs import AlignedInputs, align_inputs
 from restock.ingest.steps.clearance import angle_keys, beam_angles
 from restock.ingest.steps.needs import read_topics
+from restock.ingest.task.scan import Body
+
+BINS = 720  # of bearings, where scans are put together
 
 
 @dataclass(frozen=True)
 class SeenScan:
-    """One lidar scan as it was recorded, its angles as seen from above."""
+    """A lidar's scan as it was recorded, its angles as seen from above."""
 
     stamp_ns: int  # when it was measured, on the alignment clock
     ranges_m: F64  # (B,); inf and NaN as the lidar has them
@@ -49,12 +54,44 @@ def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: i
 
 
 def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
-    if "scan" not in aligned.inputs.by_name:
+    """As recorded; of lidars that are not where the body has its own, as seen from there."""
+    sources = {name: aligned.inputs.by_name.get(name) for name in aligned.profile.inputs.scans}
+    if "scan" not in sources or None in sources.values():
         return [None] * len(stamps)
-    latest = aligned.latest("scan")
-    ranges = aligned.inputs.column("scan", "ranges_m")
-    source = aligned.inputs.by_name["scan"]
-    first, last = (aligned.inputs.numbers("scan", key) for key in angle_keys(source.fields))
+    seen = [_scans_of(aligned, name, stamps) for name in sources]
+    known = [source for source in sources.values() if source is not None]
+    if known[0].lidar_at_m is None:
+        return seen[0]
+    body = aligned.profile.task.body
+    return [_from_the_middle(body, known, parts) for parts in zip(*seen, strict=True)]
+
+
+def _from_the_middle(
+    body: Body, sources: Sequence[Input], scans: Sequence[SeenScan | None]
+) -> SeenScan | None:
+    """One scan of what several lidars saw at a tick, the nearest in each of BINS bearings."""
+    nearest, stamp_ns = np.full(BINS, np.inf), [scan.stamp_ns for scan in scans if scan is not None]
+    for source, scan in zip(sources, scans, strict=True):
+        if scan is None:
+            continue
+        back = np.flatnonzero(np.isfinite(scan.ranges_m) & (scan.ranges_m > 0))
+        bearing = scan.angle_min_rad + scan.angle_increment_rad * back
+        bearing += source.lidar_yaw_rad or 0.0
+        ahead_m, left_m = source.lidar_at_m or (body.lidar_x_m, 0.0)
+        x = ahead_m - body.lidar_x_m + scan.ranges_m[back] * np.cos(bearing)
+        y = left_m + scan.ranges_m[back] * np.sin(bearing)
+        place = ((np.arctan2(y, x) + np.pi) * (BINS / (2 * np.pi))).astype(np.int64)
+        np.minimum.at(nearest, np.minimum(place, BINS - 1), np.hypot(x, y))
+    width = 2 * np.pi / BINS
+    first = width / 2 - np.pi - body.lidar_yaw_rad
+    return SeenScan(max(stamp_ns), nearest, first, width) if stamp_ns else None
+
+
+def _scans_of(aligned: AlignedInputs, name: str, stamps: Ints) -> list[SeenScan | None]:
+    latest = aligned.latest(name)
+    ranges = aligned.inputs.column(name, "ranges_m")
+    source = aligned.inputs.by_name[name]
+    first, last = (aligned.inputs.numbers(name, key) for key in angle_keys(source.fields))
     scans: list[SeenScan | None] = []
     for row, age, fresh, stamp in zip(latest.row, latest.age_ns, latest.fresh, stamps, strict=True):
         if not fresh:

@@ -268,7 +268,7 @@ def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
         (
             "fields =",
             "optional = true\nfields =",
-            "cannot have stop_holds, optional or upside_down",
+            "cannot have stop_holds or optional",
         ),
     ],
 )

@@ -162,8 +162,10 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsy
     profile, text = proposed(tmp_path, capsys, Framed(12.0), **more)
     body = profile.task.body
     assert (body.length_m, body.width_m) == pytest.approx((0.7, 0.6), abs=1e-3)
-    assert (body.lidar_x_m, body.lidar_yaw_rad) == pytest.approx((-0.35, -2.356), abs=1e-3)
-    assert "that it is 0.30 m to the right is ignored" in text
+    scan = profile.inputs.scans["scan"]
+    assert scan.lidar_at_m == pytest.approx((-0.35, -0.3), abs=1e-3)
+    assert scan.lidar_yaw_rad == pytest.approx(-2.356, abs=1e-3)
+    assert (body.lidar_x_m, body.lidar_yaw_rad) == (0, 0)
     assert "upside_down" not in text
 
 

@@ -44,10 +44,12 @@ class Footprint:
     width_m: float
     source: str  # where that is from, in words
     lidar_x_m: float | None = None  # ahead of the middle; None: nothing says
+    lidar_y_m: float = 0.0  # to the left
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
     upside_down: bool = False  # the lidar
     measured: bool = True  # False: a guess, though with a reason
+    middle_m: tuple[float, float] = (0.0, 0.0)  # of the outline, in the base frame
 
     @property
     def sane(self) -> bool:
@@ -203,13 +205,21 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
     low, high, count = shapes
     places = description.places(OUTLINE)
     length, width = (float(side) for side in (high - low)[:2])
-    x, yaw, upside_down = _lidar(places, scan_frame)
-    return Footprint(
+    middle_x, middle_y = (float(low[axis] + high[axis]) / 2 for axis in (0, 1))
+    found = Footprint(
         length,
         width,
         f"shapes of {count} links in {source}",
-        None if x is None else x - float(low[0] + high[0]) / 2,
-        yaw,
+        middle_m=(middle_x, middle_y),
+    )
+    if (lidar := _lidar(places, scan_frame)) is None:
+        return found
+    at_m, yaw, upside_down = lidar
+    return replace(
+        found,
+        lidar_x_m=at_m[0] - middle_x,
+        lidar_y_m=at_m[1] - middle_y,
+        lidar_yaw_rad=yaw,
         upside_down=upside_down,
     )
 
@@ -226,13 +236,14 @@ def outline(description: Description) -> tuple[F64, F64, int] | None:
     return low, high, len(known)
 
 
-def _lidar(places: dict[str, Place], frame: str) -> tuple[float | None, float | None, bool]:
-    """How far ahead of the base, and turned how, the lidar is, and whether it is upside down."""
+def _lidar(places: dict[str, Place], frame: str) -> tuple[tuple[float, float], float, bool] | None:
+    """How far ahead of the base and to its left the lidar is, turned how, and whether it is upside
+    down; None where that is not known."""
     frame = frame.strip("/")
     near = [n for n in places if n == frame or n.split("/")[-1] == frame.split("/")[-1]]
     if not frame or not near:
-        return None, None, False
+        return None
     place = places[near[0]]
-    x, yaw = float(place.at_m[0]), float(np.arctan2(place.rotation[1, 0], place.rotation[0, 0]))
-    known = np.isfinite([x, yaw]).all()
-    return (x, yaw, bool(place.rotation[2, 2] < 0)) if known else (None, None, False)
+    x, y = float(place.at_m[0]), float(place.at_m[1])
+    yaw = float(np.arctan2(place.rotation[1, 0], place.rotation[0, 0]))
+    return ((x, y), yaw, bool(place.rotation[2, 2] < 0)) if np.isfinite([x, y, yaw]).all() else None

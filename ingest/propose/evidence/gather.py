@@ -38,6 +38,14 @@ from restock.ingest.propose.evidence.commands import (
 from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
 from restock.ingest.propose.evidence.frame_guess import FrameGuess, transform_frames
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
+from restock.ingest.propose.evidence.lidars import (
+    MountedLidar,
+    lidars_of,
+    made_of_others_first,
+    scan_frame,
+    seen_from_middle,
+    with_scans,
+)
 from restock.ingest.propose.evidence.motion_choice import (
     MotionChoice,
     choose_motion,
@@ -91,6 +99,7 @@ class Evidence:
     recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
+    lidars: dict[str, MountedLidar]  # by their inputs, which say where they are
     outline: ScannedOutline | None  # where its scans say something of it
     goal: GoalChoice
     signals: list[Candidate]
@@ -135,8 +144,9 @@ def gather(
     poses = None
     if framed or roles["pose"]:
         poses, _ = pose_series(recording, roles, frames if framed else None)
-    frame = _scan_frame(recording, roles)
+    roles["scan"] = made_of_others_first(recording, roles["scan"])
     scan = roles["scan"][0][0].name if roles["scan"] else None
+    frame = scan_frame(recording, scan) if scan is not None else ""
     notes: list[str] = []
     if footprint is None and urdf is not None:
         footprint = urdf_footprint(urdf, frame)
@@ -147,7 +157,14 @@ def gather(
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, frame))
-    robot = propose_robot(recording, scan, frame, urdf, upside_down=footprint.upside_down)
+    lidars = lidars_of(recording, roles["scan"], footprint)
+    places = {topic.name: lidar for topic, _, lidar in lidars.values()}
+    robot = propose_robot(
+        recording, scan, frame, urdf, upside_down=footprint.upside_down, lidars=places
+    )
+    if lidars:
+        roles = with_scans(roles, lidars)
+        footprint = seen_from_middle(footprint, list(places.values()))
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
     robot = wheelbase_of(recording, roles, poses, robot)
@@ -191,6 +208,7 @@ def gather(
         recorded_s,
         footprint,
         notes,
+        {name: lidar for name, (_, _, lidar) in lidars.items()},
         outline,
         GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
         candidates(
@@ -260,13 +278,3 @@ def _driven_s(recording: Recording, gaps: Gaps) -> float:
         return whole
     driven = gaps.period_s * gaps.count
     return min(driven, whole) if driven > whole / 10 else whole
-
-
-def _scan_frame(recording: Recording, roles: Roles) -> str:
-    """The frame that scans say they are in."""
-    path = "header.frame_id"
-    if not roles["scan"] or path not in recording.leaves(roles["scan"][0][0].name):
-        return ""
-    topic = roles["scan"][0][0].name
-    frames = np.asarray(recording.read({topic: [path]})[topic].fields[path], object)
-    return str(frames[0]) if len(frames) else ""

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
+from restock.ingest.propose.evidence.lidars import MountedLidar, View, joined_view, view_of
 from restock.ingest.propose.evidence.roles import shared
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
@@ -166,9 +165,11 @@ def propose_robot(
     urdf: Path | None,
     *,
     upside_down: bool = False,
+    lidars: Mapping[str, MountedLidar] | None = None,
 ) -> RobotProposal:
     """The robot that a URDF file, else the recording's description, and its scans describe; its
-    lidar may hang upside down.
+    lidar may hang upside down, and `lidars`, topic by topic, be somewhere else than ahead of or
+    behind the middle.
 
     Raises:
         ConfigError: the file cannot be used: it has no wheels, say.
@@ -205,7 +206,11 @@ def propose_robot(
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)
     if scan_topic is not None:
-        seen = _lidar(recording, scan_topic, notes, upside_down)
+        if lidars:
+            seen = _lidars(recording, lidars, notes)
+        else:
+            view = view_of(recording, scan_topic, upside_down=upside_down)
+            seen = _beams(view, notes) if view is not None else {}
         values |= seen
         origin |= dict.fromkeys(seen, "logs")
     return RobotProposal(values, origin, notes)
@@ -226,34 +231,35 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
     return kept
 
 
-def _lidar(recording: Recording, topic: str, notes: list[str], upside_down: bool) -> dict[str, Any]:
-    """Beams and field of view of the last scan, as seen from above."""
-    paths = ["angle_min", "angle_max", "angle_increment"]
-    if not set(paths) <= set(recording.leaves(topic)):
-        return {}
-    fields = recording.read({topic: paths})[topic].fields
-    if not len(fields[paths[0]]):
-        return {}
-    sign = -1 if upside_down else 1
-    # `+ 0.0`: no "-0.0" in a file
-    first, last, step = (sign * float(np.asarray(fields[path])[-1]) + 0.0 for path in paths)
-    if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
-        return {}
-    count = round((last - first) / step) + 1
-    low, high = min(first, last), max(first, last)
-    turn = 2 * math.pi
-    if count < 4 or not 0 < high - low < turn + 0.1 or max(abs(low), abs(high)) > 7:
-        return {}
-    high = min(high, low + turn)
-    every = -(-count // MOST_BEAMS)
+def _beams(view: View, notes: list[str]) -> dict[str, Any]:
+    """The beams and the field of view of the twin's lidar."""
+    every = -(-view.beams // MOST_BEAMS)
     if every > 1:
-        notes.append(f"the twin has every {every}. of the lidar's {count} beams")
-    beams = -(-count // every)
+        notes.append(f"the twin has every {every}. of the lidar's {view.beams} beams")
     return {
-        "lidar.beams": beams,
-        "lidar.angle_min_rad": round(low, 5),
-        "lidar.angle_max_rad": round(high, 5),
+        "lidar.beams": -(-view.beams // every),
+        "lidar.angle_min_rad": round(view.low_rad, 5),
+        "lidar.angle_max_rad": round(view.high_rad, 5),
     }
+
+
+def _lidars(
+    recording: Recording, lidars: Mapping[str, MountedLidar], notes: list[str]
+) -> dict[str, Any]:
+    """Of one lidar in the middle that covers what these do."""
+    views = [
+        (view, lidar.yaw_rad)
+        for topic, lidar in lidars.items()
+        if (view := view_of(recording, topic, upside_down=lidar.upside_down)) is not None
+    ]
+    if not views:
+        return {}
+    notes.append("the twin has one lidar, in the middle, that covers what the robot's do")
+    joined = joined_view(views)
+    if joined is not None:
+        return _beams(joined, notes)
+    beams = round(2 * math.pi / min(view.step_rad for view, _ in views))
+    return {"lidar.beams": min(beams, MOST_BEAMS)}  # all around, as its angles are by default
 
 
 def _key(key: str) -> str:

@@ -181,6 +181,8 @@ def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     topic, static_topic = transform_topics(recording)
     for base in named_frames(BASE_FRAMES, frames):
+        if plain(scan_frame) == base:
+            return LidarPlace(base, 0.0, 0.0, 0.0, False)
         if base not in upward(plain(scan_frame), edges.parents):
             continue
         usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
@@ -206,13 +208,10 @@ def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
         return footprint
     turned = replace(footprint, lidar_yaw_rad=place.yaw_rad, upside_down=place.upside_down)
     source = f"of {place.base}, by transforms; that this is the middle is a guess"
-    if abs(place.y_m) > ROOM_M:
-        side = "left" if place.y_m > 0 else "right"
-        source += f"; that it is {abs(place.y_m):.2f} m to the {side} is ignored"
     if not footprint.measured:
         sizes = (footprint.length_m, place.x_m), (footprint.width_m, place.y_m)
         length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
         turned = replace(turned, length_m=length, width_m=width)
     elif abs(place.x_m) > footprint.length_m / 2:
         return replace(turned, lidar_source=f"{place.base} has it {place.x_m:.2f} m ahead, outside")
-    return replace(turned, lidar_x_m=place.x_m, lidar_source=source)
+    return replace(turned, lidar_x_m=place.x_m, lidar_y_m=place.y_m, lidar_source=source)

@@ -161,6 +161,9 @@ def _mount(
         ahead, yaw = profile.task.body.lidar_x_m, profile.task.body.lidar_yaw_rad
     elif footprint is not None:
         ahead, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
+    left = 0.0
+    if scan is not None and scan.lidar_at_m is not None:
+        (ahead, left), yaw = scan.lidar_at_m, scan.lidar_yaw_rad or 0.0
     if ahead is None or yaw is None:
         notes.append(
             "the position of the lidar is not known: it is assumed to be in the robot's middle, "
@@ -170,7 +173,7 @@ def _mount(
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     if scan is not None and scan.upside_down:
         turn = turn @ over
-    return turn, np.array([ahead or 0.0, 0.0, 0.0])
+    return turn, np.array([ahead or 0.0, left, 0.0])
 
 
 def _keyframes(pose: F64, known: Bools, log_ns: Ints, topic: str, notes: list[str]) -> Ints:

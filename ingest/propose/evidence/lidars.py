@@ -1,0 +1,182 @@
+"""The lidars of a robot that has several, or one beside its middle: whose scans are joined."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.profile.inputs import SCANS
+from restock.ingest.propose.evidence.footprint import Footprint
+from restock.ingest.propose.evidence.roles import Kind, Roles
+from restock.ingest.propose.evidence.scanned_outline import ROOM_M, lidar_place
+from restock.ingest.steps.frames import FRAME_ID, plain
+from restock.ingest.urdf.description import BASE_FRAMES
+
+WIDE_RAD = math.radians(150)  # a depth camera's scan is narrower, and of no height of a lidar
+_ANGLES = ("angle_min", "angle_max", "angle_increment")
+_TURN = 2 * math.pi
+_BINS = 360  # of the circle
+
+
+@dataclass(frozen=True)
+class MountedLidar:
+    """Where a lidar is in the frame of the outline's middle, and how its scans lie there."""
+
+    x_m: float = 0.0  # ahead
+    y_m: float = 0.0  # to the left
+    yaw_rad: float = 0.0
+    upside_down: bool = False
+
+    def lines(self) -> list[str]:
+        """The keys of its input."""
+        at = f"[{round(self.x_m, 3) + 0.0:g}, {round(self.y_m, 3) + 0.0:g}]"
+        return [
+            f"lidar_at_m = {at}  # ahead of the middle, and to the left",
+            f"lidar_yaw_rad = {round(self.yaw_rad, 4) + 0.0:g}",
+        ]
+
+
+@dataclass(frozen=True)
+class View:
+    """The beams of a scan's last message, as seen from above, in the lidar's own frame."""
+
+    low_rad: float
+    high_rad: float
+    step_rad: float
+    beams: int
+
+
+def lidars_of(
+    recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]], footprint: Footprint
+) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
+    """By the name of its input, each lidar whose place its input must say; empty where the robot
+    has one lidar, ahead of or behind the middle of its outline.
+
+    Several are those of different places, by transforms, that see 150 degrees or more. A topic in
+    the frame of the base has been made of the others (`made_of_others_first`).
+    """
+    if not fits:
+        return {}
+    found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
+    frames: set[str] = set()
+    for topic, kind in fits if len(fits) > 1 else ():
+        frame = scan_frame(recording, topic.name)
+        if plain(frame) in BASE_FRAMES:
+            return {}
+        view = view_of(recording, topic.name)
+        if view is None or view.high_rad - view.low_rad < WIDE_RAD or frame in frames:
+            continue
+        if len(found) < len(SCANS) and (place := lidar_place(recording, frame)) is not None:
+            frames.add(frame)
+            x_m, y_m = place.x_m - footprint.middle_m[0], place.y_m - footprint.middle_m[1]
+            lidar = MountedLidar(x_m, y_m, place.yaw_rad, place.upside_down)
+            found[SCANS[len(found)]] = (topic, kind, lidar)
+    if len(found) > 1:
+        return found
+    if abs(footprint.lidar_y_m) <= ROOM_M:
+        return {}
+    lidar = MountedLidar(
+        footprint.lidar_x_m or 0.0,
+        footprint.lidar_y_m,
+        footprint.lidar_yaw_rad or 0.0,
+        footprint.upside_down,
+    )
+    return {SCANS[0]: (*fits[0], lidar)}
+
+
+def made_of_others_first(
+    recording: Recording, fits: list[tuple[TopicInfo, Kind]]
+) -> list[tuple[TopicInfo, Kind]]:
+    """The scans' topics, those in the frame of the base first: of several lidars, as a node that
+    puts their scans together publishes them."""
+    if len(fits) < 2:
+        return fits
+    made = {fit[0].name: plain(scan_frame(recording, fit[0].name)) in BASE_FRAMES for fit in fits}
+    return sorted(fits, key=lambda fit: not made[fit[0].name])
+
+
+def with_scans(roles: Roles, lidars: Mapping[str, tuple[TopicInfo, Kind, MountedLidar]]) -> Roles:
+    """The roles with an input for each lidar, after that of the first one."""
+    found: Roles = {}
+    for role, fits in roles.items():
+        if role != SCANS[0]:
+            found[role] = fits
+            continue
+        taken = {topic.name for topic, _, _ in lidars.values()}
+        others = [fit for fit in fits if fit[0].name not in taken]
+        for name, (topic, kind, _) in lidars.items():
+            found[name] = [(topic, kind), *(others if name == SCANS[0] else [])]
+    return found
+
+
+def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Footprint:
+    """The footprint where the lidars' inputs say where they are; a guess holds them all."""
+    length, width = footprint.length_m, footprint.width_m
+    if not footprint.measured:
+        length = max(length, *(2 * abs(lidar.x_m) for lidar in lidars))
+        width = max(width, *(2 * abs(lidar.y_m) for lidar in lidars))
+    return replace(
+        footprint,
+        length_m=length,
+        width_m=width,
+        lidar_x_m=0.0,
+        lidar_yaw_rad=0.0,
+        upside_down=False,
+    )
+
+
+def scan_frame(recording: Recording, topic: str) -> str:
+    """The frame that a topic's scans say they are in."""
+    if FRAME_ID not in recording.leaves(topic):
+        return ""
+    frames = np.asarray(recording.read({topic: [FRAME_ID]})[topic].fields[FRAME_ID], object)
+    return str(frames[0]) if len(frames) else ""
+
+
+def view_of(recording: Recording, topic: str, *, upside_down: bool = False) -> View | None:
+    """What a topic's last scan covers; None where it does not say, or not sanely."""
+    if not set(_ANGLES) <= set(recording.leaves(topic)):
+        return None
+    fields = recording.read({topic: list(_ANGLES)})[topic].fields
+    if not len(fields[_ANGLES[0]]):
+        return None
+    sign = -1 if upside_down else 1
+    # `+ 0.0`: no "-0.0" in a file
+    first, last, step = (sign * float(np.asarray(fields[one])[-1]) + 0.0 for one in _ANGLES)
+    if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
+        return None
+    count = round((last - first) / step) + 1
+    low, high = min(first, last), max(first, last)
+    if count < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
+        return None
+    return View(low, min(high, low + _TURN), abs(step), count)
+
+
+def joined_view(views: Sequence[tuple[View, float]]) -> View | None:
+    """What several lidars cover together, in the robot's frame: each with how it is turned (rad).
+
+    None where that is all around.
+    """
+    covered = np.zeros(_BINS, np.bool_)
+    for view, yaw_rad in views:
+        first = round((view.low_rad + yaw_rad) / _TURN * _BINS)
+        count = round((view.high_rad - view.low_rad + view.step_rad) / _TURN * _BINS)
+        covered[np.arange(first, first + min(count, _BINS)) % _BINS] = True
+    gaps = np.flatnonzero(~covered)
+    if not len(gaps):
+        return None
+    # From the end of the widest gap to its start: the circle is opened there.
+    runs = np.split(gaps, np.flatnonzero(np.diff(gaps) > 1) + 1)
+    if len(runs) > 1 and gaps[0] == 0 and gaps[-1] == _BINS - 1:
+        runs = [np.concatenate([runs[-1] - _BINS, runs[0]]), *runs[1:-1]]
+    widest = max(runs, key=len)
+    low = (int(widest[-1]) + 1) / _BINS * _TURN
+    high = low + (_BINS - len(widest)) / _BINS * _TURN
+    back = _TURN * round((low + high) / 2 / _TURN)  # the middle of it within half a turn
+    step = min(view.step_rad for view, _ in views)
+    return View(low - back, high - back, step, round((high - low) / step) + 1)

@@ -1,0 +1,395 @@
+"""A robot with several lidars, or one beside its middle: clearance as one in the middle sees it."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+from support.driven_robot import Drive, columns, scans, without, write_topics
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.errors import ConfigError, RecordingError
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import Steps, steps_of
+from restock.ingest.task.scan import MovedMap, SectorMap, outline_reach, with_unseen
+from restock.replay.trace.seen_at_ticks import seen_between
+
+TASK = load_profile("warehouse_amr").task
+LEFT_M, RIGHT_M = 2.0, 0.2  # y of the walls: the robot drives along y = 1
+BEAMS = 720
+Place = tuple[float, float, float]  # ahead, left, angle of its zero
+FRONT: Place = (0.28, 0.22, np.pi / 4)
+REAR: Place = (-0.28, -0.22, -3 * np.pi / 4)
+THREE_QUARTERS = 1.5 * np.pi
+
+
+@dataclass
+class Corridor(Drive):
+    """Along two walls, past a post and away from another; its lidars are `mounted` by topic."""
+
+    mounted: tuple[tuple[str, Place], ...] = (("/scan_front", FRONT), ("/scan_rear", REAR))
+    field_rad: float = THREE_QUARTERS  # of each
+    roll_rad: float = 0.0  # of the last one
+
+    def topics(self) -> dict[str, TopicColumns]:
+        found = super().topics()
+        scan = found.pop("/scan")
+        times_s = (scan.fields["header.stamp"] - 1_700_000_000 * 10**9) * 1e-9
+        for index, (topic, place) in enumerate(self.mounted):
+            hanging = self.roll_rad if index == len(self.mounted) - 1 else 0.0
+            found[topic] = self.scan(times_s, place, f"laser{index}", upside_down=hanging != 0)
+        lidars = [(f"laser{index}", place) for index, (_, place) in enumerate(self.mounted)]
+        found["/tf_static"] = transforms(lidars, self.roll_rad)
+        return found
+
+    def scan(
+        self, times_s: Any, place: Place, frame: str, *, upside_down: bool = False
+    ) -> TopicColumns:
+        step = self.field_rad / BEAMS
+        bearing = np.arange(BEAMS) * step - self.field_rad / 2  # of the lidar
+        ranges = np.stack([cast(self.x_at(time) - 1.0, place, bearing) for time in times_s])
+        fields = scans(ranges)
+        sign = -1 if upside_down else 1
+        fields["angle_min"] = np.full(len(times_s), sign * bearing[0])
+        fields["angle_max"] = np.full(len(times_s), sign * bearing[-1])
+        fields["angle_increment"] = np.full(len(times_s), sign * step)
+        fields["range_min"] = np.full(len(times_s), 0.05)
+        fields["range_max"] = np.full(len(times_s), 8.0)
+        fields["header.frame_id"] = np.full(len(times_s), frame, object)
+        return columns(times_s, fields)
+
+    def bag(self, folder: Path) -> Path:
+        kinds = {
+            "/cmd_vel": "geometry_msgs/msg/Twist",
+            "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+            "/odom": "nav_msgs/msg/Odometry",
+            "/imu": "sensor_msgs/msg/Imu",
+            "/goal_pose": "geometry_msgs/msg/PoseStamped",
+            "/plan": "nav_msgs/msg/Path",
+            "/bumper": "std_msgs/msg/Bool",
+            "/behaviour_policy": "std_msgs/msg/String",
+            "/tf_static": "tf2_msgs/msg/TFMessage",
+        }
+        topics = {
+            name: (kinds.get(name, "sensor_msgs/msg/LaserScan"), one)
+            for name, one in self.topics().items()
+        }
+        return write_topics(topics, folder, storage="mcap")
+
+
+def cast(moved_m: float, place: Place, bearing: Any) -> Any:
+    """Ranges (B,) to the walls and to posts beside its way and behind where it began."""
+    x, y = 1.0 + moved_m + place[0], 1.0 + place[1]
+    way = np.stack([np.cos(bearing + place[2]), np.sin(bearing + place[2])])
+    with np.errstate(divide="ignore"):
+        ranges = np.where(way[1] > 0, (LEFT_M - y) / way[1], (RIGHT_M - y) / way[1])
+    for post in ((5.0, 1.7), (0.1, 0.95)):
+        to = np.array([post[0] - x, post[1] - y])
+        along = to @ way
+        half = np.sqrt(np.maximum(0.1**2 - (to @ to - along**2), 0.0))
+        hit = (half > 0) & (along > half)
+        ranges = np.where(hit, np.minimum(ranges, along - half), ranges)
+    return np.where(ranges < 8.0, ranges, np.inf)
+
+
+def transforms(lidars: list[tuple[str, Place]], roll_rad: float) -> TopicColumns:
+    """Of the lidars' frames in that of the base; the last is rolled first."""
+    rolls = np.zeros(len(lidars))
+    rolls[-1] = roll_rad
+    yaw = np.array([place[2] for _, place in lidars])
+    values: dict[str, Any] = {
+        "header.frame_id": np.full(len(lidars), "base_link", object),
+        "child_frame_id": np.array([frame for frame, _ in lidars], object),
+        "transform.translation.x": np.array([place[0] for _, place in lidars]),
+        "transform.translation.y": np.array([place[1] for _, place in lidars]),
+        "transform.rotation.x": np.cos(yaw / 2) * np.sin(rolls / 2),
+        "transform.rotation.y": np.sin(yaw / 2) * np.sin(rolls / 2),
+        "transform.rotation.z": np.sin(yaw / 2) * np.cos(rolls / 2),
+        "transform.rotation.w": np.cos(yaw / 2) * np.cos(rolls / 2),
+    }
+    ends = offsets_of(np.array([len(lidars)]))
+    fields = {f"transforms[].{path}": Ragged(column, ends) for path, column in values.items()}
+    return columns(np.zeros(1), fields, stamped=False)
+
+
+def two_lidars(front: str = "", rear: str = "") -> str:
+    """The shipped profile of a robot with the lidars of `Corridor`."""
+    start, end = WAREHOUSE.index("[inputs.scan]"), WAREHOUSE.index("[inputs.goal]")
+    table = WAREHOUSE[start:end].replace("optional = true\n", "")
+
+    def of(name: str, topic: str, place: Place, more: str) -> str:
+        at = f"lidar_at_m = [{place[0]}, {place[1]}]\nlidar_yaw_rad = {place[2]}\n{more}\n"
+        return table.replace("[inputs.scan]", f"[inputs.{name}]\n{at}").replace('"/scan"', topic)
+
+    both = of("scan", '"/scan_front"', FRONT, front) + of("scan_2", '"/scan_rear"', REAR, rear)
+    return WAREHOUSE[:start] + both + WAREHOUSE[end:]
+
+
+def read(bag: Path, text: str) -> Steps:
+    profile = parse_profile(text, where="p")
+    with open_recording(bag) as recording:
+        return steps_of(profile, read_topics(recording, profile))
+
+
+def sectors_of(steps: Steps) -> Any:
+    """Clearance (T, K) at the usable ticks."""
+    return steps.signals["sector_clearance_m"][[problem == "" for problem in steps.problem]]
+
+
+@settings(max_examples=60)
+@given(
+    st.tuples(st.floats(-0.5, 0.5), st.floats(-0.4, 0.4), st.floats(-3.2, 3.2)),
+    st.floats(-0.2, 0.2),
+    st.integers(0, 99),
+)
+def test_a_beam_counts_where_it_ends_as_seen_from_the_bodys_lidar(
+    place: Place, ahead_m: float, seed: int
+) -> None:
+    body = msgspec.structs.replace(TASK.body, lidar_x_m=ahead_m)
+    rng = np.random.default_rng(seed)
+    ranges = rng.uniform(-1, 8, (3, 40))
+    ranges[rng.random(ranges.shape) < 0.2] = rng.choice([np.inf, np.nan])
+    bearings = -2.0 + 0.1 * np.arange(40)
+    moved = MovedMap.build(bearings + place[2], 36, body, place[:2])
+    found = moved.clearance(ranges, 0.1, 4.0)
+    expected = np.full((3, 36), np.nan)
+    farthest = 4.0 + float(np.hypot(place[0] - ahead_m, place[1]))
+    for row in range(3):
+        for bearing, reached in zip(bearings.tolist(), ranges[row].tolist(), strict=True):
+            valid = 0.1 <= reached <= farthest
+            reached = reached if valid else farthest
+            x = place[0] + reached * np.cos(bearing + place[2]) - ahead_m
+            y = place[1] + reached * np.sin(bearing + place[2])
+            seen = float(np.arctan2(y, x))
+            near = np.hypot(x, y) - outline_reach(np.array([seen]), body)[0]
+            sector = min(int((seen + np.pi) * (36 / (2 * np.pi))), 35)
+            near = min(max(near, 0.0), 4.0) if valid else 4.0
+            expected[row, sector] = np.fmin(expected[row, sector], near)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.sampled_from([0.5, 1.5, None]), min_size=4, max_size=24))
+def test_what_no_beam_ended_in_is_as_near_as_what_is_beside_it(given: list[float | None]) -> None:
+    """Between known sectors, a few of them; all around the circle, which has no first sector."""
+    count = len(given)
+    found = with_unseen(np.array([given], np.float64), 4.0)[0]
+    for sector, value in enumerate(given):
+        if value is not None:
+            assert found[sector] == value
+            continue
+        sides = []
+        for way in (-1, 1):
+            steps = [
+                d for d in range(1, count + 1) if given[(sector + way * d) % count] is not None
+            ]
+            sides.append(min(steps, default=99))
+        if sum(sides) - 1 > 3:
+            assert found[sector] == 4.0
+        else:
+            known = [given[(sector - sides[0]) % count], given[(sector + sides[1]) % count]]
+            assert found[sector] == min(one for one in known if one is not None)
+
+
+def test_one_where_the_body_has_its_own_sees_what_that_sees() -> None:
+    ranges = np.random.default_rng(1).uniform(0.2, 5.0, (20, 360))
+    bearings = (np.arange(360) + 0.5) * (2 * np.pi / 360) - np.pi
+    own = SectorMap.build(bearings, TASK.sectors, TASK.body)
+    moved = MovedMap.build(bearings, TASK.sectors, TASK.body, (TASK.body.lidar_x_m, 0.0))
+    expected = own.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
+    found = moved.clearance(ranges, TASK.range_min_m, TASK.range_max_m)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_two_lidars_at_corners_see_what_one_in_the_middle_sees(tmp_path: Path) -> None:
+    """And neither alone does."""
+    two = Corridor().bag(tmp_path / "two")
+    one = Corridor(mounted=(("/scan", (0.0, 0.0, 0.0)),), field_rad=2 * np.pi).bag(tmp_path / "one")
+    expected, found = sectors_of(read(one, WAREHOUSE)), sectors_of(read(two, two_lidars()))
+    assert found.shape == expected.shape
+    assert len(found) > 10
+    apart_m = np.abs(found - expected)
+    assert (apart_m < 0.1).mean() > 0.99  # the rest is at the edges of a post
+    assert apart_m.mean() < 0.01
+    for topic, place in (("/scan_front", FRONT), ("/scan_rear", REAR)):
+        alone = two_lidars()
+        start, end = alone.index("[inputs.scan_2]"), alone.index("[inputs.goal]")
+        alone = alone[:start] + alone[end:]
+        alone = alone.replace("/scan_front", topic)
+        alone = alone.replace(f"[{FRONT[0]}, {FRONT[1]}]", f"[{place[0]}, {place[1]}]")
+        alone = alone.replace(f"lidar_yaw_rad = {FRONT[2]}", f"lidar_yaw_rad = {place[2]}")
+        seen = sectors_of(read(two, alone))
+        assert (np.abs(seen - expected) < 0.05).mean() < 0.9
+
+
+def test_a_tick_without_one_of_the_lidars_is_dropped_by_its_name(tmp_path: Path) -> None:
+    class Silenced(Corridor):
+        def topics(self) -> dict[str, TopicColumns]:
+            found = super().topics()
+            rear = found["/scan_rear"]
+            early = rear.log_time_ns < rear.log_time_ns[0] + 2 * 10**9
+            return found | {"/scan_rear": without(rear, early)}
+
+    steps = read(Silenced().bag(tmp_path / "bag"), two_lidars())
+    reasons = Counter(steps.problem)
+    assert reasons["scan_2: stale"] > 10
+    assert reasons[""] > 5
+    absent = Corridor(mounted=(("/scan_front", FRONT),)).bag(tmp_path / "absent")
+    with pytest.raises(RecordingError, match="/scan_rear"):
+        read(absent, two_lidars())
+
+
+def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path: Path) -> None:
+    bag, text = Corridor().bag(tmp_path / "bag"), two_lidars()
+    observer, seen = LiveObserver(parse_profile(text, where="p")), {}
+    with AnyReader([bag]) as reader:
+        chosen = [c for c in reader.connections if c.topic in observer.topics]
+        for connection, now_ns, raw in reader.messages(chosen):
+            if connection.topic == "/cmd_vel":
+                observed = observer.observe(now_ns)
+                seen[observed.stamp_ns] = observed
+            observer.receive(connection.topic, reader.deserialize(raw, connection.msgtype), now_ns)
+    steps = read(bag, text)
+    compared = 0
+    for stamp_ns, problem, clearance in zip(
+        steps.signals["stamp_ns"].tolist(),
+        steps.problem,
+        steps.signals["sector_clearance_m"],
+        strict=True,
+    ):
+        if problem == "" and seen[stamp_ns].problem == "":
+            np.testing.assert_array_equal(
+                seen[stamp_ns].signals["sector_clearance_m"][0], clearance
+            )
+            compared += 1
+    assert compared > 10
+
+
+def test_a_moment_shows_the_scans_together_as_seen_from_the_middle(tmp_path: Path) -> None:
+    bag, profile = Corridor().bag(tmp_path / "bag"), parse_profile(two_lidars(), where="p")
+    with open_recording(bag) as recording:
+        scans = seen_between(recording, profile, 1_700_000_001 * 10**9, 1_700_000_003 * 10**9).scans
+    assert len(scans) > 5
+    for scan in scans:
+        assert scan is not None
+        back = np.flatnonzero(np.isfinite(scan.ranges_m))
+        assert len(back) > 500  # all around: one lidar has three quarters of its beams
+        bearing = scan.angle_min_rad + scan.angle_increment_rad * back
+        y = 1.0 + scan.ranges_m[back] * np.sin(bearing + profile.task.body.lidar_yaw_rad)
+        assert y.min() > RIGHT_M - 0.05
+        assert y.max() < LEFT_M + 0.05
+
+
+def proposed(drive: Corridor, folder: Path, capsys: Any, *more: str) -> tuple[Profile, str, str]:
+    bag = drive.bag(folder / "bag")
+    assert main(["profile", "new", str(bag), "--json", *more]) in (0, 3)
+    said = json.loads(capsys.readouterr().out)
+    return parse_profile(said["toml"], where="p"), said["toml"], json.dumps(said["advice"])
+
+
+@pytest.mark.parametrize("roll_rad", [0.0, np.pi])
+def test_several_lidars_are_proposed_by_their_transforms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], roll_rad: float
+) -> None:
+    profile, text, advice = proposed(Corridor(12.0, roll_rad=roll_rad), tmp_path, capsys)
+    for name, place, topic in (("scan", FRONT, "/scan_front"), ("scan_2", REAR, "/scan_rear")):
+        source = profile.inputs.scans[name]
+        assert source.topic == topic
+        assert source.lidar_at_m == pytest.approx(place[:2], abs=1e-3)
+        assert source.lidar_yaw_rad == pytest.approx(place[2], abs=1e-3)
+        assert not source.optional
+    assert profile.inputs.scans["scan_2"].upside_down == (roll_rad > 0)
+    assert "/scan_front, /scan_rear are put together" in advice
+    assert ("upside down" in advice) == (roll_rad > 0)
+    assert profile.task.body.lidar_x_m == profile.task.body.lidar_yaw_rad == 0
+    # All around, as the two are.
+    assert profile.robot.lidar.angle_max_rad - profile.robot.lidar.angle_min_rad > 6.2
+    usable = sectors_of(read(tmp_path / "bag", text))
+    assert len(usable) > 40
+    straight_left, straight_right = usable[:, 27], usable[:, 9]
+    body_m = profile.task.body.width_m / 2
+    assert np.median(straight_left) == pytest.approx(LEFT_M - 1.0 - body_m, abs=0.01)
+    assert np.median(straight_right) == pytest.approx(1.0 - RIGHT_M - body_m, abs=0.01)
+    assert straight_left.max() < LEFT_M - 1.0  # behind the post, too
+
+
+def test_a_scan_made_of_the_others_is_the_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Joined(Corridor):
+        def topics(self) -> dict[str, TopicColumns]:
+            found = super().topics()
+            times_s = np.arange(0, self.duration_s, 0.1)
+            return found | {"/z_scan": self.scan(times_s, (0.0, 0.0, 0.0), "base_link")}
+
+    profile, _, _ = proposed(Joined(12.0), tmp_path, capsys)
+    assert {name: one.topic for name, one in profile.inputs.scans.items()} == {"scan": "/z_scan"}
+    assert profile.inputs.scans["scan"].lidar_at_m is None
+
+
+def test_a_depth_cameras_scan_is_not_put_beside_a_lidars(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Narrow(Corridor):
+        def scan(self, times_s: Any, place: Place, frame: str, **more: Any) -> TopicColumns:
+            wide = self.field_rad
+            self.field_rad = 1.2 if place == REAR else wide
+            found = super().scan(times_s, place, frame, **more)
+            self.field_rad = wide
+            return found
+
+    profile, _, _ = proposed(Narrow(12.0), tmp_path, capsys)
+    assert [one.topic for one in profile.inputs.scans.values()] == ["/scan_front"]
+
+
+def test_one_lidar_beside_the_middle_has_its_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That it is beside the middle was said, and ignored."""
+    drive = Corridor(12.0, mounted=(("/scan", FRONT),))
+    profile, text, _ = proposed(drive, tmp_path, capsys)
+    scan = profile.inputs.scans["scan"]
+    assert scan.lidar_at_m == pytest.approx(FRONT[:2], abs=1e-3)
+    assert scan.optional
+    lidar = profile.robot.lidar  # in the middle, turned as it is
+    middle = (lidar.angle_min_rad + lidar.angle_max_rad) / 2
+    assert middle == pytest.approx(FRONT[2], abs=0.02)
+    assert lidar.angle_max_rad - lidar.angle_min_rad == pytest.approx(THREE_QUARTERS, abs=0.02)
+    usable = sectors_of(read(tmp_path / "bag", text))
+    clear_m = LEFT_M - 1 - profile.task.body.width_m / 2
+    assert np.median(usable[:, 27]) == pytest.approx(clear_m, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (two_lidars().replace("[inputs.scan]", "[inputs.scan_3]"), "without `inputs.scan`"),
+        (two_lidars(rear="optional = true"), "inputs.scan_2.optional"),
+        (two_lidars(front="optional = true"), "inputs.scan.optional"),
+        (two_lidars().replace("/scan_rear", "/scan_front"), "two of the lidars have one topic"),
+        (two_lidars().replace("lidar_at_m = [-0.28, -0.22]\n", ""), "without lidar_at_m"),
+        (
+            two_lidars().replace(f"lidar_at_m = [-0.28, -0.22]\nlidar_yaw_rad = {REAR[2]}\n", ""),
+            "inputs.scan_2.lidar_at_m` is missing",
+        ),
+        (WAREHOUSE.replace("[inputs.imu]", "[inputs.imu]\nlidar_at_m = [0, 0]"), "only to a scan"),
+    ],
+)
+def test_lidars_that_do_not_go_together_are_refused(text: str, told: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse_profile(text, where="p")
+    assert told in str(refused.value)
