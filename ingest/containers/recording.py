@@ -6,7 +6,6 @@ decoded and skipped is kept per topic.
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from blake3 import blake3
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
@@ -113,8 +113,8 @@ class Recording:
 
     @cached_property
     def recording_id(self) -> str:
-        """16 hex digits of the content of its files, in order: the same wherever it lies."""
-        digest = hashlib.blake2b(digest_size=8)
+        """16 hex digits of BLAKE3 of its files' content, in order: the same wherever it lies."""
+        digest = blake3()  # of a bag with images, blake2b was a third of an ingest
         done, whole = 0, self.size_bytes
         for file in self.files:
             digest.update(str(file.stat().st_size).encode())
@@ -123,7 +123,7 @@ class Recording:
                     digest.update(block)
                     done += len(block)
                     self.watch("checking content, bytes", done, whole)
-        return digest.hexdigest()
+        return digest.hexdigest(8)
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
