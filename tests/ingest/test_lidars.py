@@ -341,6 +341,21 @@ def test_a_scan_made_of_the_others_is_the_one(
     assert profile.inputs.scans["scan"].lidar_at_m is None
 
 
+def test_another_robots_lidar_in_the_recording_is_not_put_beside_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Two(Corridor):
+        def topics(self) -> dict[str, TopicColumns]:
+            found = super().topics()
+            bases = found["/tf_static"].fields["transforms[].header.frame_id"]
+            assert isinstance(bases, Ragged)
+            bases.values[-1] = "other/base_link"
+            return found
+
+    profile, _, _ = proposed(Two(12.0), tmp_path, capsys)
+    assert [one.topic for one in profile.inputs.scans.values()] == ["/scan_front"]
+
+
 def test_a_depth_cameras_scan_is_not_put_beside_a_lidars(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -57,25 +57,13 @@ def lidars_of(
     """By the name of its input, each lidar whose place its input must say; empty where the robot
     has one lidar, ahead of or behind the middle of its outline.
 
-    Several are those of different places, by transforms, that see 150 degrees or more. A topic in
-    the frame of the base has been made of the others (`made_of_others_first`).
+    Several are those of different places on the base of the first, by transforms, that see 150
+    degrees or more. A topic in the frame of the base has been made of the others
+    (`made_of_others_first`).
     """
     if not fits:
         return {}
-    found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
-    frames: set[str] = set()
-    for topic, kind in fits if len(fits) > 1 else ():
-        frame = scan_frame(recording, topic.name)
-        if plain(frame) in BASE_FRAMES:
-            return {}
-        view = view_of(recording, topic.name)
-        if view is None or view.high_rad - view.low_rad < WIDE_RAD or frame in frames:
-            continue
-        if len(found) < len(SCANS) and (place := lidar_place(recording, frame)) is not None:
-            frames.add(frame)
-            x_m, y_m = place.x_m - footprint.middle_m[0], place.y_m - footprint.middle_m[1]
-            lidar = MountedLidar(x_m, y_m, place.yaw_rad, place.upside_down)
-            found[SCANS[len(found)]] = (topic, kind, lidar)
+    found = _several(recording, fits, footprint.middle_m) if len(fits) > 1 else {}
     if len(found) > 1:
         return found
     if abs(footprint.lidar_y_m) <= ROOM_M:
@@ -87,6 +75,31 @@ def lidars_of(
         footprint.upside_down,
     )
     return {SCANS[0]: (*fits[0], lidar)}
+
+
+def _several(
+    recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]], middle_m: tuple[float, float]
+) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
+    found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
+    base, frames = "", set[str]()
+    for topic, kind in fits:
+        frame = scan_frame(recording, topic.name)
+        view, place = view_of(recording, topic.name), lidar_place(recording, frame)
+        wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
+        fit = wide and place is not None and plain(frame) not in BASE_FRAMES
+        if not found and not fit:  # what is known of the others is no reason to leave the first
+            return {}
+        # Another robot's lidar is on another base.
+        if place is None or not fit or frame in frames or (found and place.base != base):
+            continue
+        base = place.base
+        frames.add(frame)
+        at_m = place.x_m - middle_m[0], place.y_m - middle_m[1]
+        lidar = MountedLidar(*at_m, place.yaw_rad, place.upside_down)
+        found[SCANS[len(found)]] = (topic, kind, lidar)
+        if len(found) == len(SCANS):
+            break
+    return found
 
 
 def made_of_others_first(
