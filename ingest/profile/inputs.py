@@ -13,6 +13,7 @@ from restock.toml import Checked
 COMMAND_SOURCES = "command_sources"
 COMMAND_THROUGH = "command_through"
 MOST_NAME = 64  # characters of a behaviour policy
+_OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of its outline
 SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
 _SCAN_FIELDS = {
     "ranges_m": True,
@@ -90,8 +91,8 @@ class Input(Checked, frozen=True):
     # Of a lidar: whether its scans turn clockwise, as seen from above; where it is, from the middle
     # of the outline (ahead, left), if not where [task.body] has it; and the angle of its zero.
     upside_down: bool = False
-    lidar_at_m: tuple[float, float] | None = None
-    lidar_yaw_rad: float | None = None
+    lidar_at_m: tuple[_OnRobot, _OnRobot] | None = None
+    lidar_yaw_rad: Annotated[float, Meta(ge=-7, le=7)] | None = None
     # Of a pose by latitude and longitude (`restock.ingest.steps.fixes`).
     origin_deg: tuple[float, float] | None = None  # of the map; None: the recording's first fix
     max_std_m: Annotated[float, Meta(gt=0)] | None = None  # larger: the fix is not used; None: 5

@@ -224,7 +224,9 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
         return
     if isinstance(kind, inspect.UnionType):
         fitting = [k for k in kind.types if _is_number(k) and isinstance(value, int | float)]
-        fitting += [k for k in kind.types if _item(k) and not isinstance(value, int | float | str)]
+        several = not isinstance(value, int | float | str)
+        lists = (k for k in kind.types if _item(k) or isinstance(k, inspect.TupleType))
+        fitting += [k for k in lists if several]
         for option in fitting:
             _check(name, option, value)
         return

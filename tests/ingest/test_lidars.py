@@ -402,6 +402,9 @@ def test_one_lidar_beside_the_middle_has_its_place(
             "inputs.scan_2.lidar_at_m` is missing",
         ),
         (WAREHOUSE.replace("[inputs.imu]", "[inputs.imu]\nlidar_at_m = [0, 0]"), "only to a scan"),
+        (two_lidars().replace("[-0.28, -0.22]", "[nan, 0.0]"), "lidar_at_m[0] must be"),
+        (two_lidars().replace("[-0.28, -0.22]", "[280.0, 0.0]"), "lidar_at_m"),
+        (two_lidars().replace(f"= {REAR[2]}", "= -135.0"), "lidar_yaw_rad"),
     ],
 )
 def test_lidars_that_do_not_go_together_are_refused(text: str, told: str) -> None:

@@ -107,6 +107,7 @@ class Config(Checked, frozen=True):
     several: float | list[Share] | dict[str, Share] = 0.0
     unbounded: float = 0.0
     points: tuple[tuple[float, float], ...] = ()
+    place: tuple[float, float] | None = None
     inner: Inner = Inner()
     inners: tuple[Inner, ...] = ()
     by_name: dict[str, Inner] = msgspec.field(default_factory=dict)
@@ -127,6 +128,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"unbounded": math.nan}, "unbounded must be finite, got nan"),
     ({"several": math.inf}, "several must be finite, got inf"),
     ({"points": [[0.0, math.nan]]}, "points[0][1] must be finite, got nan"),
+    ({"place": [math.nan, 0.0]}, "place[0] must be finite, got nan"),
     ({"count": 0}, "count must be at least 1, got 0"),
     ({"positive": 0.0}, "positive must be above 0, got 0.0"),
     ({"most": 1.5}, "most must be at most 1, got 1.5"),
