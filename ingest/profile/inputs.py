@@ -210,14 +210,14 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
                 where=where,
                 remedy="give both, or lidar_x_m and lidar_yaw_rad of [task.body]",
             )
-    if len(scans) < 2 and "scan" in scans:
-        return
-    if "scan" not in scans and scans:
+    if scans and "scan" not in scans:
         raise ConfigError(
             f"`inputs.{next(iter(scans))}` is given without `inputs.scan`",
             where=where,
             remedy="name the first lidar scan",
         )
+    if len(scans) < 2:
+        return
     for name, source in scans.items():
         if source.lidar_at_m is None:
             raise ConfigError(

@@ -118,21 +118,23 @@ def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray
     the sectors on either side, over up to UNSEEN_SECTORS. More are beyond the lidars' view: free up
     to `range_max_m`, as a sector without beams is.
     """
-    unseen = np.isnan(clearance_m)
-    if not unseen.any():
+    rows = np.flatnonzero(np.isnan(clearance_m).any(axis=1))
+    if not len(rows):
         return clearance_m
-    beside = []
+    filled, some = clearance_m.copy(), clearance_m[rows]
+    unseen, beside = np.isnan(some), []
     for way in (1, -1):
         far, value = np.full(unseen.shape, UNSEEN_SECTORS + 1), np.full(unseen.shape, np.nan)
         for step in range(UNSEEN_SECTORS, 0, -1):
-            there = np.roll(clearance_m, way * step, axis=1)
+            there = np.roll(some, way * step, axis=1)
             known = ~np.isnan(there)
             far[known], value[known] = step, there[known]
         beside.append((far, value))
     (before, low), (after, high) = beside
     short = unseen & (before + after - 1 <= UNSEEN_SECTORS)
-    filled = np.where(unseen, range_max_m, clearance_m)
-    return np.where(short, np.fmin(low, high), filled)
+    free = np.where(unseen, range_max_m, some)
+    filled[rows] = np.where(short, np.fmin(low, high), free)
+    return filled
 
 
 def outline_reach(bearings_rad: NDArray[np.float64], body: Body) -> NDArray[np.float64]:

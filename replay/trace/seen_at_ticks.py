@@ -55,15 +55,14 @@ def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: i
 
 def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
     """As recorded; of lidars that are not where the body has its own, as seen from there."""
-    sources = {name: aligned.inputs.by_name.get(name) for name in aligned.profile.inputs.scans}
-    if "scan" not in sources or None in sources.values():
+    scans = aligned.profile.inputs.scans
+    if not scans or not scans.keys() <= aligned.inputs.by_name.keys():
         return [None] * len(stamps)
-    seen = [_scans_of(aligned, name, stamps) for name in sources]
-    known = [source for source in sources.values() if source is not None]
-    if known[0].lidar_at_m is None:
+    seen = [_scans_of(aligned, name, stamps) for name in scans]
+    sources, body = list(scans.values()), aligned.profile.task.body
+    if sources[0].lidar_at_m is None:
         return seen[0]
-    body = aligned.profile.task.body
-    return [_from_the_middle(body, known, parts) for parts in zip(*seen, strict=True)]
+    return [_from_the_middle(body, sources, parts) for parts in zip(*seen, strict=True)]
 
 
 def _from_the_middle(
