@@ -14,7 +14,6 @@ from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.evidence.cameras import camera_lines
 from restock.ingest.propose.evidence.clock_choice import ClockChoice
 from restock.ingest.propose.evidence.gather import Evidence
-from restock.ingest.propose.evidence.lidars import MountedLidar
 from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
 from restock.ingest.propose.evidence.roles import (
     FIX,
@@ -282,9 +281,6 @@ def _input_lines(
     topic, kind = fitting[0]
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
     others = ", ".join(other.name for other, _ in fitting[1:4])
-    lidar = seen.lidars.get(role)
-    if role == "scan" and lidar is None and seen.footprint.upside_down:
-        lidar = MountedLidar(upside_down=True)
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
         *(
@@ -316,9 +312,11 @@ def _input_lines(
             f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}"
             f"  # {seen.commands.wheelbase_from}",
         ]
+    hangs = role == "scan" and seen.footprint.upside_down
     if role in seen.lidars:
         lines += seen.lidars[role].lines()
-    if lidar is not None and lidar.upside_down:
+        hangs = seen.lidars[role].upside_down
+    if hangs:
         lines.append("upside_down = true  # by its frame; not if its driver turns the scans over")
     if role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)

@@ -83,14 +83,13 @@ def _several(
     found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
     base, frames = "", set[str]()
     for topic, kind in fits:
-        frame = scan_frame(recording, topic.name)
-        view, place = view_of(recording, topic.name), lidar_place(recording, frame)
+        frame, view = scan_frame(recording, topic.name), view_of(recording, topic.name)
         wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
-        fit = wide and place is not None and plain(frame) not in BASE_FRAMES
-        if not found and not fit:  # what is known of the others is no reason to leave the first
+        apart = wide and frame not in frames and plain(frame) not in BASE_FRAMES
+        place = lidar_place(recording, frame) if apart else None
+        if place is None and not found:  # the others are no reason to leave the first
             return {}
-        # Another robot's lidar is on another base.
-        if place is None or not fit or frame in frames or (found and place.base != base):
+        if place is None or (found and place.base != base):  # another robot's is on another base
             continue
         base = place.base
         frames.add(frame)
@@ -138,6 +137,7 @@ def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Fo
         length_m=length,
         width_m=width,
         lidar_x_m=0.0,
+        lidar_y_m=0.0,
         lidar_yaw_rad=0.0,
         upside_down=False,
     )
