@@ -42,7 +42,7 @@ from restock.ingest.propose.evidence.lidars import (
     MountedLidar,
     lidars_of,
     made_of_others_first,
-    scan_frame,
+    scan_frames,
     seen_from_middle,
     with_scans,
 )
@@ -144,9 +144,10 @@ def gather(
     poses = None
     if framed or roles["pose"]:
         poses, _ = pose_series(recording, roles, frames if framed else None)
-    roles["scan"] = made_of_others_first(recording, roles["scan"])
+    frames_of_scans = scan_frames(recording, roles["scan"])
+    roles["scan"] = made_of_others_first(roles["scan"], frames_of_scans)
     scan = roles["scan"][0][0].name if roles["scan"] else None
-    frame = scan_frame(recording, scan) if scan is not None else ""
+    frame = frames_of_scans[scan] if scan is not None else ""
     notes: list[str] = []
     if footprint is None and urdf is not None:
         footprint = urdf_footprint(urdf, frame)
@@ -157,7 +158,7 @@ def gather(
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, frame))
-    lidars = lidars_of(recording, roles["scan"], footprint)
+    lidars = lidars_of(recording, roles["scan"], frames_of_scans, footprint)
     places = {topic.name: lidar for topic, _, lidar in lidars.values()}
     robot = propose_robot(
         recording, scan, frame, urdf, upside_down=footprint.upside_down, lidars=places

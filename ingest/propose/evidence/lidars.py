@@ -52,7 +52,10 @@ class View:
 
 
 def lidars_of(
-    recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]], footprint: Footprint
+    recording: Recording,
+    fits: Sequence[tuple[TopicInfo, Kind]],
+    frames: Mapping[str, str],
+    footprint: Footprint,
 ) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
     """By the name of its input, each lidar whose place its input must say; empty where the robot
     has one lidar, ahead of or behind the middle of its outline.
@@ -63,7 +66,7 @@ def lidars_of(
     """
     if not fits:
         return {}
-    found = _several(recording, fits, footprint.middle_m) if len(fits) > 1 else {}
+    found = _several(recording, fits, frames, footprint.middle_m) if len(fits) > 1 else {}
     if len(found) > 1:
         return found
     if abs(footprint.lidar_y_m) <= ROOM_M:
@@ -78,21 +81,24 @@ def lidars_of(
 
 
 def _several(
-    recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]], middle_m: tuple[float, float]
+    recording: Recording,
+    fits: Sequence[tuple[TopicInfo, Kind]],
+    frames: Mapping[str, str],
+    middle_m: tuple[float, float],
 ) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
     found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
-    base, frames = "", set[str]()
+    base, taken = "", set[str]()
     for topic, kind in fits:
-        frame, view = scan_frame(recording, topic.name), view_of(recording, topic.name)
+        frame, view = frames[topic.name], view_of(recording, topic.name)
         wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
-        apart = wide and frame not in frames and plain(frame) not in BASE_FRAMES
+        apart = wide and frame not in taken and plain(frame) not in BASE_FRAMES
         place = lidar_place(recording, frame) if apart else None
         if place is None and not found:  # the others are no reason to leave the first
             return {}
         if place is None or (found and place.base != base):  # another robot's is on another base
             continue
         base = place.base
-        frames.add(frame)
+        taken.add(frame)
         at_m = place.x_m - middle_m[0], place.y_m - middle_m[1]
         lidar = MountedLidar(*at_m, place.yaw_rad, place.upside_down)
         found[SCANS[len(found)]] = (topic, kind, lidar)
@@ -102,14 +108,11 @@ def _several(
 
 
 def made_of_others_first(
-    recording: Recording, fits: list[tuple[TopicInfo, Kind]]
+    fits: Sequence[tuple[TopicInfo, Kind]], frames: Mapping[str, str]
 ) -> list[tuple[TopicInfo, Kind]]:
     """The scans' topics, those in the frame of the base first: of several lidars, as a node that
     puts their scans together publishes them."""
-    if len(fits) < 2:
-        return fits
-    made = {fit[0].name: plain(scan_frame(recording, fit[0].name)) in BASE_FRAMES for fit in fits}
-    return sorted(fits, key=lambda fit: not made[fit[0].name])
+    return sorted(fits, key=lambda fit: plain(frames[fit[0].name]) not in BASE_FRAMES)
 
 
 def with_scans(roles: Roles, lidars: Mapping[str, tuple[TopicInfo, Kind, MountedLidar]]) -> Roles:
@@ -143,12 +146,13 @@ def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Fo
     )
 
 
-def scan_frame(recording: Recording, topic: str) -> str:
-    """The frame that a topic's scans say they are in."""
-    if FRAME_ID not in recording.leaves(topic):
-        return ""
-    frames = np.asarray(recording.read({topic: [FRAME_ID]})[topic].fields[FRAME_ID], object)
-    return str(frames[0]) if len(frames) else ""
+def scan_frames(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, str]:
+    """topic -> the frame that its scans say they are in, or ""."""
+    names = [topic.name for topic, _ in fits]
+    wanted = {name: [FRAME_ID] for name in names if FRAME_ID in recording.leaves(name)}
+    columns = recording.read(wanted) if wanted else {}
+    said = {name: np.asarray(one.fields[FRAME_ID], object) for name, one in columns.items()}
+    return {name: str(said[name][0]) if len(said.get(name, ())) else "" for name in names}
 
 
 def view_of(recording: Recording, topic: str, *, upside_down: bool = False) -> View | None:
