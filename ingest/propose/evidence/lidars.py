@@ -89,10 +89,11 @@ def _several(
     found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
     base, taken = "", set[str]()
     for topic, kind in fits:
-        frame, view = frames[topic.name], view_of(recording, topic.name)
+        frame = frames[topic.name]
+        apart = frame not in taken and plain(frame) not in BASE_FRAMES
+        view = view_of(recording, topic.name) if apart else None
         wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
-        apart = wide and frame not in taken and plain(frame) not in BASE_FRAMES
-        place = lidar_place(recording, frame) if apart else None
+        place = lidar_place(recording, frame) if wide else None
         if place is None and not found:  # the others are no reason to leave the first
             return {}
         if place is None or (found and place.base != base):  # another robot's is on another base
