@@ -161,6 +161,11 @@ class EvaluationSplit(Checked, frozen=True):
             f'evaluation_split.robots needs by = "robot", got {self.by!r}',
         )
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether it keeps nothing out, whatever the rows."""
+        return self.by == "none" or (self.share == 0 and not self.robots)
+
 
 class Safety(Checked, frozen=True):
     """Rows that must not be learned from."""

@@ -26,7 +26,7 @@ from restock.arrays import Ints
 from restock.errors import PanelError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.packed_row import row_columns, row_width
-from restock.replay.panel.packed_file import PackedFile
+from restock.replay.panel.packed_file import PackedFile, Values
 from restock.replay.panel.scratch import SourceSteps
 from restock.replay.panel.seal import FileRecord
 from restock.replay.plan.candidates import any_order, as_stored, matrix
@@ -131,33 +131,39 @@ class Packer:
         target, behind = _between(self.chosen, place)
         packed = np.flatnonzero(behind > target)  # those that are there
         target = target[packed]
-        observation = _chosen(matrix(batch.column("observation"), size), packed)
+        observation = matrix(batch.column("observation"), size)
         next_observation = matrix(batch.column("next_observation"), size)
         horizon = self.last[target] - place[packed] + 1
-        returns = np.zeros(len(packed))
+        returns = np.zeros(len(batch))
         for ahead in range(int(horizon.max(initial=0))):
-            reach = np.flatnonzero(horizon > ahead)
-            reward = self.steps.reward[place[packed[reach]] + ahead]
+            reach = packed[horizon > ahead]
+            reward = self.steps.reward[place[reach] + ahead]
             returns[reach] += self.mixture.discount**ahead * reward
-        action = batch.column("action").to_numpy()[packed, None]
         rows.put(
             target,
-            (part["observation"], observation),
-            (part["action"], action),
-            (part["reward"], returns[:, None]),
+            Values(part["observation"], observation, packed),
+            Values(part["action"], batch.column("action").to_numpy()[:, None], packed),
+            Values(part["reward"], returns[:, None], packed),
         )
         # Returns that end with a row of this batch take its next observation.
         first, behind = _between(self.last, place)
         source = np.repeat(np.arange(len(place)), behind - first)
         ends = np.arange(len(source)) + np.repeat(first - _starts(behind - first), behind - first)
-        next_observation = _chosen(next_observation, source)
         not_terminated = ~np.asarray(
             batch.column("terminated").to_numpy(zero_copy_only=False), np.bool_
         )
         spanned = self.last[ends] - self.chosen[ends] + 1
         discount = (self.mixture.discount**spanned * not_terminated[source])[:, None]
-        rows.put(ends, (part["next_observation"], next_observation), (part["discount"], discount))
-        if not all(np.isfinite(one).all() for one in (observation, next_observation, returns)):
+        rows.put(
+            ends,
+            Values(part["next_observation"], next_observation, source),
+            Values(part["discount"], discount),
+        )
+        if not (
+            _finite(observation, packed)
+            and _finite(next_observation, source)
+            and np.isfinite(returns).all()
+        ):
             raise PanelError(
                 "an observation or a reward is NaN or infinite, which makes training fail",
                 where=f"recording {self.plan.rows['recording_id'][int(place.max())]}",
@@ -237,10 +243,9 @@ def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
     return pa.DictionaryArray.from_arrays(codes, column.dictionary.take(order))
 
 
-def _chosen(matrix: NDArray[np.float32], rows: Ints) -> NDArray[np.float32]:
-    """matrix[rows], without a copy where these are all of them, in order."""
-    whole = len(rows) == len(matrix) and np.array_equal(rows, np.arange(len(rows)))
-    return matrix if whole else matrix[rows]
+def _finite(values: NDArray[np.float32], rows: Ints) -> bool:
+    """Whether there is neither NaN nor infinity in these rows (n,) of (m, c)."""
+    return bool(np.isfinite(values).all() or np.isfinite(values[rows]).all())
 
 
 def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:

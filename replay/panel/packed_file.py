@@ -10,7 +10,7 @@ import itertools
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,14 @@ BLOCK_ROWS = 512  # of packed rows, written together
 HELD_BYTES = 128 << 20  # of blocks that are not full, in memory at a time
 WRITERS = 2  # threads
 WAITING_BYTES = 32 << 20  # of blocks that are being written, in memory at a time
+
+
+class Values(NamedTuple):
+    """What rows (m,) have in some of their columns."""
+
+    columns: slice
+    held: NDArray[Any]  # (m, c), or (n, c) with `of`
+    of: Ints | None = None  # (m,) which of these each row has
 
 
 class PackedFile:
@@ -62,26 +70,30 @@ class PackedFile:
             raise PanelError("the source changed while it was read", where=str(self._path.parent))
         return self._leaves.record(self._path)
 
-    def put(self, rows: Ints, *values: tuple[slice, NDArray[Any]]) -> None:
-        """One part of rows (m,): some of their columns, with what they hold, (m, c).
+    def put(self, rows: Ints, *values: Values) -> None:
+        """One part of rows (m,): some of their columns.
 
         Raises OSError where the file cannot be written.
         """
         if (np.diff(rows) < 0).any():
             order = np.argsort(rows, kind="stable")
-            rows, values = rows[order], tuple((columns, held[order]) for columns, held in values)
+            rows = rows[order]
+            values = tuple(
+                value._replace(of=order if value.of is None else value.of[order])
+                for value in values
+            )
         block = rows // BLOCK_ROWS
+        into = _Stretches(rows)
+        out_of = [None if value.of is None else _Stretches(value.of) for value in values]
         for begin, end in itertools.pairwise([0, *np.flatnonzero(np.diff(block)) + 1, len(rows)]):
             if begin == end:
                 continue
             number = int(block[begin])
             packed = self._block(number)
-            inside = rows[begin:end] - number * BLOCK_ROWS
-            to: Ints | slice = inside
-            if inside[-1] - inside[0] == end - begin - 1 and (np.diff(inside) == 1).all():
-                to = slice(int(inside[0]), int(inside[-1]) + 1)
-            for columns, held in values:
-                packed[to, columns] = held[begin:end]
+            to = into(begin, end, number * BLOCK_ROWS)
+            for value, of in zip(values, out_of, strict=True):
+                held = slice(begin, end) if of is None else of(begin, end)
+                packed[to, value.columns] = value.held[held]
             self._put[number] += end - begin
             if self._put[number] == len(packed) * self._parts:
                 self._write(number)
@@ -123,3 +135,19 @@ class PackedFile:
         while rest:  # a full disk is an OSError; what is written short goes on
             written = os.pwrite(self._file, rest, place)
             rest, place = rest[written:], place + written
+
+
+class _Stretches:
+    """Stretches of row numbers (m,): as a slice, which copies faster, where each is one above the
+    last."""
+
+    def __init__(self, rows: Ints) -> None:
+        self._rows = rows
+        self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # up to each
+
+    def __call__(self, begin: int, end: int, base: int = 0) -> Ints | slice:
+        """Those of [begin, end), counted from `base`."""
+        if self._breaks[begin] != self._breaks[end - 1]:
+            return self._rows[begin:end] - base
+        first = int(self._rows[begin]) - base
+        return slice(first, first + end - begin)

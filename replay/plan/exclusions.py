@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import duckdb
@@ -92,6 +95,21 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
     return out
 
 
+@contextmanager
+def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -> Iterator[None]:
+    """Have what `repeats_of` needs by the end of the block, which must leave the connection alone.
+
+    Raises StoreError where manifests cannot be read.
+    """
+    if mixture.evaluation_split.is_empty:
+        yield
+        return
+    with ThreadPoolExecutor(1, "restock-repeats") as beside:
+        installed = beside.submit(install_repeated_rows, connection)
+        yield
+        installed.result()
+
+
 def repeats_of(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, places: Places, evaluation_split: Bools
 ) -> Bools:
@@ -99,6 +117,7 @@ def repeats_of(
 
     A recording and a part of it, or a drive that was recorded again, may both be in the store.
     Where `EPISODE_REPEATS` rows or more of an episode are in the split, all of the episode counts.
+    The connection has `repeats_installed`.
 
     Raises:
         MixtureError: nothing else is left.
@@ -106,7 +125,6 @@ def repeats_of(
     repeated = np.zeros(len(table), np.bool_)
     if not evaluation_split.any():
         return repeated
-    install_repeated_rows(connection)
     found = connection.sql(
         "SELECT transition_id, same_as_transition_id FROM repeated_rows(1)"
     ).to_arrow_table()
@@ -261,7 +279,7 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     """The same of rows that all count."""
     rule, seed = mixture.evaluation_split, mixture.seed
-    if rule.by == "none" or (rule.share == 0 and not rule.robots):
+    if rule.is_empty:
         return EvaluationRows.none(len(table))
     episodes = len(np.unique(codes(table, "episode_id")))
     if rule.by == "within_episode" or (rule.by in ("episode", "time") and episodes == 1):

@@ -39,6 +39,7 @@ from restock.replay.plan.exclusions import (
     LeftOut,
     leave_out,
     leave_out_of_strata,
+    repeats_installed,
     repeats_of,
     split_for_evaluation,
 )
@@ -121,22 +122,23 @@ def plan_panel(
     if not mixture.odometry_as_command:
         table, measured = without_measured_actions(connection, table)
     task_hash = one_task(table)
-    places = Places(table["transition_id"].to_numpy())
-    if twice := places.twice:
-        raise StoreError(
-            f"{twice} transition ids occur twice",
-            remedy="`restock audit` names them; ingest those recordings again",
-        )
-    member = _members(table, strata)
-    state = _members(table, strata, of_state=True)
-    if mixture.unlabelled == "nominal":
-        for index, named in enumerate(strata):
-            if named.name == NOMINAL and named.rule.where is None:
-                member[:, index] |= ~bools(table, "labelled")
-                state[:, index] |= ~bools(table, "labelled")
-    stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
-    del state
-    split = split_for_evaluation(table, mixture)
+    with repeats_installed(connection, mixture):  # beside what follows: it reads manifests
+        places = Places(table["transition_id"].to_numpy())
+        if twice := places.twice:
+            raise StoreError(
+                f"{twice} transition ids occur twice",
+                remedy="`restock audit` names them; ingest those recordings again",
+            )
+        member = _members(table, strata)
+        state = _members(table, strata, of_state=True)
+        if mixture.unlabelled == "nominal":
+            for index, named in enumerate(strata):
+                if named.name == NOMINAL and named.rule.where is None:
+                    member[:, index] |= ~bools(table, "labelled")
+                    state[:, index] |= ~bools(table, "labelled")
+        stratum, state_code = assign(member, strata), assign(state, strata, only_pre=True)
+        del state
+        split = split_for_evaluation(table, mixture)
     as_of_ns = (
         time.time_ns() // 10**9 * 10**9  # which `as_of` can say again
         if mixture.as_of is None

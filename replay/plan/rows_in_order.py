@@ -9,6 +9,7 @@ as few bytes as its dictionary needs.
 from __future__ import annotations
 
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from restock.arrays import Bools, Ints
 KEYS = ("episode_index", "step_index", "transition_id")  # the id where all others are the same
 # Stretches that are more, and shorter on average, take longer than sorting rows.
 MOST_STRETCHES, STRETCH_ROWS = 1_000, 256
+COLUMNS_AT_A_TIME = 2  # put in order: each holds memory
 _LOOKED_AT = 1 << 20  # codes at a time
 
 
@@ -60,23 +62,25 @@ class RowsInOrder:
         rank = self._ranks()
         stretches = _in_order(self._stretches, rank)
         order = self._sorted_rows(rank) if stretches is None else None
-        columns = {}
-        for name, field in zip(self._schema.names, self._schema, strict=True):
-            parts = self._parts.pop(name)
-            if name in self._dropped:
-                continue
-            codes = self._codes.get(name)
-            kind = field.type if codes is None else _code_type(len(codes))
+
+        def column(name: str) -> pa.Array:
+            parts, codes = self._parts.pop(name), self._codes.get(name)
+            kind = self._schema.field(name).type if codes is None else _code_type(len(codes))
             if codes is not None:  # later batches may have needed wider codes
                 parts = [part.cast(kind) for part in parts]
             if stretches is not None:
                 parts = [parts[batch].slice(begin, size) for batch, begin, size in stretches]
-            column = pa.concat_arrays([pa.array([], kind), *parts])
+            together = pa.concat_arrays([pa.array([], kind), *parts])
             del parts
             if order is not None:
-                column = column.take(order)
-            columns[name] = column if codes is None else _by_appearance(column, list(codes))
-        return pa.table(columns)
+                together = together.take(order)
+            return together if codes is None else _by_appearance(together, list(codes))
+
+        for name in self._dropped:
+            del self._parts[name]
+        names = list(self._parts)
+        with ThreadPoolExecutor(COLUMNS_AT_A_TIME, "restock-columns") as pool:
+            return pa.table(list(pool.map(column, names)), names)
 
     def _ranks(self) -> Ints:
         """The place of each recording's code in the order of their ids."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -216,24 +217,24 @@ def deal_episodes(
     first, place = first_of[names], (np.cumsum(first_of >= 0) - 1)[here]
     may = member[rows[first]][:, dealt]  # (n episodes, K)
     size = np.bincount(place, weights=counted[rows]).astype(np.int64)
-    taken = np.zeros(len(names), np.bool_)
-    filled = [0] * len(dealt)
     # Of strata with as many rows, the one that could get least goes first, then by priority.
     could = (may * size[:, None]).sum(axis=0)
-    rank = {int(k): (int(could[k]), strata[dealt[k]].priority, int(k)) for k in range(len(dealt))}
+    filled = [(0, int(could[k]), strata[dealt[k]].priority, k) for k in range(len(dealt))]
+    heapq.heapify(filled)
     choices = may.sum(axis=1)
-    waiting = {
-        k: iter(sorted(np.flatnonzero(may[:, k]).tolist(), key=choices.__getitem__)) for k in rank
-    }
-    while waiting:
-        k = min(waiting, key=lambda one: (filled[one], rank[one]))
-        mine = next((e for e in waiting[k] if not taken[e]), None)
+    waiting = [
+        iter(sorted(np.flatnonzero(of_k).tolist(), key=choices.__getitem__)) for of_k in may.T
+    ]
+    rows_of, taken = size.tolist(), [NO_STRATUM] * len(names)
+    while filled:
+        so_far, *between, k = filled[0]
+        mine = next((e for e in waiting[k] if taken[e] == NO_STRATUM), None)
         if mine is None:
-            del waiting[k]
+            heapq.heappop(filled)
         else:
-            taken[mine] = True
-            given[names[mine]] = dealt[k]
-            filled[k] += int(size[mine])
+            taken[mine] = int(dealt[k])
+            heapq.heapreplace(filled, (so_far + rows_of[mine], *between, k))
+    given[names] = taken
     return given
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from restock.errors import PanelError
 from restock.replay.panel import packed_file
-from restock.replay.panel.packed_file import PackedFile
+from restock.replay.panel.packed_file import PackedFile, Values
 from restock.replay.panel.seal import FileRecord, Leaves, checksum, sample_checksum
 
 WIDTH = 5
@@ -45,7 +45,8 @@ def test_parts_in_any_order_make_the_same_file(
         with PackedFile(path, count, WIDTH, parts=2) as file:
             for place in rng.permutation(len(puts)).tolist():
                 part, some = puts[place]
-                file.put(some, (part, rows[some, part]))
+                held = Values(part, rows[some, part])
+                file.put(some, held if place % 2 else Values(part, rows[:, part], some))
             record = file.finish()
     assert path.read_bytes() == rows.tobytes()
     assert record.bytes == rows.nbytes
@@ -89,8 +90,8 @@ def test_the_checksum_is_that_of_its_leaves(tmp_path: Path) -> None:
 def test_a_row_that_never_came_is_an_error(tmp_path: Path) -> None:
     rows = np.zeros((20, WIDTH), np.float32)
     with PackedFile(tmp_path / "rows", 20, WIDTH, parts=2) as file:
-        file.put(np.arange(20), (HALVES[0], rows[:, HALVES[0]]))
-        file.put(np.arange(19), (HALVES[1], rows[:19, HALVES[1]]))
+        file.put(np.arange(20), Values(HALVES[0], rows[:, HALVES[0]]))
+        file.put(np.arange(19), Values(HALVES[1], rows[:19, HALVES[1]]))
         with pytest.raises(PanelError, match="changed while it was read"):
             file.finish()
 
@@ -108,4 +109,4 @@ def test_a_full_disk_is_said_by_whoever_fills_it(
         pytest.raises(OSError, match="No space left"),
         PackedFile(tmp_path / "rows", len(rows), WIDTH, parts=1) as file,
     ):
-        file.put(np.arange(len(rows)), (slice(0, WIDTH), rows))
+        file.put(np.arange(len(rows)), Values(slice(0, WIDTH), rows))
