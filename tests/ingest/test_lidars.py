@@ -20,9 +20,11 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.propose.evidence.gather import gather
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.scan import MovedMap, SectorMap, outline_reach, with_unseen
@@ -325,6 +327,25 @@ def test_several_lidars_are_proposed_by_their_transforms(
     assert np.median(straight_left) == pytest.approx(LEFT_M - 1.0 - body_m, abs=0.01)
     assert np.median(straight_right) == pytest.approx(1.0 - RIGHT_M - body_m, abs=0.01)
     assert straight_left.max() < LEFT_M - 1.0  # behind the post, too
+
+
+def test_for_a_proposal_transforms_are_read_once_and_angles_of_all_lidars_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads: list[dict[str, list[str]]] = []
+    usual = Recording.read
+
+    def read(self: Recording, wanted: Any, reductions: Any = None) -> Any:
+        reads.append({name: list(paths) for name, paths in wanted.items()})
+        return usual(self, wanted, reductions)
+
+    monkeypatch.setattr(Recording, "read", read)
+    with open_recording(Corridor(12.0).bag(tmp_path / "bag")) as recording:
+        seen = gather(recording, None, odometry_as_command=False)
+    assert list(seen.lidars) == ["scan", "scan_2"]
+    assert sum("/tf_static" in one for one in reads) == 1
+    angles = [list(one) for one in reads if any("angle_max" in paths for paths in one.values())]
+    assert angles == [["/scan_front", "/scan_rear"]]
 
 
 def test_a_scan_made_of_the_others_is_the_one(

@@ -469,7 +469,7 @@ def test_of_two_robots_in_a_recording_each_has_its_own_outline_and_description(
         assert "for /robot1," in (told := in_one_recording(robots))
         assert "another name" in told
         found, notes = footprint_of(recording)
-        own = propose_robot(recording, None, "", None)
+        own = propose_robot(recording, None, None)
     assert notes == []
     assert own.values.get("track_m") == track_m
     if found is None:

@@ -75,9 +75,9 @@ def transform_edges(recording: Recording) -> Edges:
     return Edges.of(frames, recording.read(wanted) if wanted else {})
 
 
-def transform_frames(recording: Recording) -> FrameGuess | None:
-    """The map's and the robot's frame, or None where no transforms join any such two."""
-    edges = transform_edges(recording)
+def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
+    """The map's and the robot's frame, by its transforms (`transform_edges`); None where they join
+    no such two."""
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     others = {robot.rpartition("/")[2] for robot in robots_in(recording)[1:]}
     frames = {frame for frame in frames if frame.split("/")[0] not in others}

@@ -36,13 +36,17 @@ from restock.ingest.propose.evidence.commands import (
     wheelbase_of,
 )
 from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
-from restock.ingest.propose.evidence.frame_guess import FrameGuess, transform_frames
+from restock.ingest.propose.evidence.frame_guess import (
+    FrameGuess,
+    transform_edges,
+    transform_frames,
+)
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.lidars import (
     MountedLidar,
     lidars_of,
     made_of_others_first,
-    scan_frames,
+    scans_of,
     seen_from_middle,
     with_scans,
 )
@@ -135,19 +139,20 @@ def gather(
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
     if not (roles["goal"] and roles["plan"]):
         roles["goal"] = roles["plan"] = []
-    frames = transform_frames(recording)
+    edges = transform_edges(recording)
+    frames = transform_frames(recording, edges)
     if frames is not None and all(topic.type == FIX for topic, _ in roles["pose"]):
         roles["pose"] = []  # transforms say where it faces, too
     # Odometry drifts: where transforms lead to a map, they are the better pose.
     drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
-    poses = None
+    poses, poses_from = None, ""
     if framed or roles["pose"]:
-        poses, _ = pose_series(recording, roles, frames if framed else None)
-    frames_of_scans = scan_frames(recording, roles["scan"])
-    roles["scan"] = made_of_others_first(roles["scan"], frames_of_scans)
+        poses, poses_from = pose_series(recording, roles, frames if framed else None, edges)
+    scanned = scans_of(recording, roles["scan"])
+    roles["scan"] = made_of_others_first(roles["scan"], scanned)
     scan = roles["scan"][0][0].name if roles["scan"] else None
-    frame = frames_of_scans[scan] if scan is not None else ""
+    frame = scanned[scan].frame if scan is not None else ""
     notes: list[str] = []
     if footprint is None and urdf is not None:
         footprint = urdf_footprint(urdf, frame)
@@ -157,15 +162,19 @@ def gather(
     if footprint is None:
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
-        footprint = with_lidar(footprint, lidar_place(recording, frame))
-    lidars = lidars_of(recording, roles["scan"], frames_of_scans, footprint)
-    places = {topic.name: lidar for topic, _, lidar in lidars.values()}
+        footprint = with_lidar(footprint, lidar_place(recording, edges, frame))
+    lidars = lidars_of(recording, roles["scan"], scanned, edges, footprint)
+    mounted = [(scanned[topic.name], lidar) for topic, _, lidar in lidars.values()]
     robot = propose_robot(
-        recording, scan, frame, urdf, upside_down=footprint.upside_down, lidars=places
+        recording,
+        urdf,
+        scanned[scan] if scan is not None else None,
+        upside_down=footprint.upside_down,
+        lidars=mounted,
     )
     if lidars:
         roles = with_scans(roles, lidars)
-        footprint = seen_from_middle(footprint, list(places.values()))
+        footprint = seen_from_middle(footprint, [lidar for _, lidar in mounted])
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
     robot = wheelbase_of(recording, roles, poses, robot)
@@ -182,8 +191,8 @@ def gather(
     recorded_s = _recorded_s(recording, roles)
     gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
     motion = None
-    if not roles["wheels"] and (framed or roles["pose"]):
-        motion = choose_motion(recording, roles, frames, framed=framed)
+    if not roles["wheels"] and poses is not None:
+        motion = choose_motion(recording, poses, poses_from)
     best = [(role, *fitting[0]) for role, fitting in roles.items() if fitting]
     return Evidence(
         recording,

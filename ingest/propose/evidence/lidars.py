@@ -10,11 +10,12 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.decoding.columns import FieldColumn
 from restock.ingest.profile.inputs import SCANS
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.roles import Kind, Roles
 from restock.ingest.propose.evidence.scanned_outline import ROOM_M, lidar_place
-from restock.ingest.steps.frames import FRAME_ID, plain
+from restock.ingest.steps.frames import FRAME_ID, Edges, plain
 from restock.ingest.urdf.description import BASE_FRAMES
 
 WIDE_RAD = math.radians(150)  # a depth camera's scan is narrower, and of no height of a lidar
@@ -51,10 +52,33 @@ class View:
     beams: int
 
 
+@dataclass(frozen=True)
+class SeenScans:
+    """What a topic's scans say of the lidar that made them."""
+
+    frame: str = ""  # that the first one is in; "": it does not say
+    angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last one
+
+    def view(self, *, upside_down: bool = False) -> View | None:
+        """What the last scan covers; None where it does not say, or not sanely."""
+        if self.angles is None:
+            return None
+        sign = -1 if upside_down else 1
+        first, last, step = (sign * one + 0.0 for one in self.angles)  # no "-0.0" in a file
+        if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
+            return None
+        count = round((last - first) / step) + 1
+        low, high = min(first, last), max(first, last)
+        if count < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
+            return None
+        return View(low, min(high, low + _TURN), abs(step), count)
+
+
 def lidars_of(
     recording: Recording,
     fits: Sequence[tuple[TopicInfo, Kind]],
-    frames: Mapping[str, str],
+    scanned: Mapping[str, SeenScans],
+    edges: Edges,
     footprint: Footprint,
 ) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
     """By the name of its input, each lidar whose place its input must say; empty where the robot
@@ -66,7 +90,7 @@ def lidars_of(
     """
     if not fits:
         return {}
-    found = _several(recording, fits, frames, footprint.middle_m) if len(fits) > 1 else {}
+    found = _several(recording, fits, scanned, edges, footprint.middle_m) if len(fits) > 1 else {}
     if len(found) > 1:
         return found
     if abs(footprint.lidar_y_m) <= ROOM_M:
@@ -83,17 +107,17 @@ def lidars_of(
 def _several(
     recording: Recording,
     fits: Sequence[tuple[TopicInfo, Kind]],
-    frames: Mapping[str, str],
+    scanned: Mapping[str, SeenScans],
+    edges: Edges,
     middle_m: tuple[float, float],
 ) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
     found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
     base, taken = "", set[str]()
     for topic, kind in fits:
-        frame = frames[topic.name]
-        apart = frame not in taken and plain(frame) not in BASE_FRAMES
-        view = view_of(recording, topic.name) if apart else None
+        frame, view = scanned[topic.name].frame, scanned[topic.name].view()
         wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
-        place = lidar_place(recording, frame) if wide else None
+        apart = wide and frame not in taken and plain(frame) not in BASE_FRAMES
+        place = lidar_place(recording, edges, frame) if apart else None
         if place is None and not found:  # the others are no reason to leave the first
             return {}
         if place is None or (found and place.base != base):  # another robot's is on another base
@@ -109,11 +133,11 @@ def _several(
 
 
 def made_of_others_first(
-    fits: Sequence[tuple[TopicInfo, Kind]], frames: Mapping[str, str]
+    fits: Sequence[tuple[TopicInfo, Kind]], scanned: Mapping[str, SeenScans]
 ) -> list[tuple[TopicInfo, Kind]]:
     """The scans' topics, those in the frame of the base first: of several lidars, as a node that
     puts their scans together publishes them."""
-    return sorted(fits, key=lambda fit: plain(frames[fit[0].name]) not in BASE_FRAMES)
+    return sorted(fits, key=lambda fit: plain(scanned[fit[0].name].frame) not in BASE_FRAMES)
 
 
 def with_scans(roles: Roles, lidars: Mapping[str, tuple[TopicInfo, Kind, MountedLidar]]) -> Roles:
@@ -147,32 +171,28 @@ def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Fo
     )
 
 
-def scan_frames(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, str]:
-    """topic -> the frame that its scans say they are in, or ""."""
-    names = [topic.name for topic, _ in fits]
-    wanted = {name: [FRAME_ID] for name in names if FRAME_ID in recording.leaves(name)}
+def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
+    """topic -> what its scans say of their lidar: of all topics in one pass."""
+    wanted = {}
+    for topic, _ in fits:
+        leaves = set(recording.leaves(topic.name))
+        angles = _ANGLES if leaves.issuperset(_ANGLES) else ()
+        wanted[topic.name] = [path for path in (FRAME_ID, *angles) if path in leaves]
     columns = recording.read(wanted) if wanted else {}
-    said = {name: np.asarray(one.fields[FRAME_ID], object) for name, one in columns.items()}
-    return {name: str(said[name][0]) if len(said.get(name, ())) else "" for name in names}
+    return {
+        name: _seen(columns[name].fields) if name in columns else SeenScans() for name in wanted
+    }
 
 
-def view_of(recording: Recording, topic: str, *, upside_down: bool = False) -> View | None:
-    """What a topic's last scan covers; None where it does not say, or not sanely."""
-    if not set(_ANGLES) <= set(recording.leaves(topic)):
-        return None
-    fields = recording.read({topic: list(_ANGLES)})[topic].fields
-    if not len(fields[_ANGLES[0]]):
-        return None
-    sign = -1 if upside_down else 1
-    # `+ 0.0`: no "-0.0" in a file
-    first, last, step = (sign * float(np.asarray(fields[one])[-1]) + 0.0 for one in _ANGLES)
-    if not (np.isfinite([first, last, step]).all() and step and abs(step) > 1e-4):
-        return None
-    count = round((last - first) / step) + 1
-    low, high = min(first, last), max(first, last)
-    if count < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
-        return None
-    return View(low, min(high, low + _TURN), abs(step), count)
+def _seen(fields: Mapping[str, FieldColumn]) -> SeenScans:
+    columns = {path: np.asarray(column) for path, column in fields.items()}
+    if not all(map(len, columns.values())):
+        return SeenScans()
+    frame = str(columns[FRAME_ID][0]) if FRAME_ID in columns else ""
+    if _ANGLES[0] not in columns:
+        return SeenScans(frame)
+    first, last, step = (float(columns[path][-1]) for path in _ANGLES)
+    return SeenScans(frame, (first, last, step))
 
 
 def joined_view(views: Sequence[tuple[View, float]]) -> View | None:

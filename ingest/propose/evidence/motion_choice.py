@@ -18,7 +18,7 @@ from restock.ingest.propose.evidence.frame_guess import FrameGuess
 from restock.ingest.propose.evidence.roles import FIX, FIX_FIELDS, Roles
 from restock.ingest.steps.align import align
 from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
-from restock.ingest.steps.frames import FIELDS, Edges, Tree
+from restock.ingest.steps.frames import Edges, Tree
 from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
 
@@ -47,11 +47,8 @@ class MotionChoice:
         ]
 
 
-def choose_motion(
-    recording: Recording, roles: Roles, frames: FrameGuess | None, *, framed: bool
-) -> MotionChoice:
-    """How speeds are to come from the recording's poses."""
-    poses, source = pose_series(recording, roles, frames if framed else None)
+def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> MotionChoice:
+    """How speeds are to come from the recording's poses, which are from this `source`."""
     gaps = np.diff(poses.stamp_ns) * 1e-9
     period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
     least = (LEAST_POSES - 1) * usual * 1.1
@@ -82,13 +79,12 @@ def choose_motion(
 
 
 def pose_series(
-    recording: Recording, roles: Roles, frames: FrameGuess | None
+    recording: Recording, roles: Roles, frames: FrameGuess | None, edges: Edges
 ) -> tuple[PoseSeries, str]:
-    """Every pose at its log time, and where it is from in words."""
+    """Every pose at its log time, and where it is from in words: by `frames` of the transforms
+    `edges`, else of the topic for it."""
     if frames is not None:
         usual = frames.frames
-        topics = [t for t in (usual.topic, usual.static_topic) if t in recording.topics]
-        edges = Edges.of(usual, recording.read({name: list(FIELDS) for name in topics}))
         edges = edges.only({usual.base, usual.fixed})
         segments, _ = align(edges.topics, Clock(alignment="log_time"))
         tree = Tree(usual, edges, segments)

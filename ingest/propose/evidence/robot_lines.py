@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
-from restock.ingest.propose.evidence.lidars import MountedLidar, View, joined_view, view_of
+from restock.ingest.propose.evidence.lidars import MountedLidar, SeenScans, View, joined_view
 from restock.ingest.propose.evidence.roles import shared
 from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
@@ -160,16 +160,15 @@ def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
 
 def propose_robot(
     recording: Recording,
-    scan_topic: str | None,
-    scan_frame: str,
     urdf: Path | None,
+    scan: SeenScans | None,
     *,
     upside_down: bool = False,
-    lidars: Mapping[str, MountedLidar] | None = None,
+    lidars: Sequence[tuple[SeenScans, MountedLidar]] = (),
 ) -> RobotProposal:
     """The robot that a URDF file, else the recording's description, and its scans describe; its
-    lidar may hang upside down, and `lidars`, topic by topic, be somewhere else than ahead of or
-    behind the middle.
+    lidar may hang upside down, and `lidars`, with their scans, be somewhere else than ahead of
+    or behind the middle.
 
     Raises:
         ConfigError: the file cannot be used: it has no wheels, say.
@@ -188,7 +187,7 @@ def propose_robot(
             continue
         shapes = outline(description)
         middle = 0.0 if shapes is None else float(shapes[0][0] + shapes[1][0]) / 2
-        found = described_robot(description, middle, scan_frame)
+        found = described_robot(description, middle, scan.frame if scan is not None else "")
         if found.problem is not None:
             if urdf is not None:
                 raise ConfigError(
@@ -205,11 +204,11 @@ def propose_robot(
         break
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)
-    if scan_topic is not None:
+    if scan is not None:
         if lidars:
-            seen = _lidars(recording, lidars, notes)
+            seen = _lidars(lidars, notes)
         else:
-            view = view_of(recording, scan_topic, upside_down=upside_down)
+            view = scan.view(upside_down=upside_down)
             seen = _beams(view, notes) if view is not None else {}
         values |= seen
         origin |= dict.fromkeys(seen, "logs")
@@ -243,14 +242,12 @@ def _beams(view: View, notes: list[str]) -> dict[str, Any]:
     }
 
 
-def _lidars(
-    recording: Recording, lidars: Mapping[str, MountedLidar], notes: list[str]
-) -> dict[str, Any]:
+def _lidars(lidars: Sequence[tuple[SeenScans, MountedLidar]], notes: list[str]) -> dict[str, Any]:
     """Of one lidar in the middle that covers what these do."""
     views = [
         (view, lidar.yaw_rad)
-        for topic, lidar in lidars.items()
-        if (view := view_of(recording, topic, upside_down=lidar.upside_down)) is not None
+        for scans, lidar in lidars
+        if (view := scans.view(upside_down=lidar.upside_down)) is not None
     ]
     if not views:
         return {}

@@ -19,13 +19,9 @@ from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.frame_guess import (
-    named_frames,
-    transform_edges,
-    transform_topics,
-)
+from restock.ingest.propose.evidence.frame_guess import named_frames, transform_topics
 from restock.ingest.steps.align import align
-from restock.ingest.steps.frames import Tree, plain, upward
+from restock.ingest.steps.frames import Edges, Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.urdf.description import BASE_FRAMES
 
@@ -172,12 +168,11 @@ class LidarPlace:
     upside_down: bool
 
 
-def lidar_place(recording: Recording, scan_frame: str) -> LidarPlace | None:
-    """Where the lidar is, by the last transforms of the recording; None where they do not say, or
-    not sanely."""
+def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
+    """Where the lidar is, by the last of the recording's transforms; None where they do not say,
+    or not sanely."""
     if not scan_frame:
         return None
-    edges = transform_edges(recording)
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     topic, static_topic = transform_topics(recording)
     for base in named_frames(BASE_FRAMES, frames):

@@ -17,7 +17,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Frames
-from restock.ingest.propose.evidence.frame_guess import transform_frames
+from restock.ingest.propose.evidence.frame_guess import transform_edges, transform_frames
 from restock.ingest.propose.evidence.roles import (
     FIX,
     FIX_FIELDS,
@@ -141,7 +141,7 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     if profile is not None:
         return [poses for poses in [_by_profile(recording, profile)] if poses is not None]
     usable = usable_topics(recording)
-    guess = transform_frames(recording)
+    guess = transform_frames(recording, transform_edges(recording))
     along = None
     if guess is not None:
         along = along_transforms(recording, guess.frames)
