@@ -15,7 +15,7 @@ import msgspec
 
 from restock.errors import ConfigError
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.inputs import MOTION, Input
+from restock.ingest.profile.inputs import Input, is_motion
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.limiter import RULES
@@ -49,7 +49,7 @@ class CommandForm:
             ConfigError: a type that the profile does not read and that is no twist.
         """
         command = profile.inputs.command
-        measured = command.type == MOTION  # its commands were not recorded
+        measured = is_motion(command.type)  # its commands were not recorded
         topic = topic or ("/cmd_vel" if measured else command.topic)
         kind = kind or ("geometry_msgs/msg/Twist" if measured else command.type)
         if kind == command.type:

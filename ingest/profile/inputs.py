@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Annotated
 
@@ -59,7 +60,7 @@ FALLBACKS: dict[str, str] = {
     "true_exposure": "unknown: exposures are not scored",
     "perturbation": "unknown: null, as for hardware",
 }
-MOTION = "nav_msgs/msg/Odometry"  # what was measured: commands are of other types
+MOTION = "Odometry"  # the last part of its types: what was measured, where commands are of others
 STEERED = "speed x tan(steering angle) / {wheelbase_m:g} m of {topic}"
 COMMAND_FALLBACK = "the measured motion of {topic} in place of commands"
 POLICY_FALLBACK = "the source whose command it equals: {names}; else the profile's behaviour_policy"
@@ -75,6 +76,16 @@ HINDSIGHT = {
 
 FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
 SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad")
+
+
+def last_part(kind: str) -> str:
+    """Of a message type, without package or namespace: "Twist" of `ros.geometry_msgs.Twist`."""
+    return re.split(r"[/.:]", kind)[-1]
+
+
+def is_motion(kind: str) -> bool:
+    """Whether messages of this type say what was measured, not what was commanded."""
+    return last_part(kind) == MOTION
 
 
 class Input(Checked, frozen=True):

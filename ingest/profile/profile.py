@@ -35,7 +35,6 @@ from restock.ingest.profile.inputs import (
     FIX_FALLBACK,
     FIX_SETTINGS,
     HINDSIGHT,
-    MOTION,
     POLICY_FALLBACK,
     POSE_FALLBACK,
     ROUTE_FALLBACK,
@@ -45,6 +44,7 @@ from restock.ingest.profile.inputs import (
     WHEELS_FALLBACK,
     Input,
     Inputs,
+    is_motion,
 )
 from restock.ingest.profile.robot_file import with_robot_file
 from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
@@ -190,7 +190,7 @@ class Profile(Checked, frozen=True):
         """Inputs the profile leaves out -> what is used instead of each."""
         given = dict(self.inputs.items())
         fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
-        if self.inputs.command.type == MOTION:
+        if is_motion(self.inputs.command.type):
             fallbacks["command"] = COMMAND_FALLBACK.format(topic=self.inputs.command.topic)
         for name, source in given.items():
             if source.wheelbase_m is not None:

@@ -20,11 +20,12 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import Ragged
-from restock.ingest.profile.inputs import MOTION
+from restock.ingest.profile.inputs import is_motion
 from restock.ingest.propose.evidence.commands import off_the_floor
 from restock.ingest.propose.evidence.footprint import descriptions
 from restock.ingest.propose.evidence.roles import KINDS, Kind, topics_for, usable_topics
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.frames import FRAME_IDS, frame_id_path, plain
 from restock.ingest.urdf.description import read_description
 
 SCANS = 40  # of a recording that are looked at
@@ -47,7 +48,7 @@ class Lidar:
 
     frame: str
     beams: int
-    range_max_m: float
+    range_max_m: float  # 0: they do not say
     simulated: bool  # by their stamps
 
     def agrees(self, other: Lidar) -> bool:
@@ -65,7 +66,8 @@ class Lidar:
 
     def __str__(self) -> str:
         clock = ", simulated clock" if self.simulated else ""
-        return f"lidar {self.frame}, {self.beams} beams, {self.range_max_m:g} m{clock}"
+        reach = f", {self.range_max_m:g} m" if self.range_max_m else ""
+        return f"lidar {self.frame}, {self.beams} beams{reach}{clock}"
 
 
 @dataclass(frozen=True)
@@ -112,21 +114,23 @@ class RobotTraits:
 def robot_traits(recording: Recording) -> RobotTraits:
     """What a recording says of its robot; reads a few scans and poses of it."""
     topics = usable_topics(recording)
-    roles = {role: topics_for(topics, KINDS[role]) for role in ("command", "pose", "wheels")}
+    roles = {
+        role: topics_for(recording, topics, KINDS[role]) for role in ("command", "pose", "wheels")
+    }
     command = roles["command"][0][0].type if roles["command"] else ""
-    odometry = next((t for fits in roles.values() for t, _ in fits if t.type == MOTION), None)
+    odometry = next((t for fits in roles.values() for t, _ in fits if is_motion(t.type)), None)
     frames = ""
     if odometry is not None:
-        paths = ["header.frame_id", "child_frame_id"]
+        leaves = recording.leaves(odometry.name)
+        paths = [path for path in (*FRAME_IDS, "child_frame_id") if path in leaves]
         ends = recording.read({odometry.name: paths})[odometry.name].fields
-        first = [str(np.asarray(ends[path], object)[0]).strip("/") for path in paths]
-        frames = " -> ".join(first)
+        frames = " -> ".join(plain(str(np.asarray(ends[path], object)[0])) for path in paths)
     texts = [text for _, text in descriptions(recording)]
     described = read_description(texts[0]) if texts else ""
     return RobotTraits(
         command,
         frames,
-        _lidar(recording, [t.name for t, _ in topics_for(topics, KINDS["scan"])]),
+        _lidar(recording, topics_for(recording, topics, KINDS["scan"])[:1]),
         hashlib.blake2b(texts[0].encode(), digest_size=8).hexdigest() if texts else "",
         "" if isinstance(described, str) else described.name,
         frozenset((t.name, t.type) for fits in roles.values() for t, _ in fits),
@@ -155,22 +159,23 @@ def _known(traits: RobotTraits) -> int:
     return sum(bool(each) for each in told)
 
 
-def _lidar(recording: Recording, names: list[str]) -> Lidar | None:
-    if not names:
+def _lidar(recording: Recording, best: Sequence[tuple[TopicInfo, Kind]]) -> Lidar | None:
+    if not best:
         return None
-    paths = ["header.frame_id", "range_max", "angle_min", "angle_increment", "ranges", STAMP]
-    wanted = [path for path in paths if path == "ranges" or path in recording.leaves(names[0])]
-    columns = recording.read({names[0]: wanted})[names[0]]
+    name, path = best[0][0].name, best[0][1].fields["ranges_m"]
+    leaves = recording.leaves(name)
+    wanted = [one for one in (*FRAME_IDS, "range_max", STAMP) if one in leaves]
+    columns = recording.read({name: [path, *wanted]})[name]
     if not len(columns):
         return None
     fields, some = columns.fields, slice(SCANS)
-    ranges = fields["ranges"]
+    ranges, frame = fields[path], frame_id_path(fields)
     assert isinstance(ranges, Ragged)
     stamps = np.asarray(fields[STAMP], np.int64)[some] if STAMP in fields else np.zeros(0)
     return Lidar(
-        str(np.asarray(fields["header.frame_id"], object)[0]).strip("/"),
+        "" if frame is None else plain(str(np.asarray(fields[frame], object)[0])),
         int(np.median(ranges.lengths[some])),
-        round(float(np.median(np.asarray(fields["range_max"], np.float64)[some])), 3),
+        round(float(np.median(np.asarray(fields.get("range_max", [0]), np.float64)[some])), 3),
         bool(len(stamps)) and 0 < int(np.median(stamps)) < SIMULATED_NS,
     )
 
@@ -222,7 +227,7 @@ def no_wheeled_robot(
 def _rises_m(recording: Recording) -> float:
     """How far the poses of a recording go up and down; 0 where there are none."""
     rises = [0.0]
-    for topic, kind in topics_for(usable_topics(recording), KINDS["pose"]):
+    for topic, kind in topics_for(recording, usable_topics(recording), KINDS["pose"]):
         path = kind.fields.get("x_m", "").removesuffix("x") + "z"
         if path in recording.leaves(topic.name):
             heights = np.asarray(recording.read({topic.name: [path]})[topic.name].fields[path])

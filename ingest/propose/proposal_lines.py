@@ -16,7 +16,6 @@ from restock.ingest.propose.evidence.clock_choice import ClockChoice
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
 from restock.ingest.propose.evidence.roles import (
-    FIX,
     KINDS,
     LATCHED,
     REQUIRED,
@@ -202,15 +201,15 @@ def _robot_lines(seen: Evidence) -> list[str]:
     return robot.lines(*np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist())
 
 
-def _fix_topic(seen: Evidence) -> str:
-    """The topic of the fixes that its pose is from, or ""."""
+def _fixes(seen: Evidence) -> tuple[TopicInfo, Kind] | None:
+    """The topic of the fixes that its pose is from, or None."""
     pose = seen.roles["pose"][:1]
-    return pose[0][0].name if pose and pose[0][0].type == FIX else ""
+    return pose[0] if pose and pose[0][1].by_fix else None
 
 
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
     """How noisy its poses are, where that is more than a profile has otherwise."""
-    if not (topic := _fix_topic(seen)):
+    if (fixes := _fixes(seen)) is None:
         noise_m = trial.pose_noise_m
         if noise_m is None or noise_m <= Noise().localiser_m or not _shows_slip(seen):
             return []
@@ -220,8 +219,10 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
             f" {Noise().localiser_m:g} allows for: less would be taken for slip",
             "",
         ]
-    apart_s = max(seen.paces_s.get(topic, 0.25), seen.clock.period_s)
-    return fix_noise_lines(seen.recording, topic, 2 * seen.commands.speed_mps * apart_s)
+    topic, kind = fixes
+    apart_s = max(seen.paces_s.get(topic.name, 0.25), seen.clock.period_s)
+    driven_m = 2 * seen.commands.speed_mps * apart_s
+    return fix_noise_lines(seen.recording, topic.name, kind.fields, driven_m)
 
 
 def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
@@ -280,7 +281,8 @@ def _input_lines(
         return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
     topic, kind = fitting[0]
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
-    others = ", ".join(other.name for other, _ in fitting[1:4])
+    beside = dict.fromkeys(other.name for other, _ in fitting if other.name != topic.name)
+    others = ", ".join([*beside][:3])
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
         *(
@@ -302,8 +304,8 @@ def _input_lines(
         f'type = "{topic.type}"',
         f"fields = {{ {fields} }}",
     ]
-    if role == "pose" and _fix_topic(seen):
-        lines += fix_lines(seen.recording, topic.name)
+    if role == "pose" and kind.by_fix:
+        lines += fix_lines(seen.recording, topic.name, kind.fields)
     if role == "command" and seen.turns is not None:
         lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:

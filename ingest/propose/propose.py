@@ -23,7 +23,6 @@ from restock.ingest.propose.evidence.roles import (
     REQUIRED,
     robots_in,
     several_commands,
-    usable_topics,
 )
 from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.proposal_lines import in_one_recording, profile_lines, steered_by
@@ -162,7 +161,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     advice += [Advice(f"inputs.{name}", UPSIDE_DOWN) for name in hanging]
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
-        several_commands(usable_topics(recording)),
+        several_commands(recording),
         wheeled=other is None,
     )
 

@@ -1,4 +1,4 @@
-"""Poses from satellite fixes (sensor_msgs/NavSatFix): metres east and north of an origin.
+"""Poses from satellite fixes (NavSatFix, LocationFix): metres east and north of an origin.
 
 Latitude, longitude and the origin go to earth-centred coordinates on the WGS84 ellipsoid (at height
 0), and from there to the plane that touches it at the origin, x to the east and y to the north (REP
@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Ints
-from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.decoding.columns import Ragged, TopicColumns
 
 EQUATOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS84
+COVARIANCES = 9  # of a fix
 MAX_STD_M = 5.0  # of a fix, where it says and the profile does not
 TRACK_M = 1.0
 _BLOCK, _SIDES = 64, 16
@@ -101,11 +102,16 @@ class Fixes:
 
 def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None = None) -> Fixes:
     """The fixes of a topic, by the `fields` of the profile's input; with a heading at each."""
-    named = {
-        key: np.asarray(columns.fields[path], np.float64)
-        for key, path in fields.items()
-        if isinstance(columns.fields.get(path), np.ndarray)
-    }
+    named = {}
+    for key, path in fields.items():
+        column = columns.fields.get(path)
+        if isinstance(column, Ragged) and key == "covariance_m2":  # no type fixes its length
+            told = np.flatnonzero(column.lengths == COVARIANCES)
+            rows = np.full((len(column), COVARIANCES), np.nan)
+            rows[told] = np.asarray(column.take(told).values).reshape(-1, COVARIANCES)
+            column = rows
+        if isinstance(column, np.ndarray):
+            named[key] = np.asarray(column, np.float64)
     said = {key: named.get(key) for key in ("status", "covariance_m2", "covariance_type")}
     latitude, longitude = named["latitude_deg"], named["longitude_deg"]
     return Fixes(columns.log_time_ns, latitude, longitude, **said, yaw_rad=yaw)

@@ -34,6 +34,7 @@ FIELDS = (
 )
 PARENT = "parent"
 FRAME_ID = "header.frame_id"
+FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
 
 
 def frame_path(source: Input, fields: Container[str]) -> str | None:
@@ -43,7 +44,12 @@ def frame_path(source: Input, fields: Container[str]) -> str | None:
         path = ".".join([*around[:count], FRAME_ID])
         if path in fields and "[" not in path:
             return path
-    return None
+    return frame_id_path(fields)
+
+
+def frame_id_path(fields: Container[str]) -> str | None:
+    """The field that says in which frame a message is."""
+    return next((path for path in FRAME_IDS if path in fields), None)
 
 
 @dataclass(frozen=True)

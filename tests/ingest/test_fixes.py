@@ -277,10 +277,11 @@ HUSKY = ROOT.parent / "shared" / "bags" / "ros1" / "husky_robot_localization.bag
 def test_a_husky_outdoors_drives_as_far_by_its_fixes_as_by_its_wheels():
     from restock.ingest.containers.open_recording import open_recording
     from restock.ingest.propose.evidence.motion_choice import fixes_in
+    from restock.ingest.propose.evidence.roles import KINDS
 
     with open_recording(HUSKY) as recording:
         (name,) = [n for n, t in recording.topics.items() if t.type == FIX]
-        fixes = fixes_in(recording, name)
+        fixes = fixes_in(recording, name, next(k.fields for k in KINDS["pose"] if k.type == FIX))
     at = fixes.poses(max_std_m=100.0)
     known = np.isfinite(at.x_m)
     assert known.mean() > 0.9

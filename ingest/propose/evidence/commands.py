@@ -13,7 +13,7 @@ from restock.arrays import F64, Ints
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.inputs import MOTION
+from restock.ingest.profile.inputs import is_motion
 from restock.ingest.propose.driven.command_hold import (
     CommandHold,
     command_hold,
@@ -102,7 +102,7 @@ def read_commands(
         Commands().fastest(speed, turn),
         count=len(columns),
         topic=topic.name,
-        measured=topic.type == MOTION,
+        measured=is_motion(topic.type),
         steered="steering_rad" in kind.fields,
         wheelbase_m=wheelbase_m or Commands.wheelbase_m,
     )
@@ -145,7 +145,7 @@ def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[in
     topic, kind = fit
     message = kind.fields["speed_mps"].removesuffix("linear.x")
     leaves = [f"{message}{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
-    if topic.type == MOTION or not set(leaves) <= set(recording.leaves(topic.name)):
+    if is_motion(topic.type) or not set(leaves) <= set(recording.leaves(topic.name)):
         return 0, 0
     fields = recording.read({topic.name: leaves})[topic.name].fields
     asked = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
@@ -197,7 +197,7 @@ def how_it_turned(
         angles = np.abs(np.asarray(fields[path], np.float64))
         angles = angles[np.isfinite(angles)]
         return DriveEvidence(), float(np.percentile(angles, 98)) if len(angles) else 0.0
-    if topic.type == MOTION or poses is None or len(poses) < 2:
+    if is_motion(topic.type) or poses is None or len(poses) < 2:
         return DriveEvidence(), None
     return drive_evidence(*_since(recording, roles, poses)), None
 
@@ -215,7 +215,7 @@ def read_turns(
     if not (steers and roles["command"]):
         return None
     topic, kind = roles["command"][0]
-    if topic.type == MOTION or "steering_rad" in kind.fields:
+    if is_motion(topic.type) or "steering_rad" in kind.fields:
         return None
     if poses is None or len(poses) < 2:
         return TurnReading()

@@ -9,7 +9,7 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.inputs import MOTION
+from restock.ingest.profile.inputs import is_motion
 from restock.ingest.propose.driven.command_hold import (
     CommandHold,
 )
@@ -46,6 +46,7 @@ from restock.ingest.propose.evidence.lidars import (
     MountedLidar,
     lidars_of,
     made_of_others_first,
+    moved_in_frame,
     scans_of,
     seen_from_middle,
     with_scans,
@@ -57,7 +58,6 @@ from restock.ingest.propose.evidence.motion_choice import (
 )
 from restock.ingest.propose.evidence.robot_lines import RobotProposal, propose_robot, urdf_footprint
 from restock.ingest.propose.evidence.roles import (
-    FIX,
     KINDS,
     LATCHED,
     NODE_TOPICS,
@@ -124,7 +124,7 @@ def gather(
     topics, others = usable_topics(recording), other_robots_topics(recording)
 
     def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
-        found = topics_for(topics, kinds)
+        found = topics_for(recording, topics, kinds)
         return [fit for _, fit in own_first(recording, [(fit[0].name, fit) for fit in found])]
 
     roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
@@ -141,10 +141,10 @@ def gather(
         roles["goal"] = roles["plan"] = []
     edges = transform_edges(recording)
     frames = transform_frames(recording, edges)
-    if frames is not None and all(topic.type == FIX for topic, _ in roles["pose"]):
+    if frames is not None and all(kind.by_fix for _, kind in roles["pose"]):
         roles["pose"] = []  # transforms say where it faces, too
     # Odometry drifts: where transforms lead to a map, they are the better pose.
-    drifts = all(topic.type == MOTION for topic, _ in roles["pose"])
+    drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
     poses, poses_from = None, ""
     if framed or roles["pose"]:
@@ -158,11 +158,13 @@ def gather(
         footprint = urdf_footprint(urdf, frame)
     if footprint is None:
         footprint, notes = footprint_of(recording, frame)
-    outline = scanned_outline(recording, scan, poses) if scan is not None else None
+    outline = scanned_outline(recording, roles["scan"][0], poses) if roles["scan"] else None
     if footprint is None:
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, edges, frame))
+    if scan is not None:
+        footprint = moved_in_frame(footprint, scanned[scan])
     lidars = lidars_of(recording, roles["scan"], scanned, edges, footprint)
     mounted = [(scanned[topic.name], lidar) for topic, _, lidar in lidars.values()]
     robot = propose_robot(

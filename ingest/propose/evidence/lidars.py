@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.decoding.columns import FieldColumn
+from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
+from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.inputs import SCANS
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.roles import Kind, Roles
 from restock.ingest.propose.evidence.scanned_outline import ROOM_M, lidar_place
-from restock.ingest.steps.frames import FRAME_ID, Edges, plain
+from restock.ingest.steps.clearance import BEAMS
+from restock.ingest.steps.frames import Edges, frame_id_path, plain
+from restock.ingest.task.signals import yaw_of
 from restock.ingest.urdf.description import BASE_FRAMES
 
 WIDE_RAD = math.radians(150)  # a depth camera's scan is narrower, and of no height of a lidar
-_ANGLES = ("angle_min", "angle_max", "angle_increment")
+Place = tuple[float, float, float]  # ahead and to the left (m), and turned (rad)
 _TURN = 2 * math.pi
 _BINS = 360  # of the circle
 
@@ -58,6 +60,15 @@ class SeenScans:
 
     frame: str = ""  # that the first one is in; "": it does not say
     angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last one
+    origin: Place = (0.0, 0.0, 0.0)  # of the last one's lidar in its frame
+
+    def seen_from(self, x_m: float, y_m: float, yaw_rad: float, *, upside_down: bool) -> Place:
+        """Where the lidar is, and its zero, if its frame is here."""
+        ahead, left, turn = self.origin
+        left, turn = (-left, -turn) if upside_down else (left, turn)
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        at_m = x_m + cos * ahead - sin * left, y_m + sin * ahead + cos * left
+        return *at_m, math.remainder(yaw_rad + turn, _TURN) if turn else yaw_rad
 
     def view(self, *, upside_down: bool = False) -> View | None:
         """What the last scan covers; None where it does not say, or not sanely."""
@@ -124,8 +135,9 @@ def _several(
             continue
         base = place.base
         taken.add(frame)
-        at_m = place.x_m - middle_m[0], place.y_m - middle_m[1]
-        lidar = MountedLidar(*at_m, place.yaw_rad, place.upside_down)
+        at = (place.x_m - middle_m[0], place.y_m - middle_m[1], place.yaw_rad)
+        at = scanned[topic.name].seen_from(*at, upside_down=place.upside_down)
+        lidar = MountedLidar(*at, place.upside_down)
         found[SCANS[len(found)]] = (topic, kind, lidar)
         if len(found) == len(SCANS):
             break
@@ -171,28 +183,84 @@ def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Fo
     )
 
 
+def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
+    """The footprint, whose lidar is where its frame is, with the lidar where scans say it is."""
+    if scans.origin == (0.0, 0.0, 0.0):
+        return footprint
+    frame = (footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0)
+    x, y, yaw = scans.seen_from(*frame, upside_down=footprint.upside_down)
+    source = f"{footprint.lidar_source}, and the pose in its scans"
+    if footprint.lidar_x_m is None:
+        source = f"by the pose in its scans; that {scans.frame} is the middle is a guess"
+    length, width = footprint.length_m, footprint.width_m
+    if not footprint.measured:  # a guess holds it
+        length, width = max(length, 2 * abs(x)), max(width, 2 * abs(y))
+    return replace(
+        footprint,
+        length_m=length,
+        width_m=width,
+        lidar_x_m=x,
+        lidar_y_m=y,
+        lidar_yaw_rad=yaw,
+        lidar_source=source,
+    )
+
+
 def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
     """topic -> what its scans say of their lidar: of all topics in one pass."""
-    wanted = {}
-    for topic, _ in fits:
+    wanted, counted = dict[str, list[str]](), dict[str, Reduction]()
+    for topic, kind in fits:
         leaves = set(recording.leaves(topic.name))
-        angles = _ANGLES if leaves.issuperset(_ANGLES) else ()
-        wanted[topic.name] = [path for path in (FRAME_ID, *angles) if path in leaves]
-    columns = recording.read(wanted) if wanted else {}
+        frame, angles = frame_id_path(leaves), _angles(kind)
+        kept = angles if leaves.issuperset(angles) else []
+        wanted[topic.name] = [*([frame] if frame else []), *kept, *_origin(kind, leaves)]
+        if len(kept) == 2:  # by the last of so many
+            counted[topic.name] = Reduction((kind.fields["ranges_m"],), _beam_counts)
+    columns = recording.read(wanted, counted) if wanted else {}
     return {
-        name: _seen(columns[name].fields) if name in columns else SeenScans() for name in wanted
+        topic.name: _seen(columns[topic.name].fields, kind)
+        for topic, kind in fits
+        if topic.name in columns
     }
 
 
-def _seen(fields: Mapping[str, FieldColumn]) -> SeenScans:
+def _angles(kind: Kind) -> list[str]:
+    """Where scans say the angles of their first and last beam, and if they do, the step."""
+    fields = kind.fields
+    step = [fields["angle_increment_rad"]] if "angle_increment_rad" in fields else []
+    return [fields["angle_min_rad"], fields.get("angle_max_rad", "angle_max"), *step]
+
+
+def _beam_counts(fields: Fields) -> dict[str, FieldColumn]:
+    (ranges,) = fields.values()
+    lengths = ranges.lengths if isinstance(ranges, Ragged) else np.full(*ranges.shape)
+    return {BEAMS: lengths}
+
+
+def _origin(kind: Kind, fields: Collection[str]) -> list[str]:
+    """Where scans say where in their frame the lidar is, if they do."""
+    paths = [f"{kind.origin}.position.{axis}" for axis in "xy"]
+    paths += [f"{kind.origin}.orientation.{axis}" for axis in "xyzw"]
+    return paths if set(paths) <= set(fields) else []
+
+
+def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
+    angles, origin = _angles(kind), (0.0, 0.0, 0.0)
     columns = {path: np.asarray(column) for path, column in fields.items()}
     if not all(map(len, columns.values())):
         return SeenScans()
-    frame = str(columns[FRAME_ID][0]) if FRAME_ID in columns else ""
-    if _ANGLES[0] not in columns:
-        return SeenScans(frame)
-    first, last, step = (float(columns[path][-1]) for path in _ANGLES)
-    return SeenScans(frame, (first, last, step))
+    frame = frame_id_path(columns)
+    said = "" if frame is None else str(columns[frame][0])
+    if place := _origin(kind, columns):
+        x, y, *turn = (np.asarray(columns[path][-1:], np.float64) for path in place)
+        yaw = float(yaw_of(*turn)[0])
+        origin = (float(x[0]), float(y[0]), yaw if np.isfinite(yaw) else 0.0)
+    if angles[0] not in columns:
+        return SeenScans(said, None, origin)
+    first, last, *step = (float(columns[path][-1]) for path in angles)
+    if not step:
+        step = [(last - first) / max(int(columns[BEAMS][-1]) - 1, 1)]
+    return SeenScans(said, (first, last, step[0]), origin)
 
 
 def joined_view(views: Sequence[tuple[View, float]]) -> View | None:

@@ -7,6 +7,7 @@ s / period x sqrt(12 / (n (n² - 1))); the shortest window in which it is small 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from restock.arrays import F64
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.tables import Clock
 from restock.ingest.propose.evidence.frame_guess import FrameGuess
-from restock.ingest.propose.evidence.roles import FIX, FIX_FIELDS, Roles
+from restock.ingest.propose.evidence.roles import Roles
 from restock.ingest.steps.align import align
 from restock.ingest.steps.fixes import MAX_STD_M, TRACK_M, Fixes, fixes_of
 from restock.ingest.steps.frames import Edges, Tree
@@ -91,8 +92,8 @@ def pose_series(
         series = PoseSeries.joined(poses_along(tree))
         return series, f"{frames.fixed} -> {frames.base} of {usual.topic}"
     topic, kind = roles["pose"][0]
-    if topic.type == FIX:
-        fixes = fixes_in(recording, topic.name)
+    if kind.by_fix:
+        fixes = fixes_in(recording, topic.name, kind.fields)
         at = fixes.poses()
         order = np.argsort(fixes.time_ns, kind="stable")
         columns = (column[order] for column in (at.x_m, at.y_m, at.yaw_rad))
@@ -107,14 +108,14 @@ def pose_series(
     return PoseSeries.of(read.log_time_ns[order], x[order], y[order], yaw[order]), topic.name
 
 
-def fixes_in(recording: Recording, topic: str) -> Fixes:
-    """The satellite fixes of a topic."""
-    return fixes_of(recording.read({topic: list(FIX_FIELDS.values())})[topic], FIX_FIELDS)
+def fixes_in(recording: Recording, topic: str, fields: Mapping[str, str]) -> Fixes:
+    """The satellite fixes that a topic has in these fields."""
+    return fixes_of(recording.read({topic: list(fields.values())})[topic], fields)
 
 
-def fix_lines(recording: Recording, topic: str) -> list[str]:
+def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> list[str]:
     """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
-    fixes = fixes_in(recording, topic)
+    fixes = fixes_in(recording, topic, fields)
     origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
     how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
     return [
@@ -127,9 +128,11 @@ def fix_lines(recording: Recording, topic: str) -> list[str]:
     ]
 
 
-def fix_noise_lines(recording: Recording, topic: str, driven_m: float) -> list[str]:
+def fix_noise_lines(
+    recording: Recording, topic: str, fields: Mapping[str, str], driven_m: float
+) -> list[str]:
     """What is a jump, and what slip, of fixes between which `driven_m` are driven."""
-    usual = _usual_std_m(fixes_in(recording, topic)) or 1.0
+    usual = _usual_std_m(fixes_in(recording, topic, fields)) or 1.0
     return [
         "[episodes]",
         f"max_pose_jump_m = {max(1.0, round(driven_m + 3 * usual, 1)):g}  # between two fixes",

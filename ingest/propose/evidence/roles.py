@@ -11,11 +11,15 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.live.node_topics import ACTION, LIMITER, PROPOSAL, SHADOW, TAKEOVER
+from restock.ingest.profile.inputs import Input, last_part
+from restock.ingest.steps.needs import field_paths
 
 T = TypeVar("T")
 
 _TWIST = {"speed_mps": "linear.x", "yaw_rate_radps": "angular.z"}
-_POSE = {"x_m": "position.x", "y_m": "position.y", "orientation": "orientation"}
+_PLACE = {"x_m": "position.x", "y_m": "position.y"}
+_SCAN = {"ranges_m": "ranges", "angle_min_rad": "start_angle", "angle_max_rad": "end_angle"}
+_POSE = {**_PLACE, "orientation": "orientation"}
 
 
 def _under(path: str, fields: dict[str, str]) -> dict[str, str]:
@@ -32,17 +36,24 @@ class Kind:
     must: bool = False  # … and without one of them it is not taken
     never: tuple[str, ...] = ()  # in the topic's name, they speak against it
     rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
+    origin: str = ""  # of scans: the field that says where in their frame the lidar is
+
+    @property
+    def by_fix(self) -> bool:
+        """Whether it is a position by latitude and longitude."""
+        return "latitude_deg" in self.fields
 
 
 # Where nothing else says where the robot is.
-FIX = "sensor_msgs/msg/NavSatFix"
-FIX_FIELDS = {
+_STATED_FIX = {
     "latitude_deg": "latitude",
     "longitude_deg": "longitude",
     "status": "status.status",
     "covariance_m2": "position_covariance",
     "covariance_type": "position_covariance_type",
 }
+_FIX = {key: path for key, path in _STATED_FIX.items() if key != "status"}
+_RECEIVERS = ("fix", "gps", "gnss")
 
 # A name of what may drive but is only proposed: to a multiplexer, a smoother, a person's remote.
 NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_vel")
@@ -50,6 +61,7 @@ NAVIGATION = ("nav", "move_base", "planner", "autonom", "cmd_vel_raw", "raw_cmd_
 _DRIVEN = ("cmd_vel_out", "mux/out", "mux/cmd_vel", "cmd_vel")
 _ACKERMANN = ("low_level", "output", "ackermann_cmd", "drive")
 BY_HAND = ("teleop", "joy", "key", "web", "remote")
+_CHOSEN_FROM = (*NAVIGATION, *BY_HAND, "input")
 
 # A name of a pose that is not where the robot is.
 _ELSEWHERE = (
@@ -57,37 +69,39 @@ _ELSEWHERE = (
     *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
 )
 
+_PATHS = ("plan", "path")
 # A name of a path that does not lead to the goal: what a controller looks at, next to the robot.
 _NEAR_PATHS = ("local_plan", "local_path", "local_traj", "transformed_", "pruned_")
+
+_MEASURED = (
+    Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
+    Kind(
+        "foxglove.Odometry",
+        {"speed_mps": "linear_velocity.x", "yaw_rate_radps": "angular_velocity.z"},
+        ("wheel", "odom"),
+    ),
+)
 
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
 # Best first.
 KINDS: dict[str, tuple[Kind, ...]] = {
     "command": (
+        Kind("geometry_msgs/msg/Twist", _TWIST, _DRIVEN, rather=_CHOSEN_FROM),
         Kind(
-            "geometry_msgs/msg/Twist",
-            _TWIST,
-            _DRIVEN,
-            rather=(*NAVIGATION, *BY_HAND, "input"),
-        ),
-        Kind(
-            "geometry_msgs/msg/TwistStamped",
-            _under("twist", _TWIST),
-            _DRIVEN,
-            rather=(*NAVIGATION, *BY_HAND, "input"),
+            "geometry_msgs/msg/TwistStamped", _under("twist", _TWIST), _DRIVEN, rather=_CHOSEN_FROM
         ),
         Kind(
             "ackermann_msgs/msg/AckermannDriveStamped",
             {"speed_mps": "drive.speed", "steering_rad": "drive.steering_angle"},
             _ACKERMANN,
-            rather=(*NAVIGATION, *BY_HAND, "input", "safety"),
+            rather=(*_CHOSEN_FROM, "safety"),
         ),
         Kind(
             "ackermann_msgs/msg/AckermannDrive",
             {"speed_mps": "speed", "steering_rad": "steering_angle"},
             _ACKERMANN,
-            rather=(*NAVIGATION, *BY_HAND, "input", "safety"),
+            rather=(*_CHOSEN_FROM, "safety"),
         ),
     ),
     "pose": (
@@ -104,9 +118,18 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             must=True,
             never=_ELSEWHERE,
         ),
+        Kind(
+            "foxglove.PoseInFrame",
+            _under("pose", _POSE),
+            ("robot_pose", "tracked_pose", "slam", "pose"),
+            must=True,
+            never=_ELSEWHERE,
+        ),
         Kind("nav_msgs/msg/Odometry", _under("pose.pose", _POSE), ("filtered", "map", "odom")),
+        Kind("foxglove.Odometry", _under("pose", _POSE), ("filtered", "map", "odom")),
         # Of motion capture and the like, whatever their names.
         Kind("geometry_msgs/msg/PoseStamped", _under("pose", _POSE), never=_ELSEWHERE),
+        Kind("foxglove.PoseInFrame", _under("pose", _POSE), never=_ELSEWHERE),
         Kind(
             "geometry_msgs/msg/TransformStamped",
             {
@@ -123,9 +146,10 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             ("pose",),
             never=_ELSEWHERE,
         ),
-        Kind(FIX, FIX_FIELDS, ("fix", "gps", "gnss"), never=("filtered",)),
+        Kind("sensor_msgs/msg/NavSatFix", _STATED_FIX, _RECEIVERS, never=("filtered",)),
+        Kind("foxglove.LocationFix", _FIX, _RECEIVERS, never=("filtered",)),
     ),
-    "wheels": (Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),),
+    "wheels": _MEASURED,
     "imu": (
         Kind(
             "sensor_msgs/msg/Imu",
@@ -144,26 +168,19 @@ KINDS: dict[str, tuple[Kind, ...]] = {
             ("scan",),
             rather=("back", "rear"),
         ),
+        Kind("foxglove.LaserScan", _SCAN, ("scan",), rather=("back", "rear"), origin="pose"),
     ),
     "goal": (
         Kind(  # all that move_base was sent
             "move_base_msgs/msg/MoveBaseActionGoal",
-            _under("goal.target_pose.pose", {"x_m": "position.x", "y_m": "position.y"}),
+            _under("goal.target_pose.pose", _PLACE),
         ),
-        Kind(
-            "geometry_msgs/msg/PoseStamped",
-            {"x_m": "pose.position.x", "y_m": "pose.position.y"},
-            ("goal",),
-            must=True,
-        ),
+        Kind("geometry_msgs/msg/PoseStamped", _under("pose", _PLACE), ("goal",), must=True),
+        Kind("foxglove.PoseInFrame", _under("pose", _PLACE), ("goal",), must=True),
     ),
     "plan": (
-        Kind(
-            "nav_msgs/msg/Path",
-            {"x_m": "poses[].pose.position.x", "y_m": "poses[].pose.position.y"},
-            ("plan", "path"),
-            never=_NEAR_PATHS,
-        ),
+        Kind("nav_msgs/msg/Path", _under("poses[].pose", _PLACE), _PATHS, never=_NEAR_PATHS),
+        Kind("foxglove.PosesInFrame", _under("poses[]", _PLACE), _PATHS, True, _NEAR_PATHS),
     ),
     "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
     "nav_command": (
@@ -192,15 +209,15 @@ KINDS: dict[str, tuple[Kind, ...]] = {
     "perturbation": (Kind("std_msgs/msg/String", {"text": "data"}, ("perturbation",), must=True),),
 }
 # Where that is asked for: the measured motion in place of commands that were not recorded.
-ODOMETRY_AS_COMMAND = (
-    Kind("nav_msgs/msg/Odometry", _under("twist.twist", _TWIST), ("wheel", "odom")),
-)
+ODOMETRY_AS_COMMAND = _MEASURED
 # Message type -> what of a robot it is. Poses may also be of odometry's type.
 _KIND_OF = {
-    kind.type: role
+    name: role
     for role in ("pose", "imu", "scan", "plan", "wheels", "command")
     for kind in KINDS[role]
+    for name in (kind.type, last_part(kind.type))
 }
+_OTHER_ENCODINGS = ("json", "protobuf")
 REQUIRED = ("command", "pose")
 LATCHED = ("goal", "plan", "behaviour_policy", "perturbation")
 # Of Restock's own node: what a policy would have driven is no command of the robot.
@@ -286,7 +303,8 @@ def _namespaces(recording: Recording) -> dict[str, _Namespace]:
     found: defaultdict[str, _Namespace] = defaultdict(_Namespace)
     where: defaultdict[tuple[str, str, str], set[str]] = defaultdict(set)  # beside, the rest, kind
     for name, topic in _readable(recording):
-        if (kind := _KIND_OF.get(topic.type)) is None:
+        other = topic.encoding in _OTHER_ENCODINGS
+        if (kind := _KIND_OF.get(last_part(topic.type) if other else topic.type)) is None:
             continue
         parts = name.strip("/").split("/")
         for place in range(1, len(parts)):
@@ -335,8 +353,20 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
             yield name, topic
 
 
+def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
+    """Whether a topic's messages are of this type. JSON and protobuf have ROS's types, too, in
+    namespaces of any name (`ros.geometry_msgs.Twist`, `Twist`): of these, by the fields as well."""
+    if topic.encoding not in _OTHER_ENCODINGS:
+        return topic.type == kind.type
+    of_ros = "/" in kind.type and last_part(topic.type) == last_part(kind.type)
+    if not of_ros and topic.type != kind.type:
+        return False
+    paths = field_paths(Input(topic.name, topic.type, kind.fields))
+    return set(paths) <= set(recording.leaves(topic.name))
+
+
 def topics_for(
-    topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
+    recording: Recording, topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:
     """The topics that may fill an input, best first: by kind, by name, by messages."""
     fitting = []
@@ -346,16 +376,17 @@ def topics_for(
             named = [place for place, word in enumerate(kind.words) if word in name]
             against = any(word in name for word in kind.never)
             later = any(word in name for word in kind.rather)
-            if topic.type == kind.type and not against and (named or not kind.must):
+            if not against and (named or not kind.must) and _is_of(recording, topic, kind):
                 place = min(named, default=len(kind.words))
                 fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
 
 
-def several_commands(topics: dict[str, TopicInfo]) -> list[str]:
+def several_commands(recording: Recording) -> list[str]:
     """All topics that may be what drives the robot, best first, where there are several."""
-    fitting = topics_for(topics, KINDS["command"])
-    proposed = {topic.name for topic, _ in topics_for(topics, KINDS["nav_command"])}
+    topics = usable_topics(recording)
+    fitting = topics_for(recording, topics, KINDS["command"])
+    proposed = {topic.name for topic, _ in topics_for(recording, topics, KINDS["nav_command"])}
     named = [
         topic.name
         for topic, kind in fitting

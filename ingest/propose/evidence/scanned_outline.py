@@ -7,20 +7,23 @@ which nothing around it does: they belong to the outline, and are no obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
+from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.frame_guess import named_frames, transform_topics
+from restock.ingest.propose.evidence.roles import Kind
 from restock.ingest.steps.align import align
+from restock.ingest.steps.clearance import angle_keys, beam_angles
 from restock.ingest.steps.frames import Edges, Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.urdf.description import BASE_FRAMES
@@ -36,7 +39,7 @@ OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
 FACING_RAD, LEAST_FACINGS, LEAST_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
 MOST_ASIDE_M = 3.0  # of the middle: a lidar
-_FIELDS = ("ranges", "angle_min", "angle_increment", "range_min", "range_max")
+_LIMITS = ("range_min", "range_max")
 
 
 @dataclass(frozen=True)
@@ -74,12 +77,14 @@ class ScannedOutline:
 
 
 def scanned_outline(
-    recording: Recording, topic: str, poses: PoseSeries | None
+    recording: Recording, fit: tuple[TopicInfo, Kind], poses: PoseSeries | None
 ) -> ScannedOutline | None:
     """What a topic's scans say; None where it has too few. Without poses no own parts are found."""
-    if not set(_FIELDS) <= {path.removesuffix("[]") for path in recording.leaves(topic)}:
-        return None
-    columns = recording.read({topic: []}, {topic: Reduction(_FIELDS, _nearest)})[topic]
+    topic, source = fit[0].name, Input(fit[0].name, fit[0].type, fit[1].fields)
+    leaves = recording.leaves(topic)
+    paths = [*source.fields.values(), *(path for path in _LIMITS if path in leaves)]
+    reduction = Reduction(tuple(paths), partial(_nearest, source))
+    columns = recording.read({topic: []}, {topic: reduction})[topic]
     nearest = np.asarray(columns.fields[NEAREST], np.float32)
     if len(nearest) < LEAST_SCANS:
         return None
@@ -109,13 +114,20 @@ def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
     return np.asarray((middle < OWN_WITHIN_M) & (stays.mean(axis=0) >= MOSTLY), np.bool_)
 
 
-def _nearest(fields: Mapping[str, FieldColumn] | Fields) -> dict[str, FieldColumn]:
+def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
     """The nearest valid return of each scan in each bin of bearings (N, BINS); inf without one."""
-    ranges = fields["ranges"]
-    first, step, low, high = (np.asarray(fields[path], np.float64) for path in _FIELDS[1:])
-    count = len(first)
+    ranges = fields[source.fields["ranges_m"]]
+    count = len(ranges)
+    low, high = (
+        np.asarray(fields.get(path, np.full(count, usual)), np.float64)
+        for path, usual in zip(_LIMITS, (0.0, np.inf), strict=True)
+    )
     if not isinstance(ranges, Ragged):
         ranges = Ragged(ranges.reshape(-1), np.arange(count + 1) * ranges.shape[1])
+    first, last = (
+        np.asarray(fields[source.fields[key]], np.float64) for key in angle_keys(source.fields)
+    )
+    first, step = beam_angles(source, first, last, ranges.lengths)
     row: Ints = np.repeat(np.arange(count), ranges.lengths)
     beam = np.arange(len(row)) - ranges.offsets[:-1][row]
     values = np.asarray(ranges.values, np.float32)
@@ -144,8 +156,10 @@ def _range_m(
 
     Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
     """
-    columns = recording.read({topic: ["range_min", "range_max"]})[topic].fields
-    low, high = (float(np.median(np.asarray(columns[f"range_{end}"]))) for end in ("min", "max"))
+    if not set(_LIMITS) <= set(recording.leaves(topic)):
+        return 0.05, 4.0, ""
+    columns = recording.read({topic: _LIMITS})[topic].fields
+    low, high = (float(np.median(np.asarray(columns[path]))) for path in _LIMITS)
     if not 0 <= low < high < np.inf:
         return 0.05, 4.0, ""
     own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0

@@ -19,8 +19,6 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Frames
 from restock.ingest.propose.evidence.frame_guess import transform_edges, transform_frames
 from restock.ingest.propose.evidence.roles import (
-    FIX,
-    FIX_FIELDS,
     KINDS,
     topics_for,
     usable_topics,
@@ -145,11 +143,11 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     along = None
     if guess is not None:
         along = along_transforms(recording, guess.frames)
-    kinds = topics_for(usable, KINDS["pose"])
-    fixes = [topic.name for topic, _ in kinds if topic.type == FIX]
+    kinds = topics_for(recording, usable, KINDS["pose"])
+    fixes = {topic.name: kind.fields for topic, kind in kinds if kind.by_fix}
     found = _of_topics(recording, {t.name: k.fields for t, k in kinds if t.name not in fixes})
     if not found and along is None:  # another frame than anything else's, and no heading
-        found = [p for name in fixes for p in [_by_fixes(recording, name, FIX_FIELDS)] if p]
+        found = [p for name, of in fixes.items() for p in [_by_fixes(recording, name, of)] if p]
     localised = guess is not None and guess.localised
     return [p for p in ((along, *found) if localised else (*found, along)) if p is not None]
 

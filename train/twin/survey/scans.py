@@ -120,7 +120,7 @@ def _topic(recording: Recording, profile: Profile | None) -> str | None:
         named = None if scan is None else recording.topics.get(scan.topic)
         return named.name if named is not None and named.expected and not named.skipped else None
     usable = usable_topics(recording)
-    found = [topic.name for topic, _ in topics_for(usable, KINDS["scan"])]
+    found = [topic.name for topic, _ in topics_for(recording, usable, KINDS["scan"])]
     return min(found, key=lambda name: "fake" in name or "sim" in name, default=None)
 
 

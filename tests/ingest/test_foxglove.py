@@ -1,0 +1,163 @@
+"""Robots that record Foxglove's message types, and ROS's, as JSON or protobuf: what is proposed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.foxglove_robot import (
+    BEAMS,
+    FIELD_RAD,
+    SPEED_MPS,
+    START_NS,
+    TYPES,
+    WALL_M,
+    YAW_RATE_RADPS,
+    Message,
+    drive,
+    fix,
+    place,
+    pose,
+    write_robot,
+)
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.propose.kinds import robot_traits
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import Steps, steps_of
+
+ENCODINGS = pytest.mark.parametrize("encoding", ["json", "protobuf"])
+
+
+def proposed(path: Path, capsys: Any, code: int = 0) -> tuple[str, list[str]]:
+    """The proposal's TOML, and what it is told to lack."""
+    assert main(["profile", "new", str(path), "--json"]) == code
+    said = json.loads(capsys.readouterr().out)
+    return said["toml"], said["problems"]
+
+
+def read(path: Path, toml: str) -> tuple[Profile, Steps]:
+    profile = parse_profile(toml, where="p")
+    with open_recording(path) as recording:
+        return profile, steps_of(profile, read_topics(recording, profile))
+
+
+@ENCODINGS
+def test_a_robots_scans_poses_odometry_and_commands_are_proposed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
+) -> None:
+    path = write_robot(tmp_path / "run.mcap", encoding, drive())
+    toml, problems = proposed(path, capsys)
+    assert problems == []
+    profile, steps = read(path, toml)
+    assert {name: source.topic for name, source in profile.inputs.items()} == {
+        "command": "/cmd_vel",
+        "pose": "/pose",
+        "wheels": "/odom",
+        "scan": "/scan",
+    }
+    assert profile.robot.lidar.beams == BEAMS
+    assert profile.robot.lidar.angle_max_rad == pytest.approx(FIELD_RAD / 2, abs=1e-4)
+    usable = np.array([problem == "" for problem in steps.problem])
+    assert usable.sum() > 190
+    seconds = (steps.signals["stamp_ns"][usable] - START_NS) * 1e-9
+    expected = np.array([place(time_s) for time_s in seconds.tolist()])
+    for name, column in (("pose_x_m", expected[:, 0]), ("pose_y_m", expected[:, 1])):
+        # A pose is at most a period, and the time it took to be logged, old.
+        assert np.abs(steps.signals[name][usable] - column).max() < 0.1 * SPEED_MPS
+    assert np.allclose(steps.signals["command_yaw_rate_radps"][usable], YAW_RATE_RADPS)
+    ahead_m = steps.signals["sector_clearance_m"][usable].min(axis=1)
+    assert np.allclose(ahead_m, WALL_M - profile.task.body.length_m / 2, atol=0.15)
+    with open_recording(path) as recording:
+        traits = robot_traits(recording)
+    assert traits.frames == "odom -> base_link"
+    assert str(traits.lidar) == f"lidar laser, {BEAMS} beams"
+
+
+@ENCODINGS
+def test_a_lidar_is_where_the_pose_in_its_scans_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
+) -> None:
+    messages = [
+        (
+            time_s,
+            topic,
+            kind,
+            {**values, "pose": pose(0.4, 0.0, np.pi)} if "scan" in topic else values,
+        )
+        for time_s, topic, kind, values in drive(8.0)
+    ]
+    toml, problems = proposed(write_robot(tmp_path / "run.mcap", encoding, messages), capsys)
+    assert problems == []
+    body = parse_profile(toml, where="p").task.body
+    assert body.lidar_x_m == pytest.approx(0.4)
+    assert abs(body.lidar_yaw_rad) == pytest.approx(np.pi, abs=1e-3)
+    assert body.length_m == pytest.approx(0.8)  # a guess, which holds it
+    assert "by the pose in its scans" in toml
+
+
+@ENCODINGS
+def test_poses_are_by_satellite_fixes_where_nothing_else_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
+) -> None:
+    messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
+    for time_s in np.arange(0, 20, 0.2).tolist():
+        messages.append((time_s, "/gps/fix", "foxglove.LocationFix", fix(time_s, 0.02)))
+    path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
+    toml, problems = proposed(path, capsys)
+    assert problems == []
+    assert "fixes of 0.02 m, mostly" in toml
+    profile, steps = read(path, toml)
+    assert profile.inputs.pose is not None
+    assert profile.inputs.pose.topic == "/gps/fix"
+    usable = np.array([problem == "" for problem in steps.problem])
+    radius = SPEED_MPS / YAW_RATE_RADPS
+    x, y = (steps.signals[f"pose_{axis}_m"][usable] for axis in "xy")
+    assert usable.sum() > 150
+    assert np.allclose(np.hypot(x, y - radius), radius, atol=0.02)
+
+
+@ENCODINGS
+def test_goals_and_plans_are_proposed_and_are_no_poses_of_the_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
+) -> None:
+    at = {"timestamp": 0.0, "frame_id": "map"}
+    plan = {**at, "poses": [pose(), pose(2.0, 2.0)]}
+    messages: list[Message] = [
+        (0.0, "/goal_pose", "foxglove.PoseInFrame", {**at, "pose": pose(2.0, 2.0)}),
+        (0.0, "/plan", "foxglove.PosesInFrame", plan),
+        *drive(),
+    ]
+    toml, problems = proposed(write_robot(tmp_path / "run.mcap", encoding, messages), capsys)
+    assert problems == []
+    inputs = parse_profile(toml, where="p").inputs
+    assert inputs.goal is not None
+    assert inputs.plan is not None
+    assert inputs.pose is not None
+    topics = inputs.goal.topic, inputs.plan.topic, inputs.pose.topic
+    assert topics == ("/goal_pose", "/plan", "/pose")
+
+
+def test_a_type_of_ross_name_with_other_fields_is_not_taken_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    TYPES["geometry_msgs/msg/Twist"] = {"speed": "number", "turn": "number"}
+    try:
+        messages = [
+            (time_s, topic, "geometry_msgs/msg/Twist", {"speed": 0.5, "turn": 0.1})
+            if topic == "/cmd_vel"
+            else (time_s, topic, kind, values)
+            for time_s, topic, kind, values in drive(5.0)
+        ]
+        path = write_robot(tmp_path / "run.mcap", "json", messages)
+    finally:
+        del TYPES["geometry_msgs/msg/Twist"]
+    toml, problems = proposed(path, capsys, 3)
+    assert len(problems) == 1
+    assert "no topic for command" in problems[0]
+    assert "name it here" in toml
