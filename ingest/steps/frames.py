@@ -10,7 +10,7 @@ until the next one): it counts from when it was received.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,6 +32,12 @@ FIELDS = (
     "transforms[].child_frame_id",
     *(f"transforms[].transform.{part}" for part in (*AXES, *TURN)),
 )
+_FOXGLOVES = ("timestamp", "parent_frame_id", "child_frame_id", *AXES, *TURN)
+_LAYOUTS = (  # the same fields in as many types: ROS's, foxglove.FrameTransforms, FrameTransform
+    FIELDS,
+    tuple(f"transforms[].{path}" for path in _FOXGLOVES),
+    _FOXGLOVES,
+)
 PARENT = "parent"
 FRAME_ID = "header.frame_id"
 FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
@@ -52,6 +58,11 @@ def frame_id_path(fields: Container[str]) -> str | None:
     return next((path for path in FRAME_IDS if path in fields), None)
 
 
+def transform_fields(fields: Collection[str]) -> tuple[str, ...] | None:
+    """The fields that transforms are in, in the order of `FIELDS`; None where there are none."""
+    return next((layout for layout in _LAYOUTS if set(layout) <= set(fields)), None)
+
+
 @dataclass(frozen=True)
 class Edges:
     """The transforms of a recording, a topic a frame and source, for `align` to put in order."""
@@ -63,7 +74,7 @@ class Edges:
 
     @classmethod
     def of(cls, frames: Frames, topics: Mapping[str, TopicColumns]) -> Edges:
-        """The transforms in these topics' columns (those of `FIELDS`)."""
+        """The transforms in these topics' columns (their `transform_fields`)."""
         edges: dict[str, TopicColumns] = {}
         static, parents, changes = set(), dict[str, list[str]](), 0
         for topic in (frames.static_topic, frames.topic):
@@ -110,19 +121,18 @@ def plain(frame: str) -> str:
 
 def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
     """The transforms of a topic, by the frame that they place."""
-    children = topic.fields["transforms[].child_frame_id"]
-    assert isinstance(children, Ragged)
-    message = np.repeat(np.arange(len(children)), children.lengths)
-
-    def column(path: str) -> NDArray[Any]:
-        values = topic.fields[f"transforms[].{path}"]
-        assert isinstance(values, Ragged)
-        return np.asarray(values.values)
-
-    codes, names = _plain_codes(column("child_frame_id"))
+    layout = transform_fields(topic.fields)
+    assert layout is not None
+    columns = [topic.fields[path] for path in layout]
+    lengths = columns[0].lengths if isinstance(columns[0], Ragged) else np.ones(len(topic), int)
+    message = np.repeat(np.arange(len(lengths)), lengths)
+    stamp, of_parent, of_child, *parts = (
+        np.asarray(one.values if isinstance(one, Ragged) else one) for one in columns
+    )
+    codes, names = _plain_codes(of_child)
     order = np.argsort(codes, kind="stable")
-    stamp, transform = column("header.stamp"), {p: column(f"transform.{p}") for p in (*AXES, *TURN)}
-    parent_codes, parents = _plain_codes(column("header.frame_id"))
+    transform = dict(zip((*AXES, *TURN), parts, strict=True))
+    parent_codes, parents = _plain_codes(of_parent)
     parent = np.array([*parents, None], object)[parent_codes]
     edges = {}
     begins = np.searchsorted(codes[order], np.arange(len(names) + 1))

@@ -24,7 +24,7 @@ from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
-from restock.ingest.steps.frames import FIELDS, frame_path
+from restock.ingest.steps.frames import FIELDS, frame_path, transform_fields
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
@@ -126,7 +126,8 @@ def wanted_fields(
         paths += [aside] if aside else []
     for topic in profile.transform_topics:
         if topic in available:
-            wanted.setdefault(topic, []).extend(FIELDS)
+            has = {leaf.path for leaf in leaves[topic]}
+            wanted.setdefault(topic, []).extend(transform_fields(has) or FIELDS)
     beside = [signal.topic for signal in profile.signals.values()]
     for topic in (*beside, *(camera.topic for camera in profile.cameras.values())):
         if topic in available:
@@ -269,7 +270,7 @@ def _transform_problems(
     others = [
         f"{topic} holds {available[topic].type}, not transforms (frames)"
         for topic in profile.transform_topics
-        if topic in leaves and not set(FIELDS) <= {leaf.path for leaf in leaves[topic]}
+        if topic in leaves and not transform_fields({leaf.path for leaf in leaves[topic]})
     ]
     seen = any(t in available and available[t].expected for t in profile.transform_topics)
     if others or seen or (pose is not None and pose.topic in available):

@@ -161,3 +161,43 @@ def test_a_type_of_ross_name_with_other_fields_is_not_taken_for_it(
     assert len(problems) == 1
     assert "no topic for command" in problems[0]
     assert "name it here" in toml
+
+
+@ENCODINGS
+@pytest.mark.parametrize("together", [True, False])
+def test_poses_and_the_lidars_place_are_by_transforms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str, together: bool
+) -> None:
+    def between(time_s: float, parent: str, child: str, at: tuple[float, ...]) -> dict[str, Any]:
+        where = pose(*at)
+        return {
+            **{"timestamp": time_s, "parent_frame_id": parent, "child_frame_id": child},
+            **{"translation": where["position"], "rotation": where["orientation"]},
+        }
+
+    messages: list[Message] = [one for one in drive() if one[1] in ("/cmd_vel", "/scan")]
+    for time_s in np.arange(0, 20, 0.05).tolist():
+        links = [
+            between(time_s, "map", "odom", (1.0, 0.0)),
+            between(time_s, "odom", "base_link", place(time_s)),
+            between(time_s, "base_link", "laser", (0.2, 0.0, np.pi)),
+        ]
+        if together:
+            messages.append((time_s, "/tf", "foxglove.FrameTransforms", {"transforms": links}))
+        else:
+            messages += [(time_s, "/moves", "foxglove.FrameTransform", one) for one in links]
+    path = write_robot(tmp_path / "run.mcap", encoding, sorted(messages, key=lambda one: one[0]))
+    toml, problems = proposed(path, capsys)
+    assert problems == []
+    profile, steps = read(path, toml)
+    assert profile.frames is not None
+    assert profile.inputs.pose is None
+    assert (profile.frames.fixed, profile.frames.base) == ("map", "base_link")
+    assert profile.frames.topic == ("/tf" if together else "/moves")
+    assert profile.task.body.lidar_x_m == pytest.approx(0.2)
+    assert abs(profile.task.body.lidar_yaw_rad) == pytest.approx(np.pi, abs=1e-3)
+    usable = np.array([problem == "" for problem in steps.problem])
+    assert usable.sum() > 180
+    seconds = (steps.signals["stamp_ns"][usable] - START_NS) * 1e-9
+    expected_m = np.array([place(time_s) for time_s in seconds.tolist()])[:, 0] + 1.0
+    assert np.abs(steps.signals["pose_x_m"][usable] - expected_m).max() < 0.1 * SPEED_MPS

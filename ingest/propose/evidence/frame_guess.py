@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.tables import Frames
 from restock.ingest.propose.evidence.roles import robots_in
-from restock.ingest.steps.frames import FIELDS, Edges, upward
+from restock.ingest.steps.frames import Edges, transform_fields, upward
 from restock.ingest.urdf.description import BASE_FRAMES
 
+FOXGLOVES_TRANSFORMS = ("foxglove.FrameTransform", "foxglove.FrameTransforms")
 FIXED_FRAMES = ("map", "odom", "world")  # best first
 
 
@@ -48,28 +49,32 @@ class FrameGuess:
 
 def transform_topics(recording: Recording) -> tuple[str, str]:
     """The topics of the moving and the static transforms of the robot to propose for: of its own
-    namespace, else `/tf` and `/tf_static`, else of the only namespace that has any."""
+    namespace, else `/tf` and `/tf_static`, else of the only namespace that has any, else the only
+    topic of Foxglove's."""
     names = Frames().topic, Frames().static_topic
     held = {
         end: [name.removesuffix(end) for name in recording.topics if name.endswith(end)]
         for end in names
     }
     for end in names:
-        spaces = [space for space in held[end] if set(FIELDS) <= set(recording.leaves(space + end))]
+        spaces = [space for space in held[end] if transform_fields(recording.leaves(space + end))]
         one = spaces if len(spaces) == 1 else []
         for space in (*robots_in(recording)[:1], "", *one):
             if space in spaces:
                 return space + names[0], space + names[1]
-    return names
+    of_foxglove = [
+        name for name, topic in recording.topics.items() if topic.type in FOXGLOVES_TRANSFORMS
+    ]
+    return (of_foxglove[0], names[1]) if len(of_foxglove) == 1 else names
 
 
 def transform_edges(recording: Recording) -> Edges:
     """The transforms of `transform_topics`; none where it has no such topics."""
     topic, static_topic = transform_topics(recording)
     wanted = {
-        name: list(FIELDS)
+        name: fields
         for name in (topic, static_topic)
-        if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
+        if name in recording.topics and (fields := transform_fields(recording.leaves(name)))
     }
     frames = Frames(topic=topic, static_topic=static_topic)
     return Edges.of(frames, recording.read(wanted) if wanted else {})

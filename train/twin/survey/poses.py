@@ -27,13 +27,13 @@ from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.fixes import fixes_of
 from restock.ingest.steps.frames import (
     AXES,
-    FIELDS,
     FRAME_ID,
     PARENT,
     TURN,
     Edges,
     plain,
     rotations,
+    transform_fields,
 )
 from restock.ingest.task.signals import yaw_of
 
@@ -286,9 +286,9 @@ def mount_of(recording: Recording, sensor: str, base: str) -> tuple[F64, F64] | 
 
 def _edges(recording: Recording, frames: Frames) -> Edges:
     wanted = {
-        name: list(FIELDS)
+        name: fields
         for name in (frames.topic, frames.static_topic)
-        if name in recording.topics and set(FIELDS) <= set(recording.leaves(name))
+        if name in recording.topics and (fields := transform_fields(recording.leaves(name)))
     }
     return Edges.of(frames, recording.read(wanted) if wanted else {})
 
