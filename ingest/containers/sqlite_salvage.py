@@ -50,6 +50,8 @@ class SalvagedSqliteFile:
         self.path, self._copy = path, copy  # a private copy has what a `-wal` file held
         self.integrity: Integrity = "damaged"
         self.damage = [Damage(what)]
+        # By all passes: each finds what others have found, of its own topics.
+        self._unread = Damage("their pages are missing, damaged or too many")
         self.notes, self.extras = list[str](), list[Extra]()
         self.packed: list[Packed] = []
         self.metadata = list[Metadata]()  # what of it is in the file is not looked for
@@ -165,8 +167,11 @@ class SalvagedSqliteFile:
                 yield from ((channel, some.batch()) for channel, some in pending.items())
                 pending, size = {}, 0
         yield from ((channel, some.batch()) for channel, some in pending.items())
-        if lost:
-            self.damage.append(Damage("their pages are missing, damaged or too many", lost))
+        self._unread.messages |= {
+            topic: max(count, self._unread.messages.get(topic, 0)) for topic, count in lost.items()
+        }
+        if lost and self._unread not in self.damage:
+            self.damage.append(self._unread)
 
     def close(self) -> None:
         """Close the file."""
