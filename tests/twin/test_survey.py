@@ -92,6 +92,7 @@ def write_bag(
     scanned: np.ndarray | None = None,
     scanned_from: np.ndarray | None = None,
     scans_late_s: float = 0.0,
+    scan_frame: str = "laser",
     clockwise: bool = False,
 ) -> Path:
     """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own.
@@ -135,7 +136,7 @@ def write_bag(
             for index, at in enumerate(poses if scanned_from is None else scanned_from):
                 stamp_ns = 10**9 + index * 2 * 10**8
                 message = T[kind](
-                    header=header(stamp_ns + int(scans_late_s * 1e9), "laser"),
+                    header=header(stamp_ns + int(scans_late_s * 1e9), scan_frame),
                     angle_min=np.pi if clockwise else -np.pi,
                     angle_max=-np.pi if clockwise else np.pi,
                     angle_increment=2 * np.pi / (-120 if clockwise else 120),
@@ -163,12 +164,15 @@ def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
     return ranges.astype(np.float32)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 1.5])
+@pytest.mark.parametrize(
+    ("late_s", "frame"), [(0.0, "laser"), (1.5, "laser"), (0.0, "base_link"), (0.0, "/base_scan")]
+)
 def test_scans_make_the_map_that_was_scanned_by_the_clock_that_fits(
-    tmp_path: Path, late_s: float
+    tmp_path: Path, late_s: float, frame: str
 ) -> None:
     known = OccupancyGrid(hall(), CELL_M)
-    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=hall(), scans_late_s=late_s)
+    scans: dict[str, Any] = {"scanned": hall(), "scans_late_s": late_s, "scan_frame": frame}
+    bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, **scans)
     made = survey(bag, by="scans", footprint=parse_footprint("0.4x0.4"))
     assert f"by {'log time' if late_s else 'header stamps'}" in made.source
     assert made.agreement is not None

@@ -271,11 +271,13 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
 
 def mount_of(recording: Recording, sensor: str, base: str) -> tuple[F64, F64] | None:
     """Rotation (3, 3) and place (3,) of a sensor's frame in the base's, or None if unknown."""
+    turn, place = np.eye(3), np.zeros(3)
+    if plain(sensor) == plain(base):
+        return turn, place
     edges = _edges(recording, Frames(fixed=base, base=sensor)) if sensor else None
     chain = [] if edges is None else chain_between(edges, sensor, base)
-    if edges is None or (not chain and plain(sensor) != plain(base)):
+    if edges is None or not chain:
         return None
-    turn, place = np.eye(3), np.zeros(3)
     for name in chain:
         fields = edges.topics[name].fields
         step = rotations(*(np.asarray(fields[part], np.float64)[-1:] for part in TURN))[0]

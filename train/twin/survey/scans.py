@@ -8,18 +8,20 @@ taken where it stood. Beams without a return say nothing, whether they are inf, 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.roles import KINDS, topics_for, usable_topics
+from restock.ingest.propose.evidence.lidars import SeenScans, scans_of
+from restock.ingest.propose.evidence.roles import KINDS, Kind, topics_for, usable_topics
+from restock.ingest.steps.clearance import angle_keys
 from restock.ingest.steps.clocks import STAMP
-from restock.ingest.steps.frames import FRAME_ID
 from restock.ingest.urdf.description import BASE_FRAMES
 from restock.train.twin.survey.poses import Poses, Times, mount_of, shared_clock
 
@@ -27,8 +29,7 @@ BEAMS = 360  # at most, of a scan: more are thinned out
 SCANS = 3000  # at most, of a recording
 MOVED_M, TURNED_RAD, WAITED_S = 0.05, 0.05, 2.0  # since the scan before: else it is left out
 FAST_RADPS = 0.6  # turning
-_RANGES = "ranges"
-_NUMBERS = ("angle_min", "angle_increment", "range_min", "range_max")
+_LIMITS = ("range_min", "range_max")  # where scans have them
 
 
 @dataclass(frozen=True)
@@ -51,24 +52,29 @@ def placed_scans(
     """The scans of a recording's lidar, put by each clock that they share with the poses: header
     stamps first, and log time, as the clocks of two computers may be apart. Empty where it has no
     scans, or none that can be placed."""
-    topic = _topic(recording, profile)
-    if topic is None:
+    fit = _topic(recording, profile)
+    if fit is None:
         return []
-    leaves = set(recording.leaves(topic))
-    paths = [path for path in (*_NUMBERS, STAMP, FRAME_ID) if path in leaves]
-    if not {_RANGES, "angle_min", "angle_increment"} <= leaves:
+    topic, kind = fit[0].name, fit[1]
+    leaves, ranges = set(recording.leaves(topic)), kind.fields["ranges_m"]
+    angles = [kind.fields[key] for key in angle_keys(kind.fields)]
+    if not {ranges, *angles} <= leaves:
         return []
-    read = recording.read({topic: paths}, {topic: Reduction((_RANGES,), _thinned)})
+    paths = [path for path in (*angles, *_LIMITS, STAMP) if path in leaves]
+    read = recording.read({topic: paths}, {topic: Reduction((ranges,), partial(_thinned, ranges))})
     columns = read.get(topic)
     if columns is None or not len(columns):
         return []
     notes: list[str] = []
-    frames = np.asarray(columns.fields.get(FRAME_ID, [""]), object)
-    turn, place = _mount(recording, str(frames[-1]), profile, footprint, notes)
+    seen = scans_of(recording, [fit])[topic]
+    turn, place = _mount(recording, seen, profile, footprint, notes)
+    first, last = (np.asarray(columns.fields[path], np.float64) for path in angles)
+    if "angle_max_rad" in kind.fields:  # of so many beams
+        last = (last - first) / np.maximum(np.asarray(columns.fields["count"]) - 1, 1)
     times = Times.of(columns)
     clocks = [True, False] if shared_clock(poses.times, times) else [False]
     placed = [
-        _placed(columns, poses, topic, (turn, place), notes, by_stamp=by_stamp)
+        _placed(columns, poses, topic, (turn, place), (first, last), notes, by_stamp=by_stamp)
         for by_stamp in clocks
     ]
     return [scans for scans in placed if len(scans)]
@@ -79,17 +85,19 @@ def _placed(
     poses: Poses,
     topic: str,
     mount: tuple[F64, F64],
+    bearings: tuple[F64, F64],
     notes: list[str],
     *,
     by_stamp: bool,
 ) -> PlacedScans:
-    """The scans of a topic where the poses were by one clock."""
+    """The scans of a topic where the poses were by one clock; `bearings` (N,) of each first beam,
+    and from each beam to the next."""
     times, (turn, place), notes = Times.of(columns), mount, list(notes)
     pose, known = poses.at(times, by_stamp=by_stamp)
     chosen = _keyframes(pose, known, times.log_ns, topic, notes)
     numbers = {
         name: np.asarray(columns.fields[name], np.float64)
-        for name in _NUMBERS
+        for name in _LIMITS
         if name in columns.fields
     }
     ranges, beams = columns.fields["thinned"], columns.fields["beams"]
@@ -102,7 +110,7 @@ def _placed(
         good = np.isfinite(reach) & (reach > max(low, 0.02))
         good &= reach < (high if high > 0 else np.inf)
         reach, beam = reach[good], beam[good]
-        bearing = numbers["angle_min"][row] + beam * numbers["angle_increment"][row]
+        bearing = bearings[0][row] + beam * bearings[1][row]
         own = np.stack([reach * np.cos(bearing), reach * np.sin(bearing), 0 * reach], axis=-1)
         body = own @ turn.T + place
         cos, sin = np.cos(pose[row, 2]), np.sin(pose[row, 2])
@@ -114,44 +122,54 @@ def _placed(
     return PlacedScans(origins, hits, order, f"scans of {topic} by {clock}", notes)
 
 
-def _topic(recording: Recording, profile: Profile | None) -> str | None:
+def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Kind] | None:
+    """The topic of the lidar's scans, and their fields."""
     if profile is not None:
         scan = profile.inputs.scan
         named = None if scan is None else recording.topics.get(scan.topic)
-        return named.name if named is not None and named.expected and not named.skipped else None
-    usable = usable_topics(recording)
-    found = [topic.name for topic, _ in topics_for(recording, usable, KINDS["scan"])]
-    return min(found, key=lambda name: "fake" in name or "sim" in name, default=None)
+        if scan is None or named is None or not named.expected or named.skipped:
+            return None
+        origin = next((kind.origin for kind in KINDS["scan"] if kind.type == scan.type), "")
+        return named, Kind(scan.type, scan.fields, origin=origin)
+    found = topics_for(recording, usable_topics(recording), KINDS["scan"])
+    return min(found, key=lambda fit: "fake" in fit[0].name or "sim" in fit[0].name, default=None)
 
 
-def _thinned(fields: Fields) -> dict[str, FieldColumn]:
-    """Ranges of at most BEAMS beams a scan, and which beams they are."""
-    ranges = fields[_RANGES]
+def _thinned(path: str, fields: Fields) -> dict[str, FieldColumn]:
+    """Ranges of at most BEAMS beams a scan, which beams they are, and of how many."""
+    ranges = fields[path]
     rows = [np.asarray(ranges[row], np.float32).ravel() for row in range(len(ranges))]
     kept = [np.arange(0, len(row), max(len(row) // BEAMS, 1)) for row in rows]
     offsets = offsets_of(np.array([len(beams) for beams in kept], np.int64))
     none = np.zeros(0, np.float32)
     values = np.concatenate([none, *(row[beams] for row, beams in zip(rows, kept, strict=True))])
     beams = np.concatenate([np.zeros(0, np.int32), *(one.astype(np.int32) for one in kept)])
-    return {"thinned": Ragged(values, offsets), "beams": Ragged(beams, offsets)}
+    count = np.array([len(row) for row in rows], np.int64)
+    return {
+        "thinned": Ragged(values, offsets),
+        "beams": Ragged(beams, offsets),
+        "count": count,
+    }
 
 
 def _mount(
     recording: Recording,
-    frame: str,
+    seen: SeenScans,
     profile: Profile | None,
     footprint: Footprint | None,
     notes: list[str],
 ) -> tuple[F64, F64]:
     """How the lidar sits on the robot: rotation (3, 3) and place (3,)."""
+    frame = seen.frame
+    in_frame, moved = _turn(seen.origin[2]), np.array([*seen.origin[:2], 0.0])
     over = np.diag([1.0, -1.0, -1.0])
     scan = None if profile is None else profile.inputs.scan
     bases = [profile.frames.base] if profile is not None and profile.frames is not None else []
     for base in (*bases, *BASE_FRAMES):
         if found := mount_of(recording, frame, base):
-            turn, place = found
+            place, turn = found[0] @ moved + found[1], found[0] @ in_frame
             if scan is None or scan.upside_down == (turn[2, 2] < 0):
-                return found
+                return turn, place
             way = "upside down" if scan.upside_down else "upright"
             notes.append(f"the lidar is {way} by inputs.scan of the profile, and not by {frame}")
             return turn @ over, place
@@ -169,11 +187,15 @@ def _mount(
             "the position of the lidar is not known: it is assumed to be in the robot's middle, "
             "facing ahead"
         )
-    cos, sin = np.cos(yaw or 0.0), np.sin(yaw or 0.0)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    turn = _turn(yaw or 0.0)
     if scan is not None and scan.upside_down:
         turn = turn @ over
     return turn, np.array([ahead or 0.0, left, 0.0])
+
+
+def _turn(yaw_rad: float) -> F64:
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _keyframes(pose: F64, known: Bools, log_ns: Ints, topic: str, notes: list[str]) -> Ints:
