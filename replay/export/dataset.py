@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import StoreError
-from restock.files import building
+from restock.files import building, expect_place
 from restock.imports import install_command, installed
 from restock.ingest.store.version import Version
 from restock.replay.export.card import Contents, card, check_license
@@ -91,6 +91,7 @@ def export_dataset(
         raise StoreError(f"the format {to} is a file that ends in {ending}", where=str(out))
     if out.exists():
         raise StoreError("already there", where=str(out), remedy="choose another name")
+    expect_place(out, StoreError)
     counts = Counts()
     write = getattr(importlib.import_module(f"restock.replay.export.{module}"), f"write_{to}")
     with open_selection(

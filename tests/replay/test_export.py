@@ -504,6 +504,16 @@ def test_a_panel_has_no_commands_but_its_store_has(store_path: Path, tmp_path: P
     assert document["provenance"]["panel"] == panel.id
 
 
+def test_nothing_is_exported_into_a_store(
+    store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(store_path.rglob("*"))
+    for out in (store_path / "a.npz", store_path / "transitions" / "a.npz"):
+        assert cli.main(["export", str(store_path), "--to", "npz", "--out", str(out)]) == 2
+        assert f"is within the store {store_path}" in " ".join(capsys.readouterr().err.split())
+    assert sorted(store_path.rglob("*")) == before
+
+
 def test_the_verb_says_what_it_wrote(
     store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -522,6 +522,38 @@ def test_the_verb_explains_then_packs_and_never_overwrites(
     assert "no --out" in capsys.readouterr().err
 
 
+def test_the_verb_says_what_replays_are_counted_over(
+    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["mix", str(store_path), "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert "how often each would be drawn in 20,000 updates of 128 rows" in text
+    assert "draws no row more than 400 times (max_replays_per_row)" in text
+    (tmp_path / "m.toml").write_text("[planned]\nupdates = 100\n[sources]\nlogs = 1\n" + EVERY)
+    asked = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
+    assert cli.main(asked) == 0
+    text = capsys.readouterr().out
+    assert "drawn in 100 updates of 128 rows" in text
+    assert "max_replays_per_row" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["STORE", "--verify", "PANEL"], "the store has no effect with --verify"),
+        (["STORE", "--schema"], "the store has no effect with --schema"),
+        (["--verify", "PANEL", "--out", "x"], "--out: has no effect with --verify"),
+        (["--schema", "--verify", "PANEL"], "--verify: has no effect with --schema"),
+    ],
+)
+def test_what_the_verb_would_not_read_is_refused(
+    store_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    paths = {"STORE": str(store_path), "PANEL": "panel"}
+    assert cli.main(["mix", *(paths.get(word, word) for word in words)]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_same_store_and_mixture_give_the_same_bytes(
     transitions: pa.Table, tmp_path: Path
 ) -> None:

@@ -61,12 +61,21 @@ class MixCommand:
     def run(self) -> None:
         """Plan, and unless it is a dry run, pack."""
         from restock.cli import output
+        from restock.cli.command_line import refuse
         from restock.ingest.store.version import given_version
         from restock.replay.mixture.mixture import load_mixture, shipped_schema
         from restock.replay.panel.build import check_free, open_source, write_panel
         from restock.replay.plan.plan import plan_panel
         from restock.replay.store.store import Store
 
+        if self.schema or self.verify is not None:
+            alone = "--schema" if self.schema else "--verify"
+            why, remedy = f"has no effect with {alone}", "leave out one of them"
+            if self.store is not None:
+                raise MixtureError(f"the store {why}", where=self.store, remedy=remedy)
+            other = ("verify", "json") if self.schema else ()
+            planning = ("mixture", "out", "dry_run", "force", "version", "memory_limit", *other)
+            refuse(self, planning, why, remedy=remedy)
         if self.schema:
             sys.stdout.write(shipped_schema())
             return
@@ -154,6 +163,7 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
         },
         "warnings": list(plan.warnings),
         "planned_draws": plan.mixture.planned.updates * plan.mixture.planned.batch_size,
+        "planned": msgspec.structs.asdict(plan.mixture.planned),
         "max_replays_per_row": plan.mixture.max_replays_per_row,
         "schedules": {
             name: msgspec.to_builtins(part)
@@ -246,12 +256,18 @@ def _summary(document: dict[str, Any]) -> list[str]:
         for store in document["other_stores"]
     )
     left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
-    draws = f"replays a row are over the {document['planned_draws']:,} draws of [planned]"
-    if document["max_replays_per_row"] is not None:
-        draws += f" (limit {document['max_replays_per_row']:g}); a run uses its own"
+    updates, batch_size = (document["planned"][key] for key in ("updates", "batch_size"))
+    draws = [
+        f"replays a row: how often each would be drawn in {updates:,} updates of {batch_size:,}"
+        " rows ([planned]: set it to what you train)"
+    ]
+    if (most := document["max_replays_per_row"]) is not None:
+        draws.append(
+            f"a run counts its own, and draws no row more than {most:g} times (max_replays_per_row)"
+        )
     moving = " on average" if document["schedules"] else ""
     lines += [
-        draws,
+        *draws,
         f"{document['rows']:,} rows of store version {document['store_version']}{others};"
         f" not in the panel: {left_out or 'none'}",
         f"{document['logs_share']:.1%} of a batch{moving} from the logs, worth"
