@@ -156,6 +156,15 @@ def test_what_the_user_gave_is_neither_removed_nor_mistyped_at_the_earlier_demos
     assert (out / "mine.mcap").read_text() == "precious"
 
 
+@pytest.mark.parametrize("given", [("--seconds", "0"), ("--seconds", "nan"), ("--episodes", "0")])
+def test_a_demo_that_could_not_end_does_not_begin(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, str]
+) -> None:
+    assert cli.main(["demo", "--out", str(tmp_path / "out"), *given]) == 2
+    assert capsys.readouterr().err.startswith(f"restock: {given[0]}: must be")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_name_in_brackets_is_said_as_it_is() -> None:
     said: list[str] = []
     run_demo([Stage("info", "", "", ["info", "a[old].mcap"])], lambda command: 0, say=said.append)

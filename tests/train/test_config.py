@@ -9,6 +9,7 @@ import gymnasium
 import msgspec
 import pytest
 
+from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, load_config, parse_config
@@ -82,14 +83,34 @@ def test_a_setting_of_the_other_target_rule_says_which_rule_has_it(
         load_config(None, overrides)
 
 
-def test_what_is_wrong_is_looked_for_in_the_file_and_in_the_options(tmp_path: Path) -> None:
+def test_what_is_wrong_is_said_of_the_file_or_of_the_options(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("seed = 1\n")
-    with pytest.raises(ConfigError, match=r"a\.toml and --set: seed must be in"):
+    with pytest.raises(ConfigError, match=r"^--set: seed must be in"):
         load_config(file, ["seed=-1"])
     file.write_text("seed = -1\n")
-    with pytest.raises(ConfigError, match=r"a\.toml: seed must be in"):
-        load_config(file)
+    for overrides in ([], ["device=cpu"]):
+        with pytest.raises(ConfigError, match=r"a\.toml: seed must be in"):
+            load_config(file, overrides)
+    file.write_text('[target]\nrule = "hard"\n')
+    with pytest.raises(ConfigError, match=r"a\.toml and --set: `target\.tau` is a setting of"):
+        load_config(file, ["target.tau=0.1"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--seconds", "-1"], "--seconds: schedule.seconds must be above 0, got -1"),
+        (["--seed", "-1"], "--seed: seed must be in [0, 2147483647], got -1"),
+        (["--env-steps", "-1"], "--env-steps: schedule.env_steps must be at least 0, got -1"),
+        (["--set", "seed=-1"], "--set: seed must be in [0, 2147483647], got -1"),
+    ],
+)
+def test_the_option_that_is_wrong_is_named_as_it_was_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    assert main(["train", "--out", str(tmp_path / "run"), *words]) == 2
+    assert capsys.readouterr().err.startswith(f"restock: {said}")
 
 
 @pytest.mark.parametrize(

@@ -294,14 +294,16 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
     Raises:
         ConfigError: no such file, no TOML, an unknown key or a value out of range; names the key.
     """
-    document: dict[str, Any] = {}
-    if path is not None:
-        document = read_toml(path, remedy="give the path of a TOML file with --config")
-    document = apply_overrides(document, overrides)
-    places = ([] if path is None else [str(path)]) + (
-        ["--set"] if overrides or path is None else []
-    )
-    return parse_config(document, where=" and ".join(places))
+    if path is None:
+        return parse_config(apply_overrides({}, overrides), where="--set")
+    document = read_toml(path, remedy="give the path of a TOML file with --config")
+    applied = apply_overrides(document, overrides)
+    try:
+        return parse_config(applied, where=f"{path} and --set")
+    except ConfigError:  # one of the two alone, or what they say together
+        parse_config(document, where=str(path))
+        parse_config(apply_overrides({}, overrides), where="--set")
+        raise
 
 
 def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

@@ -69,6 +69,7 @@ class TrainCommand:
     def run(self) -> int:
         from restock.cli.output import print_json
         from restock.errors import RestockError
+        from restock.train.dqn.config import apply_overrides, parse_config
         from restock.train.prepare import prepare_new, prepare_resumed
 
         if self.flush_fresh is not None:  # refused before the training, not after it
@@ -81,9 +82,11 @@ class TrainCommand:
             "seed": self.seed,
             "device": self.device,
         }
-        overrides = self.set + [
-            f"{key}={value}" for key, value in given.items() if value is not None
-        ]
+        options = {key: f"{key}={value}" for key, value in given.items() if value is not None}
+        for key, override in options.items():
+            option = key.rpartition(".")[2].replace("_", "-")
+            parse_config(apply_overrides({}, [override]), where=f"--{option}")
+        overrides = [*self.set, *options.values()]
         if self.resume is not None:
             if self.out or self.panel or self.config or self.set or self.seed is not None:
                 raise RestockError(

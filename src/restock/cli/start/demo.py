@@ -6,6 +6,7 @@ a user could type; the demo runs the very same code.
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -22,7 +23,7 @@ from restock.cli.start import stages, story
 from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Stage
 from restock.cli.start.work import escape
-from restock.errors import ExitCode, RestockError
+from restock.errors import ConfigError, ExitCode, RestockError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -69,6 +70,10 @@ class DemoCommand:
         from restock.cli import main
         from restock.cli.output import print_json, stdout
 
+        if not 0 < self.seconds < math.inf:
+            raise ConfigError(f"must be a number above 0, got {self.seconds:g}", where="--seconds")
+        if self.episodes < 1:
+            raise ConfigError(f"must be at least 1, got {self.episodes}", where="--episodes")
         logs = self.logs or find_logs()
         plan = []
         if logs is None:
