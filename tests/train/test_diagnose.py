@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -307,6 +308,27 @@ def test_the_verb_says_what_it_saw(tmp_path: Path, capsys: pytest.CaptureFixture
     document = json.loads(capsys.readouterr().out)
     assert (document["cause"], document["confirmation"]) == ("BUFFER", None)
     assert len(document["runs"][0]["windows"]) == 4
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_its_table_breaks_no_word_in_80_columns(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    seeds: int,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = [f"runs/policy-{seed}" for seed in range(seeds)]
+    for seed, name in enumerate(given):
+        make_run(Path(name), windows=2, seed=seed)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["diagnose", *given]) == 0
+    table = capsys.readouterr().out.partition("\nUNDETERMINED\n")[0].split("\n", 1)[1]
+    assert max(map(len, table.splitlines())) <= 80
+    words = {*CONDITIONS, "agreement", "unexplained", "median", "supply"}
+    assert words | (set(given) | {"UNDETERMINED"} if seeds > 1 else set()) <= set(table.split())
 
 
 def test_what_cannot_be_diagnosed_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

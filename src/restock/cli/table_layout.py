@@ -42,7 +42,7 @@ class Layout:
         """As it is where it fits; closer, and with wrapped headers, where not."""
         texts = [[cell(row[name]) for row in rows] for name in names]
         lines = [[line for text in some for line in text.split("\n")] for some in texts]
-        full = [_longest([name, *some]) for name, some in zip(names, lines, strict=True)]
+        full = [_longest([*n.split("\n"), *some]) for n, some in zip(names, lines, strict=True)]
         width -= 2  # its edges
         if sum(full) + FAR * (len(names) - 1) <= width:
             return cls(FAR, list(names), [None] * len(names))
@@ -99,6 +99,8 @@ def _filled(least: Sequence[int], full: Sequence[int], room: int) -> list[int]:
 
 def _parted(name: str, width: int) -> str:
     """A header as lines, parted at underscores and spaces; no narrower than its longest part."""
+    if "\n" in name:
+        return "\n".join(_parted(line, width) for line in name.split("\n"))
     parts = re.findall(r"[^_ ]+[_ ]*|[_ ]+", name)
     width = max([width, *(len(part.rstrip()) for part in parts)])
     lines = [""]

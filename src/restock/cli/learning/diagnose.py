@@ -142,24 +142,26 @@ class DiagnoseCommand:
 
 
 def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
-    from restock.cli.output import print_table, stdout
+    from restock.cli.output import print_parted, stdout
 
-    print_table(
+    several = len(paths) > 1  # a verdict of one is said below
+    print_parted(
         [
             {
-                "run": str(path),
-                "verdict": cause,
+                **({"run": str(path)} if several else {}),
                 "condition": symptom.condition,
-                "share of replay": symptom.replay_share,
+                **({"verdict": cause} if several else {}),
+                "share of\nreplay": symptom.replay_share,
                 "supply": symptom.supply,
                 "agreement": symptom.agreement,
                 "unexplained": symptom.unexplained,
                 "G": symptom.gap,
-                "G / median": figures.relative(symptom),
+                "G /\nmedian": figures.relative(symptom),
             }
             for path, cause, figures in zip(paths, diagnosis.runs, diagnosis.figures, strict=True)
             for symptom in figures.symptoms
         ],
+        key=("run", "condition") if several else ("condition",),
         title="supply: share of replay / of what driving meets; agreement: logged rows that look"
         " like it; unexplained: of their next observations; G: |TD| held out / in replay",
     )
@@ -172,7 +174,7 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
 
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
-    from restock.cli.output import print_table, stdout
+    from restock.cli.output import print_parted, stdout
     from restock.train.diagnosis.gap_evidence import CHECK
 
     named = {check for one in diagnosis.findings for check in one.evidence}
@@ -183,7 +185,7 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
         or (row.status in ("off", "undecided") and not row.check.startswith(CHECK))
     ]
     if chosen:
-        print_table(
+        print_parted(
             [
                 {
                     "check": row.check,
@@ -199,6 +201,7 @@ def _show_rows(diagnosis: RowDiagnosis) -> None:
                 }
                 for row in chosen
             ],
+            key=("check",),
             title="findings beyond their limit, with 95 % intervals over episodes",
         )
     out, about = stdout(), diagnosis.about
