@@ -13,6 +13,12 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {plural(number, noun)}"
 
 
+def verdict_said(verdict: str, *, decides: bool) -> str:
+    """Of a check of what two runs were fed: where it does not decide, a difference is allowed."""
+    allowed = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
+    return verdict if decides else allowed.get(verdict, verdict)
+
+
 def between(text: str, begin: str, end: str, written: str) -> str:
     """A page's text with what is `written` between two of its markers, in place of what was."""
     before, rest = text.split(begin, 1)

@@ -161,7 +161,9 @@ def test_a_run_against_itself_is_comparable_by_identity(tmp_path, capsys) -> Non
     assert (found["verdict"], found["identical"]) == ("comparable", True)
     assert {row["difference"] for row in found["outcomes"]} == {0.0}
     assert main(["compare", run, str(Path(run) / ".." / Path(run).name)]) == 0
-    assert "COMPARABLE: both sides are the same runs" in " ".join(capsys.readouterr().err.split())
+    shown = capsys.readouterr()
+    assert "COMPARABLE: both sides are the same runs" in " ".join(shown.err.split())
+    assert "inconclusive" not in shown.out
 
 
 @pytest.mark.parametrize(
@@ -193,6 +195,30 @@ def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, epis
     page = as_markdown(study)
     assert "| -1.00 |" in page
     assert "**" not in page
+
+
+def test_what_the_treatment_allows_to_differ_is_shown_as_that(tmp_path, capsys) -> None:
+    first = arm(tmp_path, "a", range(1), fresh_episodes=400)
+    second = arm(tmp_path, "b", range(1, 2), slip_share=0.15, fresh_episodes=400)
+    code, found = compared(capsys, first, second, "--treatment", "mixture")
+    decides = {check["name"]: check["decides"] for check in found["checks"]}
+    assert code == 0
+    assert (decides["updates"], decides["mix"]) == (True, False)
+    page = tmp_path / "page.html"
+    asked = ["compare", *first, *second, "--treatment", "mixture"]
+    assert main([*asked, "--page", str(page)]) == 0
+    shown = capsys.readouterr()
+    assert "COMPARABLE" in shown.err
+    for text in (shown.out, page.read_text(encoding="utf-8")):
+        assert "differs: allowed" in text
+        assert "may differ: allowed" in text
+        assert ">inconclusive" not in text
+        assert "inconclusive\n" not in text
+    # Refused for its length: the page names that, not the feed, which may differ.
+    short = [str(make_run(tmp_path / "s", document(1), updates=UPDATES // 2, slip_share=0.15))]
+    asked = ["compare", *first, *short, "--treatment", "mixture", "--page", str(page)]
+    assert main(asked) == 1
+    assert "fed differently (updates)" in page.read_text(encoding="utf-8")
 
 
 def test_people_read_what_differs_and_why_it_is_refused(tmp_path, capsys) -> None:

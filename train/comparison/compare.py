@@ -65,10 +65,11 @@ class Comparison:
     @property
     def deciding_checks(self) -> list[Check]:
         """The checks that the verdict is made of: of the feed too, unless it is the treatment."""
-        return _deciding(self.treatment, self.totals, self.checks)
+        return [] if self.identical else _deciding(self.treatment, self.totals, self.checks)
 
     def as_json(self) -> dict[str, Any]:
         """All of it."""
+        deciding = self.deciding_checks
         return {
             "treatment": self.treatment,
             "verdict": self.verdict,
@@ -76,7 +77,8 @@ class Comparison:
             "refused": [difference.setting for difference in self.refused],
             "differences": [asdict(difference) for difference in self.differences],
             "checks": [
-                {**asdict(check), "verdict": check.verdict} for check in self.totals + self.checks
+                {**asdict(check), "verdict": check.verdict, "decides": check in deciding}
+                for check in self.totals + self.checks
             ],
             "outcomes_from": self.source,
             "outcomes": self.rows,

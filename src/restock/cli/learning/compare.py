@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from restock.train.comparison.comparability import Check
     from restock.train.comparison.compare import Comparison
 
 
@@ -121,7 +122,10 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
         ]
         print_table(rows, title=f"what differs (treatment: {comparison.treatment})")
     checks = comparison.totals + comparison.checks
+    deciding = comparison.deciding_checks
     shown = checks if all_checks else [c for c in checks if c.verdict != "comparable"]
+    if comparison.identical and not all_checks:
+        shown = []  # too few episodes show nothing of what is the same in any case
     if shown:
         treated = {
             "mixture": " (the treatment: shown, not compared)",
@@ -129,7 +133,10 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
             "data": " (the treatment: shown, not compared)",
             "practice": " (of fresh rows it is the treatment: shown, not compared)",
         }.get(comparison.treatment, "")
-        print_table([_check(check) for check in shown], title=f"what was fed{treated}")
+        print_table(
+            [_check(check, decides=check in deciding) for check in shown],
+            title=f"what was fed{treated}",
+        )
     say(_sentence(comparison))
     if comparison.rows:
         of = (
@@ -146,7 +153,9 @@ def _show(comparison: Comparison, all_checks: bool) -> None:
                 say(f"no interval: {reason}")
 
 
-def _check(check: Any) -> dict[str, Any]:
+def _check(check: Check, *, decides: bool) -> dict[str, Any]:
+    from restock.words import verdict_said
+
     return {
         "check": check.name,
         "of": check.part,
@@ -155,7 +164,7 @@ def _check(check: Any) -> dict[str, Any]:
         "value": check.value,
         "interval": f"{check.low:.3g} to {check.high:.3g}",
         "limit": check.limit,
-        "": check.verdict,
+        "": verdict_said(check.verdict, decides=decides),
     }
 
 

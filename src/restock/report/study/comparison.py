@@ -9,7 +9,7 @@ from restock import __version__
 from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
 from restock.report.study import charts
 from restock.stats import LEAST_PAIRS, interval_text
-from restock.words import counted
+from restock.words import counted, verdict_said
 
 MOST_NAMED = 3
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
@@ -84,7 +84,11 @@ def why_refused(found: dict[str, Any]) -> str:
         return str(found["why"])
     if found["refused"]:
         return f"they differ in {', '.join(found['refused'])}, which is not the treatment"
-    names = [words(c["name"]) for c in found["checks"] if c["verdict"] == found["verdict"]]
+    names = [
+        words(check["name"])
+        for check in found["checks"]
+        if check["verdict"] == found["verdict"] and check.get("decides", True)
+    ]
     shown = ", ".join(list(dict.fromkeys(names))[:MOST_NAMED])
     if found["verdict"] == "inconclusive":
         return f"too few episodes or seeds to show that they were fed the same ({shown})"
@@ -208,18 +212,22 @@ def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
         {
             "check": words(row["name"]),
             "part": words(row["part"]),
-            "verdict": row["verdict"],
+            "verdict": verdict_said(row["verdict"], decides=row.get("decides", True)),
             "value": number(row["value"]),
             "95 %": _ends(row["low"], row["high"]),
             "limit": f"{row['limit']:g}",
         }
-        for row in sorted(found["checks"], key=lambda row: order[row["verdict"]])
+        for row in sorted(
+            found["checks"],
+            key=lambda row: (not row.get("decides", True), order[row["verdict"]]),
+        )
     ]
     return Section(
         "gate",
         "The checks of the gate",
         intro=f"Compared: the {found['treatment']}. Everything else must be the same: settings, "
-        "and what the critics were fed, by equivalence tests. Failed checks come first.",
+        "and what the critics were fed, by equivalence tests. Failed checks come first; what the "
+        "treatment allows to differ is shown last, and decides nothing.",
         tables=[
             Table(differences, title="What differs"),
             Table(checks, {"value", "95 %", "limit"}, title="What was fed", folded=True),
