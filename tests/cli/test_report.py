@@ -39,6 +39,7 @@ from restock.report.run.headline import headline
 from restock.report.run.page import page
 from restock.report.run.sections import success
 from restock.report.run.ways import ways_section
+from restock.report.study.charts import colours
 from restock.stats import ConfidenceInterval
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
@@ -298,6 +299,23 @@ def test_a_policy_has_one_colour_in_all_charts(html: str) -> None:
     planner = [colours["planner"] for colours in told if "planner" in colours]
     assert len(planner) >= 4  # success and behaviour, each at several widths
     assert set(planner) == {POLICY_COLOURS["planner"]}
+
+
+def test_references_have_the_colours_of_reports_on_the_page_of_a_study() -> None:
+    arms = [f"arm {number}" for number in range(6)]
+    alone, beside = colours(arms), colours([*arms, "planner", "operator"])
+    assert {name: beside[name] for name in arms} == alone  # in every chart of a page
+    assert len(set(beside.values())) == 8
+    for name in ("planner", "operator"):
+        assert beside[name] == POLICY_COLOURS[name]
+
+
+def test_nought_on_an_axis_of_thousands_is_nought() -> None:
+    rows = [{"env_steps": n, "success": 0.5, "who": "agent"} for n in (0, 200_000)]
+    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success")
+    texts = [one.text for one in ElementTree.fromstring(drawn.svg[470]).iter() if one.text]
+    assert {"0", "100k"} <= set(texts)
+    assert "0k" not in texts
 
 
 def test_names_that_begin_alike_are_told_apart_in_a_legend() -> None:

@@ -216,7 +216,7 @@ def _weeks(rows: Rows, colours: dict[str, str]) -> Section | None:
             .mark_bar()
             .encode(
                 x=alt.X("week:O", title=None, axis=alt.Axis(labelAngle=-60, grid=False)),
-                y=alt.Y("rows:Q", title="rows", axis=alt.Axis(format="~s")),
+                y=alt.Y("rows:Q", title="rows", axis=alt.Axis(labelExpr=charts.SHORT_NUMBERS)),
                 color=charts.coloured("condition", names, colours, width),
             )
             .properties(height=200)

@@ -42,12 +42,14 @@ POLICY_COLOURS = {
     "agent": "#0f766e",
     "cloned": "#7c3aed",
     "planner": "#b45309",
+    "operator": "#2563eb",
     "random": "#9ca3af",
 }
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # of a line, with which each is drawn
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
+SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, nought is 0k
 LETTER_PX = 5.8  # of a label, about
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
 
@@ -284,7 +286,7 @@ def lines(
 
 def x_axis(width: int) -> alt.Axis:
     """A horizontal axis of steps, with no more labels than fit."""
-    return alt.Axis(format="~s", grid=False, tickCount=max(3, width // 80))
+    return alt.Axis(labelExpr=SHORT_NUMBERS, grid=False, tickCount=max(3, width // 80))
 
 
 def ages(rows: Sequence[Row]) -> Drawing:

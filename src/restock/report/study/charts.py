@@ -12,16 +12,21 @@ import altair as alt
 
 from restock.report.look import charts
 from restock.report.look.blocks import Drawing, Rows, words
+from restock.report.look.charts import POLICY_COLOURS
 
-ARM_COLOURS = ("#0f766e", "#b45309", "#7c3aed", "#0072b2", "#cc79a7", "#84643a", "#6b7280")
+# None of them is a reference's: the planner and the operator are as in every report.
+ARM_COLOURS = ("#0f766e", "#7c3aed", "#cc79a7", "#84643a", "#56b4e9", "#009e73", "#6b7280")
 _PERCENT = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
 _SHARE = alt.Scale(domain=[0, 1])
 _QUIET = alt.Axis(grid=False, ticks=False)
 
 
 def colours(arms: list[str]) -> dict[str, str]:
-    """A colour an arm, the same in every chart of a page."""
-    return {arm: ARM_COLOURS[place % len(ARM_COLOURS)] for place, arm in enumerate(arms)}
+    """A colour an arm, the same in every chart of a page; a reference's is its own."""
+    found = {arm: POLICY_COLOURS[arm] for arm in arms if arm in POLICY_COLOURS}
+    free = [colour for colour in ARM_COLOURS if colour not in found.values()]
+    others = [arm for arm in arms if arm not in found]
+    return found | {arm: free[place % len(free)] for place, arm in enumerate(others)}
 
 
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
