@@ -31,8 +31,6 @@ from restock.ingest.task.schema import recording_schema
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each
 CHECKPOINT_COMMITS = 20  # a reader of the log opens at most so many files
 _JITTER = random.SystemRandom()
-# What else of Restock's a folder may be, by the file that tells it.
-_OTHERS = {"panel.json": "a panel", "config.json": "the folder of a run"}
 T = TypeVar("T")
 
 
@@ -72,25 +70,19 @@ class TableCommits(StoreReader):
             return
         if folder.is_file():
             raise StoreError("is a file, not a store", where=str(self.path), remedy="give a folder")
-        for file, kind in _OTHERS.items():
-            if (folder / file).is_file() and not self.path.has_table(TRANSITIONS):
-                raise StoreError(
-                    f"is {kind}, not a store",
-                    where=str(self.path),
-                    remedy="give the folder of a store, or of a new one",
-                )
+        if (kind := self.path.other()) is not None and not self.path.has_table(TRANSITIONS):
+            raise StoreError(
+                f"is {kind}, not a store",
+                where=str(self.path),
+                remedy="give the folder of a store, or of a new one",
+            )
 
     def expect_store(self) -> None:
         """Raises StoreError where there is no store, or not all of it."""
         self.expect_folder()
         self.path.expect_both_tables()
         if not self.path.has_table(TRANSITIONS):
-            there = self.path.folder is not None and self.path.folder.exists()
-            raise StoreError(
-                "not a store" if there else "no such store",
-                where=str(self.path),
-                remedy=self.path.remedy_if_absent(),
-            )
+            raise self.path.absent()
 
     def allow_nulls(self, names: Collection[str]) -> None:
         """Let these signals be null: in a store of an older Restock the clearance of a robot

@@ -40,6 +40,8 @@ from restock.ingest.store.version import (
 if TYPE_CHECKING:
     import pyarrow.compute as pc
 
+# What else of Restock's a folder may be, by the file that tells it.
+_OTHERS = {"panel.json": "a panel", "config.json": "the folder of a run"}
 TRANSITIONS, RECORDINGS, FRAMES = "transitions", "recordings", "frames"  # folders of a store
 # An endpoint that is down or silent is given up after a minute at most.
 CONNECT_S, REQUEST_S, RETRIES, RETRY_S = 5, 30, 4, 30
@@ -167,8 +169,27 @@ class Location:
                 " recordings into a new store",
             )
 
+    def other(self) -> str | None:
+        """What else of Restock's the folder is: a panel, or a run's."""
+        for file, kind in _OTHERS.items():
+            if self.folder is not None and (self.folder / file).is_file():
+                return kind
+        return None
+
+    def absent(self) -> StoreError:
+        """The error where there is no store. Raises StoreError as `has_table` does."""
+        what, remedy = "no such store", self.remedy_if_absent()
+        if self.folder is not None and self.folder.exists():
+            what = "not a store"
+        if self.folder is not None and self.folder.is_file():
+            what, remedy = "is a file, not a store", "give the folder of a store"
+        elif kind := self.other():
+            what = f"is {kind}, not a store"
+            remedy = "give the store that it was made of, or another; its JSON file names that one"
+        return StoreError(what, where=self.text, remedy=remedy)
+
     def remedy_if_absent(self) -> str:
-        """What to do where there is no store. Raises StoreError as `has_table` does."""
+        """What to do where there is nothing. Raises StoreError as `has_table` does."""
         path, version = split_version(self.text)
         if version is not None and Location.of(path).has_table(TRANSITIONS):
             return (

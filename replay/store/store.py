@@ -326,12 +326,16 @@ class Store:
     def _set_memory(self, limit: str) -> None:
         if _UNLIMITED_OR_ZERO.match(limit):
             raise StoreError(
-                f"the memory limit {limit!r} is not a positive size", remedy=_MEMORY_REMEDY
+                f"the memory limit {limit!r} is not a positive size",
+                where=str(self.path),
+                remedy=_MEMORY_REMEDY,
             )
         try:
             self.bare.execute(f"SET memory_limit = '{limit}'")
         except duckdb.Error as error:
-            raise StoreError(f"no memory limit {limit!r}", remedy=_MEMORY_REMEDY) from error
+            raise StoreError(
+                f"no memory limit {limit!r}", where=str(self.path), remedy=_MEMORY_REMEDY
+            ) from error
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
@@ -367,8 +371,4 @@ def _expect(place: Location) -> None:
     if is_store(place):
         return
     place.expect_both_tables()
-    raise StoreError(
-        "not a store" if place.folder is not None and place.folder.exists() else "no such store",
-        where=str(place),
-        remedy=place.remedy_if_absent(),
-    )
+    raise place.absent()

@@ -219,5 +219,9 @@ def _audit_table(run: Path) -> str:
 
 def _number(row: str, where: Path, what: str) -> int:
     if not row.isdigit():
-        raise StoreError(f"{row!r} is not a {what}", where=str(where))
+        raise StoreError(
+            f"{row!r} is not a {what}",
+            where=str(where),
+            remedy="give a whole number of 0 or more; STEP/ROW names a row of a run",
+        )
     return int(row)

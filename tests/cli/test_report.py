@@ -776,8 +776,12 @@ def test_the_verb_prints_where_the_page_is(
 
 
 def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["report", str(tmp_path / "nothing")]) == 2
-    assert "is not a run directory" in capsys.readouterr().err
+    for place, said in (
+        (tmp_path / "nothing", "no such run"),
+        (tmp_path, "is not a run directory"),
+    ):
+        assert cli.main(["report", str(place)]) == 2
+        assert f"{place}: {said}" in "".join(capsys.readouterr().err.splitlines())
 
 
 def test_four_shares_stand_side_by_side_and_a_loss_by_weights_is_said(run: Path) -> None:

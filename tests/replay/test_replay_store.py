@@ -349,6 +349,13 @@ def test_what_is_no_store_is_said_to_be_none(tmp_path: Path) -> None:
         Store(tmp_path)
     with pytest.raises(StoreError, match="no such store"):
         Store(tmp_path / "x")
+    for name, said in (("panel.json", "is a panel"), ("config.json", "is the folder of a run")):
+        (tmp_path / name).write_text("{}")
+        with pytest.raises(StoreError, match=f"{said}, not a store\n  give the store that it was"):
+            Store(tmp_path)
+        with pytest.raises(StoreError, match="is a file, not a store\n  give the folder"):
+            Store(tmp_path / name)
+        (tmp_path / name).unlink()
     write_store(tmp_path / "s", [recording_transitions(1)])
     assert is_store(tmp_path / "s")
     with pytest.raises(StoreError, match="--version 3"):

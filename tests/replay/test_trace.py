@@ -202,7 +202,7 @@ def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
         trace_row(places.run, "8/0")
     with pytest.raises(StoreError, match="no transition 5"):
         trace_row(places.store, "5")
-    with pytest.raises(StoreError, match="is not a transition id"):
+    with pytest.raises(StoreError, match="is not a transition id\n  give a whole number"):
         trace_row(places.store, "seven")
     with pytest.raises(StoreError, match="it is not a run, a panel or a store"):
         trace_row(tmp_path, "1")

@@ -455,7 +455,9 @@ def test_the_experiment_replaces_one_suspect(tmp_path: Path, cause: Any) -> None
 def test_an_experiment_overwrites_nothing(tmp_path: Path, capsys) -> None:
     run = str(make_run(tmp_path / "r", lag=0.9).path)
     assert main(["diagnose", run, "--confirm", run]) == 2
-    said = " ".join(capsys.readouterr().err.split())
+    shown = capsys.readouterr()
+    assert not shown.out  # refused before anything else
+    said = " ".join(shown.err.split())
     assert "already exists give --confirm another directory" in said
     assert "--out" not in said
 

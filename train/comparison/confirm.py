@@ -20,6 +20,18 @@ from restock.train.run.run import Run, check_free
 _NOTHING: frozenset[Cause] = frozenset({"HEALTHY", "UNDETERMINED"})
 
 
+def check_place(out: Path) -> None:
+    """Raises RunError where the experiment's run cannot be made at `out`."""
+    try:
+        check_free(out)
+    except RunError as taken:
+        raise RunError(
+            taken.what,
+            where=taken.where,
+            remedy="give --confirm another directory, or remove this one",
+        ) from taken
+
+
 def confirm(
     run: Run, diagnosis: Diagnosis, out: Path, *, rows_at_fault: bool = False
 ) -> dict[str, Any]:
@@ -36,14 +48,7 @@ def confirm(
         RunError: something is at `out`, there is nothing to confirm, or no setting changes what
             is suspected.
     """
-    try:
-        check_free(out)
-    except RunError as taken:
-        raise RunError(
-            taken.what,
-            where=taken.where,
-            remedy="give --confirm another directory, or remove this one",
-        ) from taken
+    check_place(out)
     if rows_at_fault and diagnosis.cause in (*_NOTHING, "ACTION_COVERAGE"):
         raise RunError(
             f"is {diagnosis.cause} by its own figures, and only its rows are at fault: another run"
@@ -116,4 +121,4 @@ def swapped(run: Run, cause: Cause) -> list[str]:
     ]
 
 
-__all__ = ["confirm", "swapped"]
+__all__ = ["check_place", "confirm", "swapped"]

@@ -93,7 +93,7 @@ class Run:
         config = path / "config.json"
         if not config.exists():
             raise RunError(
-                "is not a run directory: it has no config.json",
+                "is not a run directory: it has no config.json" if path.exists() else "no such run",
                 where=str(path),
                 remedy="give the directory that `restock train --out` wrote",
             )

@@ -57,7 +57,7 @@ class DoctorCommand:
     read. A missing extra is not an error.
     """
 
-    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")] = None
+    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[STORE]")] = None
     """Also check this store: a folder or an s3:// address."""
     json: bool = False
     """Print {"findings": [{"part", "name", "state", "what", "remedy"}]}."""

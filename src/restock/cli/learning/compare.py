@@ -24,8 +24,9 @@ class CompareCommand:
     the feed is compared; the store, the algorithm, the target rule, the evaluation and the numbers
     of steps and updates must be the same. With `practice`, the missions in the twin may differ
     (`practice.*`, `env.conditions`, `env.missions`), and the logs must have been sampled in the
-    same way. With `method`, everything about how an arm learns may differ (replay, target rule,
-    updates), but not the twin, the environment steps and the evaluation.
+    same way. With `data`, what both of these allow may differ together. With `method`, everything
+    about how an arm learns may differ (replay, target rule, updates), but not the twin, the
+    environment steps and the evaluation.
 
     With several seeds per arm: `restock compare runs/a1 runs/a2 --against runs/b1 runs/b2`
 
@@ -39,7 +40,7 @@ class CompareCommand:
     treatment: Literal["algorithm", "target", "mixture", "practice", "data", "method"] = "algorithm"
     """The treatment: what is compared, and therefore may differ."""
     all_checks: bool = False
-    """Show all checks, not only the decisive ones."""
+    """Show all checks, not only those that found, or could not exclude, a difference."""
     page: Path | None = None
     """Write an HTML page that opens without a network. Replaces an existing file."""
     json: bool = False

@@ -60,7 +60,7 @@ class DiagnoseCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.comparison.confirm import confirm
+        from restock.train.comparison.confirm import check_place, confirm
         from restock.train.comparison.diagnose import diagnose
         from restock.train.comparison.rows_verdict import rows_of, with_rows
         from restock.train.run.run import Run
@@ -78,6 +78,8 @@ class DiagnoseCommand:
                 "needs a run, or --before-training PANEL_OR_STORE", where="restock diagnose"
             )
         runs = [Run.open(path) for path in self.runs]
+        if self.confirm is not None:
+            check_place(self.confirm)
         own = diagnosis = diagnose(runs)
         found, reason = rows_of(runs) if self.rows else (None, "")
         if found is not None:
