@@ -19,10 +19,12 @@ from deltalake import DeltaTable
 from deltalake.exceptions import CommitFailedError, DeltaError
 from deltalake.transaction import AddAction
 from support.long import one_in
+from support.paths import ROOT
 from support.s3_server import files_of
 from support.stores import one, shown
 
 import restock
+from restock.cli import main
 from restock.errors import StoreError
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.writer import StoreWriter
@@ -298,10 +300,15 @@ def test_a_file_in_the_way_is_said_so(tmp_path):
     ("file", "said"),
     [("panel.json", "is a panel, not a store"), ("config.json", "is the folder of a run")],
 )
-def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, file, said):
+def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, capsys, file, said):
     (tmp_path / file).write_text("{}")
     with pytest.raises(StoreError, match=said):
         StoreWriter(tmp_path).write(*one(1))
+    # Said once, before a recording is read.
+    recordings = [str(ROOT / "sample_logs" / name) for name in ("amr_monday.mcap", "amr_tuesday")]
+    assert main(["ingest", *recordings, "--store", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert (told.count(said), "was not added" in told) == (1, False)
     assert [path.name for path in tmp_path.iterdir()] == [file]
 
 

@@ -92,7 +92,8 @@ class IngestCommand:
         profile = load_profile(self.profile)
         store = None if self.dry_run else self.store
         if store is not None:
-            StoreWriter(store).reach()  # or say now why not, and not once a recording
+            StoreWriter(store).expect_folder()  # or say now why not, and not once a recording
+            StoreWriter(store).reach()
         typestore = with_definitions(self.typestore, self.definitions)
         job = IngestJob(*(profile, store, self.force, self.salvage, typestore, self.repeated, tags))
         paths, failures = self._recordings()
