@@ -17,6 +17,8 @@ from restock.replay.store.parquet_views import damage
 
 T = TypeVar("T")
 
+# A table of DuckDB's own that is spelled a little like what was asked for: never what was meant.
+_OWN_TABLE = re.compile(r'\s*Did you mean "(?:pg|duckdb|sqlite|pragma|information)_[^"]*"\?')
 ZONED = "TIMESTAMP WITH TIME ZONE"
 # Statements that leave files as they are; CREATE makes tables and macros in memory.
 _ALLOWED = {"SELECT", "CREATE", "SET", "VARIABLE_SET", "PRAGMA", "CALL"}
@@ -45,7 +47,7 @@ def query(
     except duckdb.Error as error:
         raise QueryError(_message(error), where=where) from error
     if not statements:
-        raise QueryError("the query is empty", where=where, remedy='try "FROM coverage"')
+        raise QueryError("the query is empty", where=where, remedy='try "FROM columns"')
     for statement in statements:
         if not _reads(connection, statement):
             kind = statement.type.name
@@ -226,7 +228,7 @@ def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
 
 def _message(error: duckdb.Error) -> str:
     """What DuckDB says, or what a function in Python said, without DuckDB's words around it."""
-    text = str(error).strip()
+    text = _OWN_TABLE.sub("", str(error)).strip()
     _, of_python, cause = text.partition("occurred while executing the UDF: ")
     return cause.partition(": ")[2] if of_python else text
 

@@ -170,6 +170,16 @@ def test_wrong_sql_is_one_message_and_exit_2(
     assert "Traceback" not in err
 
 
+def test_a_view_that_a_panel_lacks_is_not_taken_for_one_of_duckdbs_own(
+    tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
+    err = out_of(capsys, str(panel.path), "FROM transitions", code=2)
+    assert "does not exist" in err
+    assert "pg_" not in err
+    assert 'try "FROM columns"' in out_of(capsys, str(panel.path), "", code=2)
+
+
 def test_wrong_places_are_refused(
     tmp_path: Path, store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -73,7 +73,7 @@ def success(facts: Facts) -> Section | None:
         else "Success per kind of episode, on the same seeded episodes for every policy, without "
         "a perturbation (clean) and under each one. Lines are 95 % Wilson intervals. "
         f"{facts.evaluation}" + "".join(f" {one.text}." for one in facts.clones),
-        callout="" if facts.no_goal else "; ".join(losses(facts)),
+        callout="" if facts.no_goal else ". ".join(losses(facts)),
         figures=[] if facts.no_goal else [Figure(charts.success(shown))],
         tables=tables,
     )
