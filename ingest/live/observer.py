@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.errors import ConfigError
+from restock.errors import ConfigError, expect
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.live.clock import LiveClock
 from restock.ingest.profile.inputs import Input
@@ -63,6 +63,7 @@ class LiveObserver:
     """
 
     def __init__(self, profile: Profile) -> None:
+        expect("profile", profile, Profile, "`load_profile(NAME_OR_FILE)` gives one")
         if lacking := not_live(profile):
             raise ConfigError(
                 "takes " + " and ".join(f"{one.takes}, {one.why}" for one in lacking),
@@ -101,8 +102,15 @@ class LiveObserver:
         """Take a message of one of `topics`, received at `log_time_ns`.
 
         Raises:
+            ConfigError: the profile takes nothing from this topic.
             AttributeError, TypeError: it has not the fields of its type; nothing of it is kept.
         """
+        if topic not in self._inputs:
+            raise ConfigError(
+                f"takes nothing from {topic!r}",
+                where=f"profile {self.profile.name!r}",
+                remedy=f"its topics are {', '.join(self._inputs)}",
+            )
         sources = self._inputs[topic]
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
         latched = all(source.max_age_s is None for source in sources)

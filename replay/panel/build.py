@@ -23,6 +23,7 @@ from restock.files import building, expect_place
 from restock.ingest.store.location import Location
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
+from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
@@ -33,6 +34,14 @@ from restock.replay.panel.seal import FileRecord, seal
 from restock.replay.plan.plan import PanelPlan, plan_panel
 from restock.replay.plan.stores import AllStores, PinnedStore, all_stores
 from restock.replay.store.store import Store, StoredProfile, corrected_versions, profiles_of
+
+# What a panel is made of: what a table must have, whatever the mixture asks for.
+_NEEDED = (
+    *("transition_id", "recording_id", "episode_id", "episode_index", "step_index"),
+    *("observation", "action", "reward", "next_observation", "terminated", "truncated"),
+    *("condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
+    *("action_probability", "stamp_ns", "pose_x_m", "pose_y_m", "task_hash"),
+)
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ def open_source(
             )
         return
     with duckdb.connect() as connection:
-        connection.register("given", transitions)
+        _register(connection, transitions)
         connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
         if conditions is None:
             conditions = _named_conditions(connection)
@@ -99,6 +108,39 @@ def open_source(
             return msgspec.json.encode(task).decode()
 
         yield TransitionSource(connection, "table in memory", -1, task_json, tuple(conditions))
+
+
+def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
+    """Give a connection a table as `given`. Raises ArgumentError, StoreError: it is not fit."""
+    where = "the table of transitions"
+    remedy = "a store's rows fit, as of Store(…).sql('FROM transitions').to_arrow_table()"
+    try:
+        connection.register("given", given)
+    except duckdb.InvalidInputException as error:
+        what = f"transitions must be a Store or a table, got {repr(given)[:80]}"
+        raise ArgumentError(what, remedy=remedy) from error
+    kinds = {name.casefold(): kind for name, kind in _kinds(connection.table("given")).items()}
+    if lacking := [name for name in _NEEDED if name not in kinds]:
+        raise StoreError(f"it has no {', '.join(lacking)}", where=where, remedy=remedy)
+    fit = _kinds(connection.from_arrow(transition_schema(1).empty_table()))
+    for name in _NEEDED:
+        if kinds[name] != fit[name] and not kinds[name].endswith("null"):
+            what = f"{name} must be {fit[name]}, not {kinds[name]}"
+            raise StoreError(what, where=where, remedy=remedy)
+
+
+def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
+    """What the values of each column are, whatever their size."""
+    columns = zip(relation.columns, map(str, relation.types), strict=True)
+    return {name: _kind(kind) for name, kind in columns}
+
+
+def _kind(kind: str) -> str:
+    if kind.endswith("]"):
+        return f"lists of {_kind(kind.rpartition('[')[0])}"
+    if kind == "BOOLEAN" or kind.endswith("INT") or kind in ("INTEGER", "FLOAT", "DOUBLE"):
+        return "numbers"
+    return "text" if kind.startswith(("VARCHAR", "ENUM")) else kind.strip('"').lower()
 
 
 def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:

@@ -7,7 +7,7 @@ with `state_dict` and `load_state_dict`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, ClassVar
 
@@ -37,24 +37,34 @@ class Stateful:
         """Puts everything where `state_dict` found it. Raises `mismatch` for another's state.
 
         Raises:
-            RunError: a state without one of these names: another version of Restock saved it.
+            RunError: no mapping, or one without one of these names: another version saved it.
         """
+        self.expect_state(state, ())
         for name in self.SAME:
             if not _alike(saved(getattr(self, name)), state.get(_key(name))):
                 raise self.mismatch(_key(name), state.get(_key(name)))
+        self.expect_state(state, self.STATE)
         for name in self.STATE:
-            if _key(name) not in state:
-                raise RunError(
-                    f"the saved state of {type(self).__name__} has no {_key(name)}:"
-                    " another version of Restock saved it",
-                    remedy="resume with the version that the run began with, or start another run",
-                )
             value, kind = state[_key(name)], self.STATE_TYPES.get(name)
             if kind is None:
                 setattr(self, name, restored(getattr(self, name), value))
             else:
                 setattr(self, name, msgspec.convert(value, kind, str_keys=True))
         self.restored()
+
+    def expect_state(self, state: Mapping[str, Any], names: Sequence[str]) -> None:
+        """Raises RunError for a state that is no mapping, or that lacks one of these names."""
+        own = type(self).__name__
+        if not isinstance(state, Mapping):
+            raise RunError(
+                f"a state of {own} is a dict, got {repr(state)[:80]}",
+                remedy="give what its state_dict() returned",
+            )
+        if lacking := next((_key(name) for name in names if _key(name) not in state), None):
+            raise RunError(
+                f"the saved state of {own} has no {lacking}: another version of Restock saved it",
+                remedy="resume with the version that the run began with, or start another run",
+            )
 
     def restored(self) -> None:
         """Called after `load_state_dict`."""

@@ -138,6 +138,14 @@ def test_a_message_off_the_clock_is_left_out_and_counted() -> None:
     assert observer.offset_ns == 2_000_000
 
 
+def test_a_message_of_no_topic_of_the_profile_is_refused_with_those_it_has() -> None:
+    with pytest.raises(ConfigError, match="takes nothing from '/unknown'") as caught:
+        LiveObserver(PROFILE).receive("/unknown", odometry(0, 1.0), 0)
+    assert "/odom" in str(caught.value.remedy)
+    with pytest.raises(ConfigError, match="profile must be a Profile, got 'warehouse_amr'"):
+        LiveObserver("warehouse_amr")  # type: ignore[arg-type]
+
+
 def test_memory_does_not_grow_with_messages() -> None:
     observer = LiveObserver(PROFILE)
     for index in range(1000):

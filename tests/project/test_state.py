@@ -152,6 +152,12 @@ def test_a_state_that_lacks_a_name_is_refused() -> None:
     assert "start another run" in str(caught.value.remedy)
 
 
+@pytest.mark.parametrize("state", [None, [], "inner"])
+def test_a_state_that_is_no_dict_is_refused(state: Any) -> None:
+    with pytest.raises(RunError, match=r"a state of Outer is a dict, got .*\n.*state_dict\(\)"):
+        Outer().load_state_dict(state)
+
+
 def test_objects_in_lists_and_mappings_are_restored_in_place() -> None:
     class Many(Stateful):
         STATE = ("by_name", "in_turn")

@@ -20,7 +20,7 @@ from support.panels import panel_of
 from support.stores import CONDITIONS, TASK, manifest, recording_transitions, write_store
 
 from restock import cli
-from restock.errors import MixtureError, PanelError, StoreError
+from restock.errors import MixtureError, PanelError, RestockError, StoreError
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.task import Task
 from restock.replay.mixture.mixture import Mixture, load_mixture, parse_mixture
@@ -555,3 +555,46 @@ def test_a_store_several_times_the_memory_is_packed(tmp_path: Path) -> None:
     for row in order:
         expected = observation[int(ids[row]) & ((1 << 25) - 1)].as_py()
         np.testing.assert_array_equal(panel.rows[row, panel.columns["observation"]], expected)
+
+
+def test_a_table_that_is_not_of_transitions_is_refused_with_its_columns(
+    transitions: pa.Table, tmp_path: Path
+) -> None:
+    def refused(table: pa.Table, match: str) -> None:
+        with pytest.raises(RestockError, match=match):
+            build_panel(table, uniform(), tmp_path / "panel", task=TASK, conditions=CONDITIONS)
+        assert not list(tmp_path.iterdir())
+
+    refused(pa.table({}), "must be a Store or a table")
+    refused(transitions.to_pylist(), "must be a Store or a table")
+    refused(
+        transitions.drop_columns(["observation", "pose_x_m"]),
+        r"transitions: it has no observation, pose_x_m\n.*Store\(",
+    )
+    texts = pa.array(["1"] * len(transitions))
+    place = transitions.column_names.index
+    refused(
+        transitions.set_column(place("observation"), "observation", texts),
+        "observation must be lists of numbers, not text",
+    )
+    refused(
+        transitions.set_column(place("reward"), "reward", texts), "reward must be numbers, not text"
+    )
+
+
+def test_a_table_may_have_other_types_of_the_same_kind(
+    transitions: pa.Table, tmp_path: Path
+) -> None:
+    table = transitions
+    for name, kind in {
+        "reward": pa.float64(),
+        "zone": pa.dictionary(pa.int32(), pa.string()),
+        "terminated": pa.int8(),
+        "observation": pa.list_(pa.float64()),
+        "behaviour_version": pa.null(),
+    }.items():
+        column = pa.nulls(len(table)) if kind == pa.null() else table[name].cast(kind)
+        table = table.set_column(table.column_names.index(name), name, column)
+    panel = panel_of(table, uniform(), tmp_path / "panel", task=TASK, conditions=CONDITIONS)
+    same = panel_of(transitions, uniform(), tmp_path / "same", task=TASK, conditions=CONDITIONS)
+    np.testing.assert_array_equal(panel.rows[:, :-1], same.rows[:, :-1])

@@ -127,6 +127,8 @@ def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> N
     env.reset(seed=2)
     with pytest.raises(RunError, match="8 environments"):
         WarehouseVectorEnv(2).load_state_dict(env.state_dict())
+    with pytest.raises(RunError, match="has no task_hash"):
+        env.load_state_dict({})
 
 
 def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:

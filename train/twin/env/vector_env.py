@@ -392,8 +392,10 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
         """Continue from a state of an environment that was made with the same arguments.
 
         Raises:
-            RunError: it was of another number of environments, another task, or other floors.
+            RunError: it was of another number of environments, another task, or other floors, or is
+                no such state.
         """
+        self.expect_state(state, ("task_hash", "floors", *self.STATE))
         specs = msgspec.convert(state["specs"], list[EpisodeSpec])
         if len(specs) != self.num_envs or state["task_hash"] != self.task.hash:
             raise RunError(
