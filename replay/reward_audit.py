@@ -20,7 +20,7 @@ from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.places import RUN_CONFIG, open_place
-from restock.replay.store.audit import Audit, Finding, Thresholds, run_audits
+from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import found
 
@@ -59,13 +59,15 @@ def audit_reward(
         memory_limit: of DuckDB, for a store.
 
     Raises:
-        ConfigError: another discount than a run's evaluations were made with.
+        ConfigError: another discount than a run's evaluations were made with; thresholds that none
+            of the audits uses.
         RunError: a run that was not evaluated, or by an earlier Restock.
         StoreError: there is neither a store nor a run.
     """
     folder = Location.of(place).folder
     of_run = folder is not None and (folder / RUN_CONFIG).is_file()
     names = [OF_RUN + name if of_run else name for name in NAMES]
+    check_thresholds(audits, thresholds)
     chosen = [audit for audit in audits if audit.name in names]
     limits = {name: table for name, table in thresholds.items() if name in names}
     if of_run:

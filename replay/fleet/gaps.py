@@ -7,8 +7,9 @@ each episode of the store has of it: the sample that a forecast is made from.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -19,18 +20,19 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError, expect
+from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.plan.plan import LOGS, PanelPlan, plan_panel
+from restock.replay.store.audit import Thresholds, check_thresholds, shipped_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.store import Store
 
 Counted = Literal["rows", "episodes"]
 # Audits that ask for more of something, with their thresholds.
 AUDITS = ("rare_condition", "few_effective_episodes", "missing_cells")
-Thresholds = Mapping[str, Mapping[str, float | str]]
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,14 @@ def find_gaps(
 
     Args:
         name: of the mixture, for the reports; `folder`: where its other stores are looked up.
-        kinds: of missions that can be driven.
+        kinds: of missions that can be driven: names of conditions, the store's or shipped ones.
         thresholds: of audits, by audit; those of AUDITS are asked. None: the mixture alone.
         min_rows: that each cell should have, of all combinations that `by` spans; 0: not asked.
         by: the columns that make a cell.
 
     Raises:
-        ConfigError, MixtureError, StoreError: as `plan_panel` does; columns that make none.
+        ConfigError, MixtureError, StoreError: as `plan_panel` does; columns that make none, and
+            kinds, audits and thresholds that there are not.
     """
     unknown = sorted(set(by) - set(CELL))
     if isinstance(by, str) or unknown or len(set(by)) != len(by) or not by:
@@ -82,6 +85,9 @@ def find_gaps(
         )
     expect("store", store, Store, 'open it as Store("store")')
     expect("mixture", mixture, Mixture, "`load_mixture(NAME_OR_FILE)` gives one")
+    _refuse_unknown(kinds, [NOMINAL, *(one.name for one in store.conditions()), *shipped()])
+    if thresholds is not None:
+        check_thresholds(shipped_audits(), thresholds, others=True)
     asked = _without_split(store, uncorrected(mixture))
     with open_source(store, asked, folder=None if folder is None else Path(folder)) as source:
         plan = plan_panel(source.connection, asked, source.conditions, source.others)
@@ -93,6 +99,20 @@ def find_gaps(
         gaps += _of_cells(yields, store.conditions(), min_rows, by)
     gaps.sort(key=lambda gap: (gap.counted, -gap.missing, str(gap.cell)))
     return yields, [gap for gap in gaps if gap.missing > 0]
+
+
+def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
+    if isinstance(kinds, str):
+        expect("kinds", kinds, (list, tuple), f"give [{kinds!r}]")
+    for kind in kinds:
+        if kind not in known:
+            near = get_close_matches(kind, known, n=1)
+            names = f"the conditions are {', '.join(dict.fromkeys(known))}"
+            raise ConfigError(
+                f"no condition is called {kind!r}",
+                where="kinds",
+                remedy=f"did you mean {near[0]!r}? {names}" if near else names,
+            )
 
 
 def uncorrected(mixture: Mixture) -> Mixture:

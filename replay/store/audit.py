@@ -20,6 +20,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -163,7 +164,7 @@ def run_audits(
             "it holds no transitions: there is nothing to audit",
             remedy="`restock ingest` recordings first",
         )
-    _check_thresholds(audits, thresholds)
+    check_thresholds(audits, thresholds)
     available = set(beside)
     available |= {
         f"{schema}.{table}" for schema, table in _tables(connection) if schema in available
@@ -264,23 +265,36 @@ def _run(
     return Finding(audit, status, len(rows), columns, sample, thresholds)
 
 
-def _check_thresholds(audits: Sequence[Audit], thresholds: Thresholds) -> None:
+def check_thresholds(
+    audits: Sequence[Audit], thresholds: Thresholds, *, others: bool = False
+) -> None:
+    """Refuse thresholds that no audit uses. There may be `others`, of names unlike those of these.
+
+    Raises:
+        ConfigError: a name of an audit or of a threshold that there is not.
+    """
     used = {audit.name: audit.parameters for audit in audits}
     for name, table in thresholds.items():
         if name not in used:
-            remedy = f"the audits are {', '.join(used)}"
-            if name in RENAMED:
-                remedy = f"it is now called {RENAMED[name]!r}: rename it"
+            likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
+            if others and not likely and name not in RENAMED:
+                continue
+            remedy = _instead(name, likely, f"the audits are {', '.join(used)}")
             raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
         if unknown := sorted(table.keys() - used[name]):
-            remedy = f"its thresholds are {', '.join(sorted(used[name])) or 'none'}"
-            if unknown[0] in RENAMED:
-                remedy = f"it is now called {RENAMED[unknown[0]]!r}: rename it"
+            names = ", ".join(sorted(used[name])) or "none"
+            likely = get_close_matches(unknown[0], used[name], n=1)
             raise ConfigError(
                 f"{name}.{unknown[0]} is not a threshold of this audit",
                 where="thresholds",
-                remedy=remedy,
+                remedy=_instead(unknown[0], likely, f"its thresholds are {names}"),
             )
+
+
+def _instead(name: str, likely: Sequence[str], known: str) -> str:
+    if name in RENAMED:
+        return f"it is now called {RENAMED[name]!r}: rename it"
+    return f"did you mean {likely[0]!r}?" if likely else known
 
 
 def _load(entries: Iterable[Traversable], where: str) -> list[Audit]:

@@ -115,6 +115,26 @@ def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store
             assert one.see_one[1] >= 1
 
 
+def test_unknown_kinds_and_thresholds_are_refused_with_what_is_near(tmp_path: Path) -> None:
+    def refused(match: str, **given: Any) -> None:
+        with pytest.raises(ConfigError, match=match):
+            find_gaps(store, parse_mixture(ASKING), name="mine", **given)
+
+    with Store(write_store(tmp_path / "store", [recording_transitions(0)])) as store:
+        refused("'wheel_slips'\n.*mean 'wheel_slip'", kinds=["wheel_slips"])
+        refused(r"must be a list.*\n.*\['wheel_slip'\]", kinds="wheel_slip")
+        refused(
+            "no audit named 'rare_conditions'\n.*mean 'rare_condition'",
+            thresholds={"rare_conditions": {"min_rows": 3}},
+        )
+        refused(
+            "rare_condition.min_row is not a threshold.*\n.*mean 'min_rows'",
+            thresholds={"rare_condition": {"min_row": 3}},
+        )
+        own = {"my_own_audit": {"least": 3.0}}  # of the same file as for `restock audit --audits`
+        find_gaps(store, parse_mixture(ASKING), name="mine", kinds=["nominal"], thresholds=own)
+
+
 def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path: Path) -> None:
     rows = recording_transitions(0)
     place = rows.schema.get_field_index("condition")

@@ -19,7 +19,7 @@ from support.finished_runs import document, make_run
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.errors import RunError
+from restock.errors import ConfigError, RunError
 from restock.replay.reward_audit import audit_reward
 from restock.replay.store.audit import load_audits, load_thresholds
 from restock.replay.store.definitions import definitions
@@ -312,3 +312,9 @@ def test_the_difference_of_success_has_newcombes_interval(first, second) -> None
     (low_a, high_a), (low_b, high_b) = wilson(a, total_a), wilson(b, total_b)
     assert ends[0] == pytest.approx(p - q - np.hypot(p - low_a, high_b - q), abs=1e-4)
     assert ends[1] == pytest.approx(p - q + np.hypot(high_a - p, q - low_b), abs=1e-4)
+
+
+def test_thresholds_that_no_audit_uses_are_refused(tmp_path: Path) -> None:
+    place = store_of(tmp_path / "store", hasty_and_careful(shipped, 3))
+    with pytest.raises(ConfigError, match=r"no audit named 'reward_orders'\n.*'reward_order'"):
+        audit_reward(place, load_audits(), {"reward_orders": {"min_share": 0.5}})
