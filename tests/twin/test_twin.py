@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,27 @@ def test_a_state_of_another_environment_is_refused(env: WarehouseVectorEnv) -> N
         WarehouseVectorEnv(2).load_state_dict(env.state_dict())
     with pytest.raises(RunError, match="has no task_hash"):
         env.load_state_dict({})
+
+
+@pytest.mark.parametrize("pickler", ["pickle", "cloudpickle"])
+def test_a_pickled_environment_is_a_fresh_one_with_the_same_settings(pickler: str) -> None:
+    dumps = pytest.importorskip(pickler).dumps
+    made = WarehouseVectorEnv(3, conditions={"wheel_slip": 1.0}, perturbation="friction", seed=5)
+    first, _ = made.reset()
+    roll(made, 5, 0)
+    again = pickle.loads(dumps(made))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        again.step(np.zeros(3, int))
+    np.testing.assert_array_equal(again.reset()[0], first)
+    assert again.perturbation.name == "friction"
+    assert set(again.episode_condition) == {"wheel_slip"}
+    roll(made, 1, 0)  # it goes on itself
+
+    single = gymnasium.make("restock/Warehouse-v0", seed=7, action="continuous")
+    other = pickle.loads(dumps(single))
+    assert other.spec == single.spec
+    assert other.action_space == single.action_space
+    np.testing.assert_array_equal(other.reset()[0], single.reset()[0])
 
 
 def test_autoreset_keeps_the_final_observation(env: WarehouseVectorEnv) -> None:

@@ -7,7 +7,7 @@ a trained network, an ONNX file, a script, one of your own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from msgspec import Meta
@@ -105,6 +105,30 @@ def epsilon_greedy(
     action = np.where(explores, uniform, greedy).astype(np.int64)
     probability = epsilon / actions + (1 - epsilon) * (action == greedy)
     return action, probability.astype(np.float32)
+
+
+class MadeAgain:
+    """Pickled and copied by what it was made of, as Gymnasium's EzPickle: a fresh one comes back.
+
+    It has the same settings and stands before its first reset; where the other stood is not copied.
+    """
+
+    spec: Any  # of Gymnasium, where `gymnasium.make` made it
+    _made_of: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Keep what it is made of."""
+        made = super().__new__(cls)
+        made._made_of = given, named
+        return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As pickle and copy ask."""
+        return _make_again, (type(self), *self._made_of), {"spec": self.spec}
+
+
+def _make_again(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) -> Any:
+    return kind(*given, **named)
 
 
 def refuse_other_type(

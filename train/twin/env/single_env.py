@@ -10,10 +10,11 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from restock.arrays import F32
+from restock.train.twin.env.interface import MadeAgain
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
-class WarehouseEnv(gymnasium.Env[F32, Any]):
+class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
     """The vector environment with N = 1; `info` holds its values without the leading axis.
 
     Takes the vector environment's keyword arguments. The one inside is `self.vector`.

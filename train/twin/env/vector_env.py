@@ -47,7 +47,13 @@ from restock.train.twin.env.floor_report import (
     refuse_unfit,
 )
 from restock.train.twin.env.info import info_after, info_now
-from restock.train.twin.env.interface import DEFAULT_CONDITIONS, Info, Step, refuse_other_type
+from restock.train.twin.env.interface import (
+    DEFAULT_CONDITIONS,
+    Info,
+    MadeAgain,
+    Step,
+    refuse_other_type,
+)
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
@@ -63,7 +69,7 @@ from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
 
-class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful):
+class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, MadeAgain):
     """N warehouses as a Gymnasium vector environment; `docs/twin.md` explains `info`."""
 
     # What changes while episodes run; the rest (layout, noise, ways of traffic) follows from specs.
