@@ -48,9 +48,11 @@ from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.conditions import NOMINAL, held
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.schema import recording_schema
+from restock.interrupts import interrupts_raised
 from restock.words import counted
 
 
+@interrupts_raised
 def ingest(
     path: Path | str,
     profile: Profile,

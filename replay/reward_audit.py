@@ -19,6 +19,7 @@ from restock.errors import ConfigError, RunError
 from restock.files import read_json
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
+from restock.interrupts import interrupts_raised
 from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
 from restock.replay.store.definitions import install_named
@@ -40,6 +41,7 @@ class RewardAudit:
     findings: list[Finding]
 
 
+@interrupts_raised
 def audit_reward(
     place: str | Path,
     audits: Sequence[Audit],

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.errors import ExitCode, RestockError
+from restock.interrupts import interrupts_raised
 from restock.train.dqn.config import GIVEN
 from restock.train.dqn.loss import Loss
 from restock.train.dqn.network import clone
@@ -62,6 +63,7 @@ class TrainResult:
     rollbacks: int
 
 
+@interrupts_raised
 def train(
     session: Session,
     *,

@@ -14,6 +14,7 @@ import msgspec
 from restock.arrays import F32, Ints
 from restock.errors import PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.interrupts import interrupts_raised
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
@@ -152,6 +153,7 @@ class Prepared:
         return reference_success(self.config, env, self.profile.task)
 
 
+@interrupts_raised
 def train(
     config: TrainConfig | Path | str | None = None,
     *,

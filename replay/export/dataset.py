@@ -18,6 +18,7 @@ from restock.errors import StoreError
 from restock.files import building, expect_place
 from restock.imports import install_command, installed
 from restock.ingest.store.version import Version
+from restock.interrupts import interrupts_raised
 from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
@@ -37,6 +38,7 @@ WITH_IMAGES = ("lerobot",)
 ROOM_BYTES = 64 << 20
 
 
+@interrupts_raised
 def export_dataset(
     source: str | Path,
     to: str,

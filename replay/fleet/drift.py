@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from restock.errors import ConfigError, expect
+from restock.interrupts import interrupts_raised
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
@@ -44,6 +45,7 @@ class Drift:
         }
 
 
+@interrupts_raised
 def measure_drift(
     store: Store, *, every: str = "week", reference: int = 2, least_episodes: int = 5
 ) -> Drift:

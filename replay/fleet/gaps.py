@@ -22,6 +22,7 @@ from restock.arrays import F64
 from restock.errors import ConfigError, expect
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition
+from restock.interrupts import interrupts_raised
 from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
@@ -52,6 +53,7 @@ class Gap:
         return max(self.needed - self.there, 0.0)
 
 
+@interrupts_raised
 def find_gaps(
     store: Store,
     mixture: Mixture,

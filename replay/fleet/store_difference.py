@@ -17,6 +17,7 @@ import numpy as np
 
 from restock.errors import StoreError
 from restock.ingest.task.signals import STORED_SIGNALS
+from restock.interrupts import interrupts_raised
 from restock.replay.fleet.two_sample import (
     LEAST_EPISODES,
     Shift,
@@ -109,6 +110,7 @@ class StoreDifference:
         }
 
 
+@interrupts_raised
 def diff_stores(first: Store, second: Store, *, seed: int = 0) -> StoreDifference:
     """What is different in `second`.
 

@@ -25,6 +25,7 @@ from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition, Kind, Timing, labels_version, of_kind
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.task import Task
+from restock.interrupts import interrupts_raised
 from restock.replay.mixture.mixture import Mixture, load_mixture
 from restock.replay.mixture.packed_row import PACKING_VERSION
 from restock.replay.panel.pack import Packer
@@ -112,8 +113,7 @@ def open_source(
 
 def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
     """Give a connection a table as `given`. Raises ArgumentError, StoreError: it is not fit."""
-    where = "the table of transitions"
-    remedy = "a store's rows fit, as of Store(…).sql('FROM transitions').to_arrow_table()"
+    where, remedy = "the table of transitions", "give rows as Store(…).sql('FROM transitions') has"
     try:
         connection.register("given", given)
     except duckdb.InvalidInputException as error:
@@ -131,8 +131,7 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
     """What the values of each column are, whatever their size."""
-    columns = zip(relation.columns, map(str, relation.types), strict=True)
-    return {name: _kind(kind) for name, kind in columns}
+    return dict(zip(relation.columns, map(_kind, map(str, relation.types)), strict=True))
 
 
 def _kind(kind: str) -> str:
@@ -158,6 +157,7 @@ def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
     return sorted(found, key=lambda condition: (condition.kind != "outcome", condition.name))
 
 
+@interrupts_raised
 def build_panel(
     transitions: pa.Table | Store,
     mixture: Mixture,

@@ -31,6 +31,7 @@ import duckdb
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
+from restock.interrupts import interrupts_raised
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import found, interruptible
@@ -141,6 +142,7 @@ def _check_value(key: str, value: object, shipped: float | str | None, where: st
     raise ConfigError(f"{key} must be {kind}, got {value!r}", where=where)
 
 
+@interrupts_raised
 def run_audits(
     connection: duckdb.DuckDBPyConnection,
     audits: Sequence[Audit],

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from functools import partial
 from itertools import count
+from threading import Lock
 from typing import Any, TypeVar
 
 import duckdb
@@ -211,13 +212,22 @@ def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
 
 def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
     """Run a job on a thread of its own: DuckDB does not look for Ctrl-C while it works."""
+    begins, given_up = Lock(), False
+
+    def run() -> T:
+        with begins:
+            if given_up:  # before it began: nobody waits for it
+                raise CancelledError
+            return job()
+
     with ThreadPoolExecutor(1) as pool:
-        done = pool.submit(job)
         try:
-            return done.result()
+            return pool.submit(run).result()
         except KeyboardInterrupt:
+            given_up = True
             connection.interrupt()
-            raise
+            with begins:  # the connection is free again, even where the thread was just starting
+                raise
 
 
 def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:

@@ -29,6 +29,7 @@ from restock.ingest.store.writer import RETENTION_HOURS
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
+from restock.interrupts import interrupts_raised
 from restock.replay.store.computed import computed
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.parquet_views import damage
@@ -69,6 +70,7 @@ class Store:
         StoreError: nothing there, not a store, no such version, or it cannot be reached.
     """
 
+    @interrupts_raised
     def __init__(
         self,
         path: str | Path | Location,
@@ -139,6 +141,7 @@ class Store:
         return f"<Store {self.path} version {self.version}>"
 
     @property
+    @interrupts_raised
     def connection(self) -> duckdb.DuckDBPyConnection:
         """With the common views; macros, and views of fewer uses, `install_named` makes."""
         self._definitions.make_common()
@@ -149,6 +152,7 @@ class Store:
         self.bare.close()
         self._spill.cleanup()
 
+    @interrupts_raised
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
         """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 if TYPE_CHECKING:  # slow to import, and every command imports this
     import subprocess
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _running: set[subprocess.Popen[bytes]] = set()
 _interrupted = False
@@ -52,6 +57,34 @@ def was_interrupted() -> bool:
     KeyboardInterrupt in a Python function that they call as an error of theirs: who would take an
     error for a damaged file asks here first."""
     return _interrupted
+
+
+def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, which ends an interrupt with KeyboardInterrupt whatever DuckDB made of it."""
+
+    @wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        before = sys.exception()
+        try:
+            return function(*args, **kwargs)
+        except Exception as error:
+            if _by_interrupt(error, before):
+                raise KeyboardInterrupt from error
+            raise
+
+    return called
+
+
+def _by_interrupt(error: BaseException | None, before: BaseException | None) -> bool:
+    """Whether it, or what led to it, is a KeyboardInterrupt or what DuckDB makes of one."""
+    while error is not None and error is not before:
+        said = str(error)
+        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in said:
+            return True
+        if "Query interrupted" in said:
+            return True
+        error = error.__context__
+    return False
 
 
 def went_on_after_interrupt() -> None:
@@ -101,6 +134,7 @@ def _note_interrupt(number: int, frame: FrameType | None) -> None:
 __all__ = [
     "ended_with_us",
     "interrupt_running",
+    "interrupts_raised",
     "kill_as_interrupt",
     "was_interrupted",
     "went_on_after_interrupt",

@@ -18,14 +18,16 @@ import pytest
 import restock.replay.plan.plan as plan
 from restock.cli import main
 from restock.cli.learning.train import _stop_on_interrupt
-from restock.errors import ExitCode
+from restock.errors import ExitCode, StoreError
 from restock.interrupts import (
     ended_with_us,
     interrupt_running,
+    interrupts_raised,
     kill_as_interrupt,
     was_interrupted,
     went_on_after_interrupt,
 )
+from restock.replay import Panel, Store, build_panel, load_mixture
 
 WAITS = [sys.executable, "-c", "import time; print(flush=True); time.sleep(600)"]
 
@@ -149,6 +151,57 @@ def test_an_error_after_an_interrupt_that_was_dealt_with_is_none() -> None:
     with kill_as_interrupt():
         assert not was_interrupted()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("usual_ctrl_c")
+def test_what_duckdb_makes_of_an_interrupt_is_raised_as_one() -> None:
+    @interrupts_raised
+    def asks(query: str) -> None:
+        """Asks `query`, and says of what DuckDB says that the store is damaged, as callers may."""
+        with duckdb.connect(config={"threads": 1}) as connection:
+            connection.create_function("stop", _stop, ["BIGINT"], "BIGINT")
+            try:
+                connection.sql(query).fetchall()
+            except duckdb.Error as error:
+                raise StoreError("is damaged") from error
+
+    with pytest.raises(KeyboardInterrupt):
+        asks("SELECT stop(1)")
+    with pytest.raises(StoreError):
+        asks("SELECT a")
+
+    def interrupts() -> None:
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(interrupts)
+        with pytest.raises(KeyboardInterrupt):
+            asks("SELECT sum(a.range * b.range) FROM range(9000000) a, range(9000000) b")
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        with pytest.raises(StoreError):  # what was handled before is none of its doing
+            asks("SELECT a")
+
+
+@pytest.mark.usefixtures("usual_ctrl_c")
+def test_an_interrupt_from_python_is_one_at_every_moment(store_path: Path, tmp_path: Path) -> None:
+    usual = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    done, after_s, panel = False, 0.01, tmp_path / "panel"
+    try:
+        while not done:
+            signal.setitimer(signal.ITIMER_REAL, after_s)
+            try:
+                with Store(store_path) as store:
+                    build_panel(store, load_mixture("coverage"), panel, force=True)
+                done = True
+            except KeyboardInterrupt:
+                after_s += 0.04
+            assert not panel.exists() or Panel.open(panel, verify=True).rows.size  # all or nothing
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, usual)
 
 
 def _stop(value: int) -> int:

@@ -15,6 +15,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import RunError
+from restock.interrupts import interrupts_raised
 from restock.train.dqn.network import torch_threads
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.evaluation.evaluation_plan import (
@@ -34,6 +35,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
 
 
+@interrupts_raised
 def evaluate(
     run: Path | str,
     *,
