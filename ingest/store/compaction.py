@@ -61,9 +61,9 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
         if store.path.has_table(RECORDINGS):
             _Fold.of(store).count(done)
         return done
-    fold(store, done)
-    for group in groups:
+    for group in groups:  # first: where one is damaged, the manifests stay as they are
         _merge_rows(store, group, done)
+    fold(store, done)
     return done
 
 

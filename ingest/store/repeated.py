@@ -55,10 +55,11 @@ class RepeatedDrive:
         return self.share_of_other > self.share
 
     def __str__(self) -> str:
+        whole = min(self.share, self.share_of_other) >= NEARLY_ALL
         return (
             f"{self.rows:,} transitions ({self.share:.0%}) are also in {self.source_file} "
             f"(recording {self.recording_id}, {self.share_of_other:.0%} of it), with other ids: "
-            "the same drive twice"
+            f"{'the same drive' if whole else 'a part of the same drive'} twice"
         )
 
 

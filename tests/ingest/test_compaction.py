@@ -282,6 +282,17 @@ def test_a_damaged_manifest_does_not_hide_a_repeated_drive_in_another(tmp_path):
     assert found.recording_id == f"{2:016x}"
 
 
+def test_a_damaged_file_of_rows_leaves_the_manifests_as_they_are(tmp_path):
+    writer = StoreWriter(tmp_path / "s")
+    writer.write_all([one(1), one(2)])
+    before = writer.files(RECORDINGS)
+    path = tmp_path / "s" / TRANSITIONS / writer.files(TRANSITIONS)[0].path
+    path.write_bytes(b"damaged")
+    with pytest.raises(StoreError, match=path.name):
+        compact(writer)
+    assert writer.files(RECORDINGS) == before
+
+
 def test_the_ends_of_episodes_outlive_compaction(tmp_path):
     """Of several recordings, one of which has none."""
     writer = StoreWriter(tmp_path / "s")

@@ -53,7 +53,7 @@ def test_the_whole_after_a_part_is_said(
         "share_of_other": 1.0,
         "held": 1.0,
     }
-    (note,) = (note for note in whole["notes"] if "same drive twice" in note)
+    (note,) = (note for note in whole["notes"] if "a part of the same drive twice" in note)
     assert str(part) in note
     assert f"`restock remove {store} {first['recording_id']}` takes out that one" in note
 
