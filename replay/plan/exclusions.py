@@ -248,6 +248,7 @@ class EvaluationRows:
     gap: Bools  # (N,) before the held end of an episode: neither learnt from nor evaluated on
     by: str  # as `EvaluationSplit.by`: what was done, where that is not what was asked for
     note: str = ""  # why not, for people
+    warning: str = ""  # of far more than was asked for
 
     @classmethod
     def none(cls, rows: int, note: str = "") -> EvaluationRows:
@@ -273,7 +274,7 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
     split = _split(table.filter(pa.array(admitted)), mixture)
     held, gap = np.zeros(len(table), np.bool_), np.zeros(len(table), np.bool_)
     held[admitted], gap[admitted] = split.held, split.gap
-    return EvaluationRows(held, gap, split.by, split.note)
+    return EvaluationRows(held, gap, split.by, split.note, split.warning)
 
 
 def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
@@ -291,7 +292,17 @@ def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
         ends = _ends_of_episodes(table, rule, mixture.n_step, longest)
         if len(np.unique(code[held])) == 1 and ends.held.any():
             return ends
-    return EvaluationRows(held, np.zeros(len(table), np.bool_), rule.by)
+    none, warning = np.zeros(len(table), np.bool_), ""
+    if not rule.robots and held.mean() > _WHOLE_AT_MOST * rule.share:
+        column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
+        kept, of = (len(np.unique(codes(table, column)[rows])) for rows in (held, ~none))
+        finer = "within_episode" if group == "episode" else "episode"
+        warning = (
+            f"the evaluation split holds out {held.mean():.0%} of the rows, where {rule.share:.0%}"
+            f" were asked for: {kept} of {counted(of, group)}, whole; [evaluation_split]"
+            f' by = "{finer}" comes nearer'
+        )
+    return EvaluationRows(held, none, rule.by, warning=warning)
 
 
 def _ends_of_episodes(

@@ -84,7 +84,7 @@ class PanelPlan:
     others: tuple[PinnedStore, ...] = ()  # besides the first store
     uncertain_rows: int = 0  # with a condition too near to call, of those admitted
     ratios: tuple[RatioFit, ...] = ()  # where a correction is by density ratio
-    warnings: tuple[str, ...] = ()  # of a source that may be an archive
+    warnings: tuple[str, ...] = ()  # of a source that may be an archive, or of the split
 
     @property
     def panel_rows(self) -> Ints:
@@ -162,11 +162,11 @@ def plan_panel(
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
     if others:
         met = episodes_met(connection, mixture, conditions)
         names = [named.name for named in strata]
-        warnings = look_for_archives(mixture.sources.said, met, names)
+        warnings += look_for_archives(mixture.sources.said, met, names)
     occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)
     worked_out = [

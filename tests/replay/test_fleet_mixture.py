@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from support.panels import EVERY, NO_SPLIT, panel_of, planned
 from support.stores import recording_transitions, write_store
@@ -123,6 +124,15 @@ def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
     assert {name for (name,) in found(panel, "SELECT robot FROM rows")} < {"a", "b"}
     with pytest.raises(MixtureError, match="have no robot"):  # a table that no store's view shows
         planned(tables[0], text)
+
+
+def test_a_split_that_holds_out_far_more_than_was_asked_says_so() -> None:
+    two = pa.concat_tables([recording_transitions(1), recording_transitions(2)])
+    plan = planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.1")
+    (warning,) = plan.warnings
+    assert f"holds out {plan.evaluation_split.mean():.0%} of the rows, where 10% were" in warning
+    assert "1 of 2 recordings, whole" in warning
+    assert not planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4").warnings
 
 
 def test_one_robot_cannot_be_split(tmp_path):
