@@ -91,7 +91,7 @@ class OpePlan:
     def updates(self) -> int:
         """How often a model is updated."""
         model = self.config.model
-        cloned = not (self.dataset.evaluation.probability > 0).all()
+        cloned = bool(self.dataset.evaluation.unlogged.any())
         return model.cloning_updates * cloned + (
             model.iterations * model.updates * len(self.measures)
         )
@@ -302,7 +302,7 @@ def behaviour_probability(
     As logged; where the logs do not say, by cloning the behaviour of the training rows.
     """
     steps = dataset.evaluation
-    unknown = ~(steps.probability > 0)
+    unknown = steps.unlogged
     probability = steps.probability.copy()
     if unknown.any():
         rows = dataset.training.rows

@@ -68,6 +68,11 @@ class OpeSteps:
             bumped_before=self.bumped_before[keep],
         )
 
+    @property
+    def unlogged(self) -> Bools:
+        """(N,) whether the logs do not say the probability of the action."""
+        return ~(self.probability > 0)
+
 
 @dataclass(frozen=True)
 class OpeDataset:
