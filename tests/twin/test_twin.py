@@ -226,6 +226,11 @@ def test_a_new_plan_makes_no_jump_in_progress() -> None:
     assert largest < 0.4  # no more than .2 s of driving
 
 
+def test_a_fixed_episode_that_is_no_spec_is_refused_at_once(env: WarehouseVectorEnv) -> None:
+    with pytest.raises(ConfigError, match="an episode must be a EpisodeSpec, got 'nominal'"):
+        env.set_episodes(["nominal"])  # type: ignore[list-item]
+
+
 def test_fixed_episodes_are_numbered_and_then_run_out() -> None:
     made = WarehouseVectorEnv(2)
     made.set_episodes([EpisodeSpec("nominal", seed) for seed in range(3)])

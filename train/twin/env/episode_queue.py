@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from restock.arrays import F64
-from restock.errors import ConfigError
+from restock.errors import ConfigError, expect
 from restock.state import Stateful
 from restock.train.twin.env.mission_arms import MissionArm, MissionArms, floor_place, perturbed
 from restock.train.twin.env.mission_orders import MissionOrders
@@ -111,8 +111,11 @@ class EpisodeQueue(Stateful):
         self.set_conditions(self.conditions)
 
     def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
-        """These are next, in order, for any environment."""
-        self.fixed, self.next_fixed = list(specs), 0
+        """These are next, in order, for any environment. Raises ArgumentError for other things."""
+        fixed = list(specs)
+        for spec in fixed:
+            expect("an episode", spec, EpisodeSpec, 'such as EpisodeSpec("nominal", seed=1)')
+        self.fixed, self.next_fixed = fixed, 0
 
     def next(self, env: int) -> tuple[EpisodeSpec, int, int]:
         """The episode that an environment begins now, its place among the fixed, and its arm.
