@@ -47,3 +47,15 @@ def ranges(
     out: Any,
     /,
 ) -> None: ...
+def keep_rows(
+    values: tuple[Any, Any, Any, Any],
+    logged: tuple[Any, Any],
+    logged_to: tuple[Any, ...],
+    logged_at: int,
+    ring: tuple[Any, ...],
+    slots: Any,
+    fresh_to: tuple[Any, ...],
+    fresh_at: int,
+    clocks: tuple[int, int],
+    /,
+) -> None: ...

@@ -1,9 +1,9 @@
 """Whether this installation has what `restock/compiled/` is, and whether it is used.
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
-network, the gather of a batch, draws by priority and the twin's lidar. Without it PyTorch, NumPy
-and MuJoCo do the same, updates and ranges to the rounding of sums. RESTOCK_NATIVE=0 (or no, false,
-off) asks for that.
+network, the gather of a batch and the record of its rows, draws by priority and the twin's lidar.
+Without it PyTorch, NumPy and MuJoCo do the same, updates and ranges to the rounding of sums.
+RESTOCK_NATIVE=0 (or no, false, off) asks for that.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from restock import native
 from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
@@ -29,9 +30,11 @@ from restock.train.feed.sampled_rows import (
     FRESH,
     GREEDY,
     LOGGED,
+    BatchValues,
     Columns,
     SampledRows,
     fresh_audit,
+    keep_rows,
     logged_audit,
     named,
     row_hashes,
@@ -84,6 +87,7 @@ class FeedRecord(Stateful):
         self.actions, self.greedy = actions, greedy
         self.labels, self.perturbations = labels, perturbations
         self.audit_share = audit_share
+        self._by_native = native.is_used()
         self._rng = np.random.default_rng([seed, 4])
         self._age_days = (
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
@@ -119,43 +123,29 @@ class FeedRecord(Stateful):
         Inside the update loop: only what will not be there any more when the interval is closed.
         `tail` (B, 3) is the rows' action, reward and discount, where whoever learnt has them.
         """
-        slots, logged = batch.slots, batch.logged
-        td, q = loss.td.cpu().numpy(), loss.q.cpu().numpy()
-        weight = np.ones_like(td) if batch.weight is None else batch.weight.cpu().numpy()
-        last = batch.rows[:, -3:].cpu() if tail is None else tail
-        action, reward, discount = last.numpy().T.copy()  # the buffer is filled again
-        action = action.astype(np.int16)
-        if logged:
-            self._logged.append(
-                batch.log_rows,
-                batch.log_stratum,
-                td[:logged],
-                q[:logged],
-                weight[:logged],
-                action[:logged],
-                reward[:logged],
-                discount[:logged],
-            )
+        last = batch.rows if tail is None else tail
+        values = BatchValues(
+            loss.td.cpu().numpy(),
+            loss.q.cpu().numpy(),
+            None if batch.weight is None else batch.weight.cpu().numpy(),
+            last.cpu().numpy()[:, -3:],
+        )
+        keep_rows(
+            values,
+            batch.log_rows,
+            batch.log_stratum,
+            batch.slots,
+            self.ring,
+            (env_steps, step),
+            self._logged,
+            self._fresh,
+            by_native=self._by_native,
+        )
+        if batch.logged:
             self._quota += batch.quota
             self._quota_batches += 1
-        meta = self.ring.meta
-        episode, episode_step = meta["episode"][slots], meta["episode_step"][slots]
-        self._before, self._last = self._last, (batch.log_rows, episode, episode_step)
-        if len(slots):
-            self._fresh.append(
-                self.ring.condition(slots),
-                episode,
-                episode_step,
-                meta["behaviour_policy"][slots],
-                env_steps - meta["env_step"][slots],
-                step - meta["gradient_step"][slots],
-                td[logged:],
-                q[logged:],
-                weight[logged:],
-                action[logged:],
-                reward[logged:],
-                discount[logged:],
-            )
+        self._before = self._last
+        self._last = batch.log_rows, *self._fresh.last_of("episode", "episode_step")
         if self._rng.random() < self.audit_share:
             self._audit(step, batch, last_sync)
 

@@ -1,18 +1,21 @@
 """Rows as they were sampled: columns that grow by a batch, their sums by episode, and audit rows.
 
-The update loop only appends; what is worked out of the columns is worked out once an interval, or
-for the few batches whose every row is written down.
+The update loop only appends, in one pass of compiled code where there is any; what is worked out of
+the columns is worked out once an interval, or for the few batches whose every row is written down.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from restock import native
+from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.train.feed.fresh_log import FreshPerturbations
@@ -36,46 +39,127 @@ FRESH: dict[str, DTypeLike] = {
     **_BATCH,
 }
 
+_OF_RING = ("episode", "episode_step", "behaviour_policy", "env_step", "gradient_step")
+_LEAST_ROOM = 1 << 12  # rows
+
 Columns = dict[str, Any]  # arrays, lists, or scalars that hold for all rows
 Arrays = Mapping[str, NDArray[Any]]  # (n,) each
 
 
 class SampledRows(Stateful):
-    """Columns (n,) of the rows sampled since `clear`: joined when they are asked for."""
+    """Columns (n,) of the rows sampled since `clear`."""
 
     STATE: ClassVar[tuple[str, ...]] = ("columns",)
 
     def __init__(self, kinds: Mapping[str, DTypeLike]) -> None:
         self._kinds = {name: np.dtype(kind) for name, kind in kinds.items()}
-        self._parts: list[tuple[NDArray[Any], ...]] = []
-        self.clear()
+        self._places = {name: place for place, name in enumerate(kinds)}
+        self._count = self._last = 0
+        self._held = self._made(0)  # more than there are rows
 
     def __len__(self) -> int:
-        return sum(len(part[0]) for part in self._parts)
+        return self._count
+
+    def grow(self, rows: int) -> tuple[tuple[NDArray[Any], ...], int]:
+        """Room for more rows: the columns, and where in them these begin."""
+        begin, self._last = self._count, self._count
+        self._count += rows
+        if self._count > len(self._held[0]):
+            longer = self._made(max(2 * self._count, _LEAST_ROOM))
+            for column, old in zip(longer, self._held, strict=True):
+                column[:begin] = old[:begin]
+            self._held = longer
+        return self._held, begin
 
     def append(self, *part: NDArray[Any]) -> None:
-        """Rows (n,), columns in their order. They are kept, not copied."""
-        self._parts.append(part)
+        """Rows (n,), columns in their order."""
+        columns, begin = self.grow(len(part[0]))
+        for column, values in zip(columns, part, strict=True):
+            column[begin : self._count] = values
 
     def clear(self) -> None:
-        self._parts = [tuple(np.empty(0, kind) for kind in self._kinds.values())]
+        """Begin again; `columns` that were taken stay as they are."""
+        if self._count:
+            self._held = self._made(self._count)  # as many as the interval before
+        self._count = self._last = 0
 
     @property
     def last(self) -> dict[str, NDArray[Any]]:
         """The rows last appended."""
-        return dict(zip(self._kinds, self._parts[-1], strict=True))
+        return self._since(self._last)
+
+    def last_of(self, *names: str) -> tuple[NDArray[Any], ...]:
+        """Some columns of the rows last appended."""
+        part = slice(self._last, self._count)
+        return tuple(self._held[self._places[name]][part] for name in names)
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
         """All rows."""
-        if len(self._parts) > 1:
-            joined = zip(self._kinds.values(), zip(*self._parts, strict=True), strict=True)
-            self._parts = [tuple(np.concatenate(parts, dtype=kind) for kind, parts in joined)]
-        return self.last
+        return self._since(0)
 
     @columns.setter
     def columns(self, columns: Arrays) -> None:
-        self._parts = [tuple(columns[name] for name in self._kinds)]
+        self._held = tuple(np.array(columns[name], kind) for name, kind in self._kinds.items())
+        self._count, self._last = len(self._held[0]), 0
+
+    def _since(self, begin: int) -> dict[str, NDArray[Any]]:
+        named = zip(self._kinds, self._held, strict=True)
+        return {name: column[begin : self._count] for name, column in named}
+
+    def _made(self, rows: int) -> tuple[NDArray[Any], ...]:
+        return tuple(np.empty(rows, kind) for kind in self._kinds.values())
+
+
+@dataclass(frozen=True)
+class BatchValues:
+    """What was worked out of each row of a batch (B,), its logged rows first."""
+
+    td: F32
+    q: F32
+    weight: F32 | None  # None: 1
+    tail: F32  # (B, 3) action, reward, discount
+
+
+def keep_rows(
+    values: BatchValues,
+    log_rows: Ints,  # (L,) of the panel
+    log_stratum: Ints,  # (L,)
+    slots: Ints,  # (B - L,) of the ring
+    ring: FreshRing,
+    clocks: tuple[int, int],  # environment steps and updates, now
+    logged: SampledRows,
+    fresh: SampledRows,
+    *,
+    by_native: bool,
+) -> None:
+    """Append a batch to the rows of both sources, LOGGED and FRESH; or have compiled code do it."""
+    meta, condition = ring.meta, ring.strata.stratum
+    of_ring = (condition, *(meta[name] for name in _OF_RING))
+    logged_to, logged_at = logged.grow(len(log_rows))
+    fresh_to, fresh_at = fresh.grow(len(slots))
+    if by_native:
+        native.compiled.keep_rows(
+            (values.td, values.q, values.weight, values.tail),
+            (log_rows, log_stratum),
+            logged_to,
+            logged_at,
+            of_ring,
+            slots,
+            fresh_to,
+            fresh_at,
+            clocks,
+        )
+        return
+    weight = np.ones_like(values.td) if values.weight is None else values.weight
+    of_rows = (values.td, values.q, weight, *values.tail.T)
+    condition, episode, step, policy, env_step, gradient_step = (of[slots] for of in of_ring)
+    ages = (clocks[0] - env_step, clocks[1] - gradient_step)
+    of_logs = (log_rows, log_stratum, *(of[: len(log_rows)] for of in of_rows))
+    of_fresh = (condition, episode, step, policy, *ages, *(of[len(log_rows) :] for of in of_rows))
+    for columns, begin, every in ((logged_to, logged_at, of_logs), (fresh_to, fresh_at, of_fresh)):
+        for column, found in zip(columns, every, strict=True):
+            column[begin : begin + len(found)] = found
 
 
 def episode_sums(
@@ -191,9 +275,11 @@ __all__ = [
     "FRESH",
     "GREEDY",
     "LOGGED",
+    "BatchValues",
     "SampledRows",
     "episode_sums",
     "fresh_audit",
+    "keep_rows",
     "logged_audit",
     "named",
 ]

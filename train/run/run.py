@@ -288,9 +288,12 @@ def _to_table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
     arrays = []
     for field in schema:
         value = columns[field.name]
-        if not _is_column(value):
-            value = [value] * length
-        arrays.append(pa.array(value, field.type, from_pandas=False))
+        if _is_column(value):
+            arrays.append(pa.array(value, field.type, from_pandas=False))
+        elif value is None:
+            arrays.append(pa.nulls(length, field.type))
+        else:
+            arrays.append(pa.repeat(pa.scalar(value, field.type), length))
     return pa.Table.from_arrays(arrays, schema=schema)
 
 

@@ -1,10 +1,10 @@
-/* `restock._native`: an update of a plain Q network, the drawing of its batches, and the twin's lidar,
- * compiled.
+/* `restock._native`: an update of a plain Q network, the drawing and the record of its batches, and the
+ * twin's lidar, compiled.
  *
  * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` with NumPy's and
  * `restock.train.twin` with MuJoCo's rays, in fewer calls and fewer passes over memory. Python's side is
- * `restock/native.py`, `train/dqn/native_backprop.py`, `replay/sampling/gather.py` and `priorities.py`,
- * `train/twin/physics/lidar.py`. Compiled with
+ * `restock/native.py`, `train/dqn/native_backprop.py`, `train/feed/sampled_rows.py`,
+ * `replay/sampling/gather.py` and `priorities.py`, `train/twin/physics/lidar.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
  * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.
@@ -13,6 +13,7 @@
 #include "learning.h"
 #include "network.h"
 #include "ranging.h"
+#include "recording.h"
 #include "sampling.h"
 
 static PyMethodDef module_methods[] = {
@@ -21,6 +22,7 @@ static PyMethodDef module_methods[] = {
     {"gather", gather, METH_VARARGS, gather_doc},
     {"find_places", find_places, METH_VARARGS, find_places_doc},
     {"ranges", ranges, METH_VARARGS, ranges_doc},
+    {"keep_rows", keep_rows, METH_VARARGS, keep_rows_doc},
     {NULL, NULL, 0, NULL},
 };
 

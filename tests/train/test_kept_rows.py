@@ -1,0 +1,107 @@
+"""Rows of batches as the record keeps them: compiled code and NumPy's write the same columns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from restock import native
+from restock.replay.ring.ring import FreshRing
+from restock.train.feed.sampled_rows import FRESH, LOGGED, BatchValues, SampledRows, keep_rows
+
+compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
+CAPACITY = 50
+
+
+def ring_of(rng: np.random.Generator) -> FreshRing:
+    """A ring whose metadata are any numbers."""
+    ring = FreshRing(
+        CAPACITY, 1, 4, discount=0.9, n_step=1, conditions=["a", "b"], behaviour_policies=["p"]
+    )
+    for name in ("episode", "episode_step", "behaviour_policy", "env_step", "gradient_step"):
+        ring.meta[name][:] = rng.integers(0, 30_000, CAPACITY)
+    ring.strata.stratum[:] = rng.integers(-1, 2, CAPACITY)
+    return ring
+
+
+def batch(rng: np.random.Generator, logged: int, fresh: int, weighted: bool) -> dict[str, Any]:
+    rows = logged + fresh
+    packed = rng.normal(size=(rows, 11)).astype(np.float32)
+    packed[:, 8] = rng.integers(0, 10, rows)
+    td, q, weight = rng.normal(size=(3, rows)).astype(np.float32)
+    return {
+        "values": BatchValues(td, q, weight if weighted else None, packed[:, -3:]),
+        "log_rows": rng.integers(0, 1 << 40, logged),
+        "log_stratum": rng.integers(0, 8, logged),
+        "slots": rng.integers(0, CAPACITY, fresh),
+        "clocks": (int(rng.integers(1 << 40)), int(rng.integers(1 << 40))),
+    }
+
+
+@compiled
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32),
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.booleans()), max_size=8),
+    st.integers(0, 8),
+)
+def test_compiled_code_keeps_what_numpy_does(
+    seed: int, sizes: list[tuple[int, int, bool]], cleared_after: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    ring = ring_of(rng)
+    both = [(SampledRows(LOGGED), SampledRows(FRESH)) for _ in range(2)]
+    for place, (logged, fresh, weighted) in enumerate(sizes):
+        one = batch(rng, logged, fresh, weighted)
+        for sources, by_native in zip(both, (True, False), strict=True):
+            to = {"ring": ring, "logged": sources[0], "fresh": sources[1], "by_native": by_native}
+            keep_rows(**one, **to)
+            if place == cleared_after:
+                taken = [(rows, dict(rows.columns)) for rows in sources]
+                before = [{name: of.copy() for name, of in told.items()} for _, told in taken]
+                for rows, _ in taken:
+                    rows.clear()
+                keep_rows(**one, **to)
+                for (_, told), held in zip(taken, before, strict=True):
+                    for name, of in held.items():
+                        assert np.array_equal(told[name], of)
+    for of_compiled, of_numpy in zip(*both, strict=True):
+        assert len(of_compiled) == len(of_numpy)
+        for name, column in of_compiled.columns.items():
+            assert column.dtype == of_numpy.columns[name].dtype
+            assert np.array_equal(column, of_numpy.columns[name]), name
+            assert np.array_equal(of_compiled.last[name], of_numpy.last[name])
+
+
+@compiled
+def test_what_does_not_fit_is_refused_and_nothing_is_read_outside() -> None:
+    rng = np.random.default_rng(0)
+    ring = ring_of(rng)
+
+    def kept(**changed: Any) -> None:
+        keep_rows(
+            **{**batch(rng, 3, 4, weighted=True), **changed},
+            ring=ring,
+            logged=SampledRows(LOGGED),
+            fresh=SampledRows(FRESH),
+            by_native=True,
+        )
+
+    for slots in ([0, 1, 2, CAPACITY], [0, 1, 2, -1]):
+        with pytest.raises(IndexError, match=f"slot {slots[-1]} is not one of {CAPACITY}"):
+            kept(slots=np.array(slots))
+    with pytest.raises(IndexError, match="room for 2 values, not 3"):
+        kept(log_rows=np.arange(2))
+    with pytest.raises(TypeError, match="contiguous vector of 'l'"):
+        kept(log_rows=np.arange(3, dtype=np.float64))
+    with pytest.raises(ValueError, match="slots has another shape"):
+        kept(slots=np.zeros(20, np.int64))
+    short = batch(rng, 3, 4, weighted=True)["values"]
+    with pytest.raises(IndexError, match="room for 6 values, not 7"):
+        kept(values=BatchValues(short.td[:6], short.q, short.weight, short.tail))
+    with pytest.raises((TypeError, ValueError)):
+        kept(values=BatchValues(short.td, short.q, short.weight, short.tail[:, :2]))
