@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -98,3 +99,25 @@ def test_pandas_that_a_command_did_not_look_for_works_once_it_is_imported() -> N
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["3", "1"], done.stderr
+
+
+@pytest.mark.parametrize(
+    ("verb", "environment", "threads"),
+    [("audit", {}, "1"), ("audit", {"OPENBLAS_NUM_THREADS": "3"}, "3"), ("train", {}, "")],
+)
+def test_a_short_command_starts_no_threads_of_blas(
+    verb: str, environment: dict[str, str], threads: str
+) -> None:
+    code = (
+        "import os, sys; from restock.cli import main; main(sys.argv[1:]);"
+        "sys.stderr.write(os.environ.get('OPENBLAS_NUM_THREADS', ''))"
+    )
+    inherited = {name: text for name, text in os.environ.items() if "_NUM_THREADS" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", code, verb, "--help"],
+        capture_output=True,
+        text=True,
+        env=inherited | environment,
+        check=True,
+    )
+    assert done.stderr == threads

@@ -66,6 +66,8 @@ FOLDERS = {
     "robot": ("node",),
     "start": ("start", "demo"),
 }
+# folders of verbs that multiply no large matrices
+ONE_THREAD_OF_BLAS = ("data", "upkeep", "pages", "pipeline")
 PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # of work that goes on where nobody reads it
 _FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
 
@@ -128,6 +130,8 @@ def _dispatch(args: list[str]) -> int:
         raise RestockError(f"no verb named {verb!r}", remedy=hint)
 
     when_imported("pyarrow", _settle_pandas)
+    if any(verb in FOLDERS[folder] for folder in ONE_THREAD_OF_BLAS):
+        _start_no_blas_threads()
 
     import tyro
 
@@ -170,6 +174,14 @@ def _settle_pandas() -> None:
 
     with hidden("pandas"):
         pa.array([])
+
+
+def _start_no_blas_threads() -> None:
+    """NumPy's OpenBLAS starts a thread a core while it is imported, and they wait for work in a
+    loop: a fifth of the CPU time of a short command on two cores, more on more. What it computes
+    then depends on the number of cores no more. A number that the environment gives stands."""
+    if "numpy" not in sys.modules:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _without_ros(args: list[str]) -> list[str]:
