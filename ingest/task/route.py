@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from restock import native
 from restock.arrays import F64
 
 ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
@@ -43,8 +44,12 @@ def view_route(
 ) -> RouteView:
     """Plans (N, P, 2) and poses (N,) to look-ahead points at `distances_m` along the plan.
 
-    A look-ahead point beyond the end of the plan is its end.
+    A look-ahead point beyond the end of the plan is its end. Compiled code, where there is some
+    (`restock.native`), does what NumPy does without it, to the last bit.
     """
+    cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
+    if native.is_used():
+        return _view_compiled(plans_m, pose_x_m, pose_y_m, cos, sin, distances_m)
     # Coordinate by coordinate on contiguous arrays: this runs at every step of the twin.
     x, y = np.ascontiguousarray(plans_m[..., 0]), np.ascontiguousarray(plans_m[..., 1])  # (N, P)
     start_x, start_y = x[:, :-1], y[:, :-1]
@@ -66,7 +71,6 @@ def view_route(
     here = arc[rows, nearest] + along[rows, nearest] * length[rows, nearest]
     total = arc[:, -1]
 
-    cos, sin = np.cos(pose_yaw_rad), np.sin(pose_yaw_rad)
     body = np.empty((len(plans_m), len(distances_m), 2))
     for column, ahead in enumerate(distances_m):
         target = np.minimum(here + ahead, total)
@@ -80,3 +84,23 @@ def view_route(
         body[:, column, 0] = cos * ahead_x + sin * ahead_y
         body[:, column, 1] = -sin * ahead_x + cos * ahead_y
     return RouteView(body, total - here, np.sqrt(distance2[rows, nearest]))
+
+
+def _view_compiled(
+    plans_m: F64, x_m: F64, y_m: F64, cos: F64, sin: F64, distances_m: Sequence[float]
+) -> RouteView:
+    count = len(plans_m)
+    look_ahead_m = np.empty((count, len(distances_m), 2))
+    remaining_m, offset_m = np.empty(count), np.empty(count)
+    native.compiled.view_plans(
+        np.ravel(plans_m),
+        np.ascontiguousarray(x_m),
+        np.ascontiguousarray(y_m),
+        cos,
+        sin,
+        np.array(distances_m),
+        look_ahead_m.reshape(-1),
+        remaining_m,
+        offset_m,
+    )
+    return RouteView(look_ahead_m, remaining_m, offset_m)

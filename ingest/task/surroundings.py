@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from restock.arrays import F64, Ints
+from restock import native
+from restock.arrays import F64
 from restock.ingest.task.scan import Body, outline_reach
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
@@ -24,10 +26,12 @@ LEAST_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
 # The signals that it takes.
-SCANNED = (
-    *("stamp_ns", "gyro_yaw_rate_radps", "sector_clearance_m"),
+MOTION = (
+    *("stamp_ns", "gyro_yaw_rate_radps"),
     *("localised_speed_mps", "localised_lateral_mps"),
 )
+SCANNED = (*MOTION, "sector_clearance_m")
+_ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
 
 
 def steps_remembered(task: Task) -> int:
@@ -53,48 +57,67 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     clearance, count = now["sector_clearance_m"], task.sectors
     if not count:
         return np.full(len(clearance), np.nan)
-    bearing, reach = _sectors(count, task.body)
+    elapsed_s = (now["stamp_ns"] - earlier[0]["stamp_ns"]) * 1e-9
+    walked_m = FASTEST_MPS * np.maximum(elapsed_s, LEAST_S)
+    before = np.array([one["sector_clearance_m"] for one in earlier])
+    motions = _motions([now, *earlier])
+    if not native.is_used():
+        return _came_by_numpy(task, clearance, before, motions, walked_m)
+    sectors, came = _sectors(count, task.body), np.empty(len(clearance))
+    native.compiled.find_came(  # the same, to the last bit
+        *(np.ravel(clearance), before.reshape(-1), motions.reshape(-1)),
+        walked_m,
+        *(sectors.cos, sectors.sin, sectors.reach_m, sectors.ends),
+        came,
+        (NEAR_M, task.range_max_m - _ROUNDING_M, task.body.lidar_x_m),
+    )
+    return came
+
+
+def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked_m: F64) -> F64:
+    count, sectors = task.sectors, _sectors(task.sectors, task.body)
     # The same scan again, of a lidar slower than the steps, tells nothing.
-    told = (clearance != earlier[0]["sector_clearance_m"]).any(axis=1)
+    told = (clearance != before[0]).any(axis=1)
     row, sector = np.nonzero((clearance < NEAR_M) & told[:, None])
-    distance = (clearance + reach)[row, sector]
+    distance = (clearance + sectors.reach_m)[row, sector]
     lever = task.body.lidar_x_m  # points are of the lidar, turns about the middle of the body
-    x, y = distance * np.cos(bearing[sector]) + lever, distance * np.sin(bearing[sector])
+    x, y = distance * sectors.cos[sector] + lever, distance * sectors.sin[sector]
     came = np.full(len(row), np.inf)
-    after = now
-    for before in earlier:
+    for scan, motion in zip(before, motions, strict=True):
         if not len(row):
             break
-        x, y = _seen_from(before, after, row, x, y)
+        moved_x, moved_y, cos, sin = motion[:, row]
+        x, y = moved_x + cos * x - sin * y, moved_y + sin * x + cos * y
         x_of_lidar = x - lever
-        place = ((np.arctan2(y, x_of_lidar) + np.pi) * (count / (2 * np.pi))).astype(np.intp)
-        around = (np.minimum(place, count - 1)[:, None] + (-1, 0, 1)) % count
-        seen = before["sector_clearance_m"][row[:, None], around]
-        seen = np.where(seen < task.range_max_m - 1e-6, seen + reach[around], np.inf)
+        place = np.searchsorted(sectors.ends, _turned(x_of_lidar, y), side="right")
+        around = (place[:, None] + (-1, 0, 1)) % count
+        seen = scan[row[:, None], around]
+        farthest = task.range_max_m - _ROUNDING_M
+        seen = np.where(seen < farthest, seen + sectors.reach_m[around], np.inf)
         farther = seen.min(axis=1)
         gain = np.where(np.isinf(farther), 0.0, farther - np.hypot(x_of_lidar, y))
         came = np.minimum(came, gain)
         left = came > 0
         row, x, y, came = row[left], x[left], y[left], came[left]
-        after = before
-    elapsed_s = (now["stamp_ns"] - earlier[0]["stamp_ns"]) * 1e-9
-    walked = came <= FASTEST_MPS * np.maximum(elapsed_s, LEAST_S)[row]
+    walked = came <= walked_m[row]
     most = np.zeros(len(clearance))
     np.maximum.at(most, row[walked], came[walked])
     return most
 
 
-def _seen_from(before: Signals, after: Signals, row: Ints, x: F64, y: F64) -> tuple[F64, F64]:
-    """Points (n,) of these rows in the body frame of `after`, in that of the step before."""
-    elapsed_s = (after["stamp_ns"] - before["stamp_ns"]) * 1e-9
-    turn = elapsed_s * (after["gyro_yaw_rate_radps"] + before["gyro_yaw_rate_radps"]) / 2
-    forward, left = (
-        elapsed_s * after[name] for name in ("localised_speed_mps", "localised_lateral_mps")
-    )
+def _motions(scans: Sequence[Signals]) -> F64:
+    """Of steps, the last one first: from each one's body frame to that of the step before, as x, y,
+    cosine and sine of the turn, (steps - 1, 4, N)."""
+    stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in MOTION)
+    elapsed_s = (stamp_ns[:-1] - stamp_ns[1:]) * 1e-9
+    turn = elapsed_s * (rate[:-1] + rate[1:]) / 2
+    forward, left = elapsed_s * forward[:-1], elapsed_s * left[:-1]
     half_cos, half_sin = np.cos(turn / 2), np.sin(turn / 2)  # motion is along the mean heading
-    moved_x, moved_y = forward * half_cos - left * half_sin, forward * half_sin + left * half_cos
-    cos, sin = np.cos(turn)[row], np.sin(turn)[row]
-    return moved_x[row] + cos * x - sin * y, moved_y[row] + sin * x + cos * y
+    motions = np.empty((len(turn), 4, turn.shape[1]))
+    motions[:, 0] = forward * half_cos - left * half_sin
+    motions[:, 1] = forward * half_sin + left * half_cos
+    motions[:, 2], motions[:, 3] = np.cos(turn), np.sin(turn)
+    return motions
 
 
 def plan_distances_m(task: Task) -> tuple[float, ...]:
@@ -121,6 +144,20 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
     if task.goal == "none" or not task.sectors:
         return none, none.copy()
     x, y = sector_returns(task, clearance_m)
+    limits = (
+        float(task.range_max_m),
+        float(task.range_max_m**2),
+        (task.body.width_m / 2) ** 2,
+        GAP_WITHIN * task.near_m,
+    )
+    if native.is_used():  # the same, to the last bit
+        way_m, gap_m = np.empty(len(none)), np.empty(len(none))
+        native.compiled.find_returns(
+            *(np.ravel(x), np.ravel(y), np.ravel(clearance_m), np.ravel(plan_m)),
+            *(way_m, gap_m, limits),
+        )
+        return way_m, gap_m
+    range_m, range2, on_plan2, ahead_m = limits
     off2 = np.full(clearance_m.shape, np.inf)  # of each return from the plan, squared
     along_m = np.zeros(clearance_m.shape)  # the plan, to where it is nearest
     passed = np.zeros((len(none), 1))
@@ -134,23 +171,42 @@ def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64
         off2 = np.where(nearer, aside2, off2)
         along_m = np.where(nearer, passed + part * np.sqrt(length2), along_m)
         passed = passed + np.sqrt(length2)
-    seen = clearance_m < task.range_max_m
-    on_it = seen & (off2 <= (task.body.width_m / 2) ** 2)
-    ahead = seen & (along_m <= GAP_WITHIN * task.near_m)
-    way_m = np.where(on_it, along_m, task.range_max_m).min(axis=1)
-    gap_m = np.sqrt(np.where(ahead, off2, task.range_max_m**2).min(axis=1))
-    return way_m, np.minimum(gap_m, task.range_max_m)
+    seen = clearance_m < range_m
+    way_m = np.where(seen & (off2 <= on_plan2), along_m, range_m).min(axis=1)
+    gap_m = np.sqrt(np.where(seen & (along_m <= ahead_m), off2, range2).min(axis=1))
+    return way_m, np.minimum(gap_m, range_m)
 
 
 def sector_returns(task: Task, clearance_m: F64) -> tuple[F64, F64]:
     """x and y (N, K) in the body frame of each sector's nearest return, of clearances (N, K)."""
-    bearing, reach = _sectors(task.sectors, task.body)
-    distance = clearance_m + reach
-    return distance * np.cos(bearing) + task.body.lidar_x_m, distance * np.sin(bearing)
+    sectors = _sectors(task.sectors, task.body)
+    distance = clearance_m + sectors.reach_m
+    return distance * sectors.cos + task.body.lidar_x_m, distance * sectors.sin
+
+
+class _Sectors(NamedTuple):
+    cos: F64  # (K,), of the middle bearing
+    sin: F64
+    reach_m: F64  # (K,), how far the body reaches that way
+    ends: F64  # (K - 1,), where each but the last ends, as `_turned`
 
 
 @lru_cache(maxsize=64)
-def _sectors(count: int, body: Body) -> tuple[F64, F64]:
-    """The middle bearing of each sector (K,), and how far the body reaches that way."""
-    bearing = np.asarray((np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi, np.float64)
-    return bearing, outline_reach(bearing, body)
+def _sectors(count: int, body: Body) -> _Sectors:
+    width_rad = 2 * np.pi / count
+    bearing = np.asarray((np.arange(count) + 0.5) * width_rad - np.pi, np.float64)
+    ends = np.arange(1, count) * width_rad - np.pi
+    return _Sectors(
+        np.cos(bearing),
+        np.sin(bearing),
+        np.asarray(outline_reach(bearing, body), np.float64),
+        _turned(np.cos(ends), np.sin(ends)),
+    )
+
+
+def _turned(x: F64, y: F64) -> F64:
+    """What grows with the bearing of points as that does, from -2 behind the robot to 2, and is
+    rounded alike wherever it is computed."""
+    far = np.abs(x) + np.abs(y)
+    part = y / np.where(far > 0, far, 1.0)
+    return np.where(x >= 0, part, np.where(y >= 0, 2.0 - part, -2.0 - part))

@@ -59,3 +59,38 @@ def keep_rows(
     clocks: tuple[int, int],
     /,
 ) -> None: ...
+def view_plans(
+    plans: Any,
+    x: Any,
+    y: Any,
+    cosine: Any,
+    sine: Any,
+    ahead: Any,
+    look_ahead: Any,
+    remaining: Any,
+    offset: Any,
+    /,
+) -> None: ...
+def find_returns(
+    x: Any,
+    y: Any,
+    clearance: Any,
+    plan: Any,
+    way: Any,
+    gap: Any,
+    limits: tuple[float, float, float, float],
+    /,
+) -> None: ...
+def find_came(
+    clearance: Any,
+    before: Any,
+    motions: Any,
+    walked: Any,
+    cosine: Any,
+    sine: Any,
+    reach: Any,
+    ends: Any,
+    came: Any,
+    limits: tuple[float, float, float],
+    /,
+) -> None: ...

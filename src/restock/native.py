@@ -1,8 +1,9 @@
 """Whether this installation has what `restock/compiled/` is, and whether it is used.
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
-network, the gather of a batch and the record of its rows, draws by priority and the twin's lidar.
-Without it PyTorch, NumPy and MuJoCo do the same, updates and ranges to the rounding of sums.
+network, the gather of a batch and the record of its rows, draws by priority, the twin's lidar, and
+what robots see of their plans and of who comes near. Without it PyTorch, NumPy and MuJoCo do the
+same, updates and ranges to the rounding of sums.
 RESTOCK_NATIVE=0 (or no, false, off) asks for that.
 """
 
@@ -30,7 +31,7 @@ else:
 
 
 def is_used() -> bool:
-    """Whether compiled code updates plain networks on the CPU, draws batches and ranges there."""
+    """Whether compiled code does what it can."""
     return IS_THERE and os.environ.get(SWITCH, "").lower() not in ("0", "no", "false", "off")
 
 

@@ -1,10 +1,11 @@
-/* `restock._native`: an update of a plain Q network, the drawing and the record of its batches, and the
- * twin's lidar, compiled.
+/* `restock._native`: an update of a plain Q network, the drawing and the record of its batches, the
+ * twin's lidar, and what robots see of their plans and of who comes near, compiled.
  *
- * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` with NumPy's and
- * `restock.train.twin` with MuJoCo's rays, in fewer calls and fewer passes over memory. Python's side is
- * `restock/native.py`, `train/dqn/native_backprop.py`, `train/feed/sampled_rows.py`,
- * `replay/sampling/gather.py` and `priorities.py`, `train/twin/physics/lidar.py`. Compiled with
+ * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` and
+ * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
+ * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/native_backprop.py`,
+ * `train/feed/sampled_rows.py`, `replay/sampling/gather.py` and `priorities.py`,
+ * `train/twin/physics/lidar.py`, `ingest/task/route.py` and `surroundings.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
  * gives the same bits. x86-64 with AVX2 and FMA, GCC or Clang; elsewhere it does not compile, or
  * importing it fails, and these do the work. Stable ABI: one build serves Python 3.11 and later.
@@ -15,6 +16,7 @@
 #include "ranging.h"
 #include "recording.h"
 #include "sampling.h"
+#include "surroundings.h"
 
 static PyMethodDef module_methods[] = {
     {"td_loss", td_loss, METH_VARARGS, td_loss_doc},
@@ -23,6 +25,9 @@ static PyMethodDef module_methods[] = {
     {"find_places", find_places, METH_VARARGS, find_places_doc},
     {"ranges", ranges, METH_VARARGS, ranges_doc},
     {"keep_rows", keep_rows, METH_VARARGS, keep_rows_doc},
+    {"view_plans", view_plans, METH_VARARGS, view_plans_doc},
+    {"find_returns", find_returns, METH_VARARGS, find_returns_doc},
+    {"find_came", find_came, METH_VARARGS, find_came_doc},
     {NULL, NULL, 0, NULL},
 };
 
