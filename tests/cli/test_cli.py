@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -56,6 +57,24 @@ def test_a_wrong_flag_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert captured.out == ""
     assert "--jsn" in captured.err
     assert "Traceback" not in captured.err
+
+
+@pytest.mark.parametrize(
+    "words", [("gap", "S", "--episodes", "3"), ("fit",), ("layout", "--foot")], ids=" ".join
+)
+def test_a_complaint_about_a_job_names_the_help_of_the_job(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["twin", *words]) == ExitCode.USAGE
+    helps = re.findall(r"restock [a-z ]*--help", capsys.readouterr().err)
+    assert set(helps) == {f"restock twin {words[0]} --help"}
+
+
+def test_an_option_that_may_be_left_out_takes_its_names_and_not_none(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["train", "--device", "None"]) == ExitCode.USAGE
+    assert "one of ('cpu', 'cuda')" in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
 def test_no_arguments_is_a_usage_error() -> None:

@@ -135,18 +135,23 @@ def _dispatch(args: list[str]) -> int:
 
     import tyro
 
-    from restock.cli.command_line import prepared, refuse_empty_paths
+    from restock.cli.command_line import jobs_of, prepared, refuse_empty_paths
     from restock.cli.help import printed
 
     asked = bool({"-h", "--help"} & set(args))
+    command, name, rest = command_of(verb), f"restock {verb}", args[1:]
+    if job := jobs_of(command).get(
+        rest[0] if rest else ""
+    ):  # else tyro's hints have no verb in them
+        command, name, rest = job, f"{name} {rest[0]}", rest[1:]
     try:
-        command = prepared(command_of(verb), explained=asked)
+        command = prepared(command, explained=asked)
         with printed(help_asked=asked):
             parsed = tyro.cli(
                 command,
-                prog=f"restock {verb}",
+                prog=name,
                 description=command.__doc__ if asked else None,
-                args=_without_ros(args[1:]) if verb == "node" else args[1:],
+                args=_without_ros(rest) if verb == "node" else rest,
                 use_underscores=False,
                 config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
             )

@@ -59,6 +59,22 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     return command
 
 
+def jobs_of(command: type[Any]) -> dict[str, type[Any]]:
+    """A verb's commands of its own, by name: `gap` of `twin`."""
+    found = {}
+    for hint in typing.get_type_hints(command, include_extras=True).values():
+        for one in typing.get_args(_bare(hint)):
+            kind, *told = typing.get_args(one) or (one,)
+            if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+                found[next(t.name for t in told if getattr(t, "name", None))] = kind
+    return found
+
+
+def _bare(hint: Any) -> Any:
+    """A type without what is annotated."""
+    return typing.get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
+
+
 def _texts(command: type[Any]) -> dict[str, str]:
     """What stands below each field, in one line: tyro would keep the line breaks of the source."""
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(command))).body
@@ -128,13 +144,29 @@ def _prepared(hint: Any, default: Any) -> Any:
         optional = len(kinds) < len(typing.get_args(bare))
         jobs = [_job(kind) for kind in kinds]
         bare = typing.Optional[jobs[0]] if optional else typing.Union[tuple(jobs)]  # noqa: UP007, UP045
-        if optional:
+        if optional and typing.get_origin(kinds[0]) is Literal:
+            extras.insert(0, _one_of(kinds[0]))
+        elif optional:
             extras.insert(0, tyro.conf.arg(metavar=_metavar(kinds[0])))
     elif bare in _METAVARS:
         extras.insert(0, tyro.conf.arg(metavar=_METAVARS[bare]))
     if default in (None, ()) or isinstance(default, bool) or typing.get_origin(bare) is tuple:
         extras.insert(0, tyro.conf.arg(help_behavior_hint=""))
     return Annotated[(bare, *extras)] if extras else bare
+
+
+def _one_of(literal: Any) -> tyro.constructors.PrimitiveConstructorSpec[str | None]:
+    """An option that takes one of a few names, or is left out. tyro's own takes None, too, and its
+    complaint has that among the names, in an order that changes."""
+    names = typing.get_args(literal)
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=_metavar(literal),
+        instance_from_str=lambda given: given[0],
+        is_instance=lambda value: value is None or value in names,
+        str_from_instance=lambda value: [str(value)],
+        choices=names,
+    )
 
 
 def _job(kind: Any) -> Any:

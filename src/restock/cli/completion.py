@@ -5,7 +5,6 @@ It is made of the verbs' own argument structs, once, so that a Tab starts no Pyt
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import typing
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from restock.cli.command_line import Names
+from restock.cli.command_line import Names, jobs_of
 
 # option -> the folder of the TOML files whose names it takes; it takes files, too
 SHIPPED = {
@@ -51,17 +50,12 @@ class CompletionCommand:
 
 def words_of(command: type[Any]) -> Words:
     """The command line of a verb's dataclass."""
-    options, choices, jobs = ["--help"], dict[str, tuple[str, ...]](), dict[str, Words]()
+    options, choices = ["--help"], dict[str, tuple[str, ...]]()
+    jobs = {job: words_of(kind) for job, kind in jobs_of(command).items()}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
         bare, *extras = typing.get_args(hint) if _is(hint, Annotated) else (hint,)
         kinds = [one for one in typing.get_args(bare) if one is not type(None)] or [bare]
-        subcommands = [one for one in kinds if _is(one, Annotated)]
-        for one in subcommands:
-            kind, *told = typing.get_args(one)
-            if dataclasses.is_dataclass(kind):
-                named = next(t.name for t in told if getattr(t, "name", None))
-                jobs[named] = words_of(typing.cast("type[Any]", kind))
-        if jobs and subcommands:
+        if jobs and any(_is(one, Annotated) for one in kinds):
             continue
         literal = next((one for one in (bare, *kinds) if _is(one, Literal)), None)
         told_name = next((e.name for e in extras if getattr(e, "name", None)), None)

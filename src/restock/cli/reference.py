@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import tyro
 
 from restock.cli import VERBS, command_of, usage
-from restock.cli.command_line import _metavar, prepared
+from restock.cli.command_line import _bare, _metavar, jobs_of, prepared
 from restock.words import between
 
 BEGIN = "<!-- verbs: written by `python -m restock.cli.reference docs/cli.md` -->"
@@ -53,7 +53,7 @@ def markdown() -> str:
 def _entry(name: str, command: type[Any], level: str) -> Iterator[str]:
     """A verb's section; then one for each of its jobs, a level deeper."""
     prepared(command, explained=True)
-    jobs = dict(_jobs(command))
+    jobs = jobs_of(command)
     arguments = [] if jobs else [_argument(field) for field in dataclasses.fields(command)]
     arguments.sort(key=lambda one: one.is_option)
     words = [one.usage for one in arguments if not one.is_option or one.is_required]
@@ -68,15 +68,6 @@ def _entry(name: str, command: type[Any], level: str) -> Iterator[str]:
         yield "\n".join(f"- `{one.form}`: {_linked(one.text)}" for one in arguments)
     for job, kind in jobs.items():
         yield from _entry(f"{name} {job}", kind, f"{level}#")
-
-
-def _jobs(command: type[Any]) -> Iterator[tuple[str, type[Any]]]:
-    """A verb's commands of its own: name and dataclass."""
-    for field in dataclasses.fields(command):
-        for one in typing.get_args(_bare(field.type)):
-            kind, *told = typing.get_args(one) or (one,)
-            if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-                yield next(t.name for t in told if getattr(t, "name", None)), kind
 
 
 def _argument(field: dataclasses.Field[Any]) -> Argument:
@@ -107,11 +98,6 @@ def _argument(field: dataclasses.Field[Any]) -> Argument:
         takes = f"{flag} {takes}".strip()
         text += " Required." * is_required
     return Argument(takes, text, is_option, is_required)
-
-
-def _bare(hint: Any) -> Any:
-    """A type without what is annotated."""
-    return typing.get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
 
 
 def _paragraphs(text: str) -> Iterator[str]:

@@ -27,7 +27,3 @@ class TwinCommand:
         | Annotated[LayoutCommand, tyro.conf.subcommand("layout", prefix_name=False)]
         | Annotated[RobotCommand, tyro.conf.subcommand("robot", prefix_name=False)]
     ]
-
-    def run(self) -> int:
-        """Do the job."""
-        return self.job.run()
