@@ -21,6 +21,7 @@ from restock.replay.store.parquet_views import read_parquet
 from restock.replay.store.store import Store, is_store
 
 RUN_CONFIG = "config.json"
+_MADE_BY = {"panel": "mix --out", "run": "train --out"}
 
 
 @contextmanager
@@ -37,15 +38,16 @@ def open_place(
 
     Args:
         path: the place: a folder, or `s3://bucket/prefix` for a store.
-        beside: more places, each under a schema of its own: `{"run": "runs/a"}` gives
-            `run.audit`. Runs and panels only.
+        beside: a run and a panel, each under a schema of its own: `{"run": "runs/a"}` gives
+            `run.audit`, `{"panel": "panel"}` gives `panel.rows`.
         memory_limit: of DuckDB, for a store.
         only_store: take nothing but a store.
         version: of a store; the newest.
 
     Raises:
-        StoreError: there is nothing that can be queried, or no such version; or what is beside a
-            store has logged rows, all of them of recordings that the store does not hold.
+        StoreError: there is nothing that can be queried, or no such version; or what is beside it
+            is no run or panel, or has logged rows, all of them of recordings that the store does
+            not hold.
     """
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
@@ -60,7 +62,7 @@ def open_place(
     if version is not None:
         raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")
     with duckdb.connect() as connection:
-        if not _add(connection, path, "main"):
+        if _add(connection, path, "main") is None:
             raise StoreError(
                 "it is not a store, a run or a panel" if path.exists() else "it does not exist",
                 where=str(path),
@@ -76,8 +78,15 @@ def _add_all(
 ) -> None:
     for schema, path in (beside or {}).items():
         connection.execute(f'CREATE SCHEMA "{schema}"')
-        if not _add(connection, Path(path), schema):
-            raise StoreError(f"not a {schema}", where=str(path))
+        kind = _add(connection, Path(path), schema)
+        if kind == schema:
+            continue
+        what = f"not a {schema}" if Path(path).exists() else f"no such {schema}"
+        raise StoreError(
+            f"is a {kind}, not a {schema}" if kind else what,
+            where=str(path),
+            remedy=f"give a folder that `restock {_MADE_BY[schema]}` wrote",
+        )
 
 
 def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> None:
@@ -104,8 +113,8 @@ def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> Non
             )
 
 
-def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool:
-    """Views of a run or a panel in a schema; False where it is neither."""
+def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str | None:
+    """Views of a run or a panel in a schema; returns which it is, None where it is neither."""
     from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 
     if (path / HEADER).is_file():
@@ -114,10 +123,10 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
             _add_table(connection, schema, view, path / name)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
-        return True
+        return "panel"
     tables = sorted(path.glob("*.parquet"))
     if not tables or not (path / RUN_CONFIG).is_file():
-        return False
+        return None
     files = {file.stem: file for file in tables}
     files |= {f"eval_{file.stem}": file for file in sorted(path.glob("eval/*.parquet"))}
     for view, file in files.items():
@@ -132,7 +141,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> bool
         _add_replay_audit(connection, path, schema)
     if "eval_episodes" in files:
         _add_returns(connection, files["eval_episodes"], schema)
-    return True
+    return "run"
 
 
 def _add_table(connection: duckdb.DuckDBPyConnection, schema: str, view: str, file: Path) -> None:

@@ -187,8 +187,21 @@ def test_wrong_places_are_refused(
     assert "it does not exist" in out_of(capsys, str(tmp_path / "x"), "SELECT 1", code=2)
     err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path), code=2)
     assert "not a run" in err
+    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(tmp_path / "x"), code=2)
+    assert "no such run" in err
     err = out_of(capsys, str(store_path), "SELECT 1", "--json", "--csv", code=2)
     assert "choose one" in err
+
+
+def test_a_run_is_not_taken_for_a_panel_nor_a_panel_for_a_run(
+    store_path: Path, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    err = out_of(capsys, str(store_path), "SELECT 1", "--panel", str(run_dir), code=2)
+    assert f"{run_dir}: is a run, not a panel" in err
+    assert "`restock mix --out`" in err
+    panel = panel_of(store_path, load_mixture("uniform"), tmp_path / "p")
+    err = out_of(capsys, str(store_path), "SELECT 1", "--run", str(panel.path), code=2)
+    assert f"{panel.path}: is a panel, not a run" in err
 
 
 def test_without_a_query_there_is_a_prompt(
