@@ -124,26 +124,33 @@ def _takes_a_stream(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def refuse_folder(path: Path | None, option: str) -> None:
-    """Refuse a folder where an option names a file to write: before the work, not after it.
-
-    Raises:
-        ConfigError: it is one.
-    """
-    if path is not None and path.is_dir():
-        raise ConfigError(
-            f"{path} is a folder, and a file is to be written",
-            where=option,
-            remedy="give the name of a file, in this folder for example",
-        )
-
-
 # What marks a folder that Restock writes, and its name for people.
 _MARKS = {
     "panel.json": "the panel",
     "transitions/_delta_log": "the store",
     "progress.parquet": "the run",
 }
+
+
+def expect_file_place(path: Path | None, option: str, *, run: Path | None = None) -> None:
+    """Refuse a place where an option's file cannot be, or would be lost: before the work.
+
+    Args:
+        run: what the file is about, where that is a run: it may lie in the run's folder.
+
+    Raises:
+        ConfigError: it is a folder, or lies within a panel, a store or another run.
+    """
+    if path is None:
+        return
+    if path.is_dir():
+        raise ConfigError(
+            f"{path} is a folder, and a file is to be written",
+            where=option,
+            remedy="give the name of a file, in this folder for example",
+        )
+    if why := _within(path, run):
+        raise ConfigError(f"{path} {why}", where=option, remedy="choose another place")
 
 
 def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
@@ -162,12 +169,18 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
         why = f"cannot be made: {parent} may not be written"
     elif any(map(is_undecoded, str(absolute))):
         why = "cannot be made: its path is not UTF-8, and other libraries cannot write there"
-    for folder in absolute.parents:
-        for mark, kind in _MARKS.items():
-            if (folder / mark).exists():
-                why = f"is within {kind} {folder}: what replaces or removes that removes this, too"
-    if why is not None:
+    if why := _within(path) or why:
         raise error(why, where=str(path), remedy="choose another --out")
+
+
+def _within(path: Path, run: Path | None = None) -> str | None:
+    """Why nothing is written there, where it lies within a panel, a store or another run."""
+    for folder in path.absolute().parents:
+        for mark, kind in _MARKS.items():
+            own = kind == "the run" and run is not None and run.resolve() == folder.resolve()
+            if (folder / mark).exists() and not own:
+                return f"is within {kind} {folder}: what replaces or removes that removes this, too"
+    return None
 
 
 def is_undecoded(letter: str) -> bool:
@@ -244,13 +257,13 @@ def is_running(process: int) -> bool:
 
 __all__ = [
     "building",
+    "expect_file_place",
     "expect_place",
     "first_line",
     "is_undecoded",
     "is_running",
     "read_json",
     "read_table",
-    "refuse_folder",
     "remove_leftovers",
     "temporary_name",
     "write_bytes",

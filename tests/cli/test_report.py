@@ -775,6 +775,26 @@ def test_the_verb_prints_where_the_page_is(
     assert said == {"report": str(out), "bytes": out.stat().st_size}
 
 
+def test_no_page_or_schema_is_written_into_a_store_nor_into_another_run(
+    run: Path, store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "run"
+    shutil.copytree(run, own)
+    before = sorted([*store_path.rglob("*"), *run.rglob("*")])
+    store = str(store_path)
+    for words, place in (
+        (["report", str(own), "--out", str(run / "page.html")], f"the run {run}"),
+        (["report", str(own), "--figures", str(store_path / "figures")], f"the store {store}"),
+        (["coverage", store, "--out", str(store_path / "page.html")], f"the store {store}"),
+        (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
+        (["schema", "--out", store], f"the store {store}"),
+    ):
+        assert cli.main(words) == 2
+        assert f"is within {place}:" in " ".join(capsys.readouterr().err.split())
+    assert sorted([*store_path.rglob("*"), *run.rglob("*")]) == before
+    assert cli.main(["report", str(own), "--out", str(own / "pages" / "page.html")]) == 0
+
+
 def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for place, said in (
         (tmp_path / "nothing", "no such run"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from support.kept_run import kept_run
+from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError
@@ -73,6 +74,19 @@ def test_eval_drives_it_like_the_agent_it_is(run: Path, tmp_path: Path, capsys) 
     }
     assert by["agent"] == by[f"run:{run}"]
     assert [row[:3] for row in by["agent"]] == [row[:3] for row in by[f"onnx:{out}"]]
+
+
+def test_a_policy_is_written_into_no_store_and_into_no_run_but_its_own(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = write_store(tmp_path / "store", [recording_transitions(1)])
+    other = kept_run(tmp_path / "other")
+    for place, said in ((store, "the store"), (other, "the run")):
+        out = place / "p.onnx"
+        assert main(["export", str(run), "--to", "onnx", "--out", str(out)]) == 2
+        assert f"is within {said} {place}:" in " ".join(capsys.readouterr().err.split())
+        assert not out.exists()
+    assert main(["export", str(other), "--to", "onnx", "--out", str(other / "p.onnx")]) == 0
 
 
 def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, capsys) -> None:

@@ -17,6 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from support.kept_run import kept_run
 from support.long import one_in
+from support.stores import recording_transitions, write_store
 
 from restock import cli
 from restock.cli.twin.record import load_policy
@@ -136,6 +137,24 @@ def test_a_wrong_value_is_one_clear_message(
     assert captured.out == ""
     assert message in captured.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
+    assert cli.main(words) == ExitCode.USAGE
+    assert "ends in .mcap, or a folder for rosbag2" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert cli.main([*words, "--format", "rosbag2", "--dry-run"]) == ExitCode.OK
+
+
+def test_no_recording_is_written_into_a_store(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = write_store(tmp_path / "store", [recording_transitions(1)])
+    assert cli.main(["record", "--out", str(store / "drive.mcap")]) == ExitCode.USAGE
+    assert f"is within the store {store}" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_recording_is_never_overwritten(

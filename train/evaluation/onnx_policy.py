@@ -19,7 +19,7 @@ from torch import nn
 from restock import __version__
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
-from restock.files import write_bytes
+from restock.files import expect_file_place, write_bytes
 from restock.imports import import_extra
 from restock.ingest.live.policy_file import FORMAT, open_session
 from restock.ingest.profile.profile_text import profile_toml
@@ -40,12 +40,14 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
 
     Raises:
         RunError: no such run, no policy kept, or there is something at `out` already.
-        ConfigError: the extra `onnx` is not installed.
+        ConfigError: the extra `onnx` is not installed, or `out` lies within a store, a panel or
+            another run.
     """
     onnx = _onnx()
     run = Run.open(run_path)
     if out.exists():
         raise RunError("already exists", where=str(out), remedy="choose another --out")
+    expect_file_place(out, "--out", run=run.path)
     agent = load_agent(run)
     profile = profile_of_run(run)
     model = to_onnx(agent.network)

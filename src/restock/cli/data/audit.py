@@ -64,7 +64,7 @@ class AuditCommand:
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
-        from restock.files import refuse_folder
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.places import RUN_CONFIG, open_place
         from restock.replay.reward_audit import audit_reward
@@ -100,7 +100,7 @@ class AuditCommand:
                 where="--rows",
                 remedy="0 shows no rows; `restock sql` shows all",
             )
-        refuse_folder(self.junit, "--junit")
+        expect_file_place(self.junit, "--junit", run=self.run_dir or Path(self.store))
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)

@@ -52,12 +52,12 @@ class DriftCommand:
     def run(self) -> int:
         """Measure, print, and write the page."""
         from restock.cli import output
-        from restock.files import refuse_folder
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.fleet.drift import measure_drift
         from restock.replay.store.store import Store
 
-        refuse_folder(self.out, "--out")
+        expect_file_place(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
             drift = measure_drift(
                 store,

@@ -49,7 +49,7 @@ class SchemaCommand:
         """Print or write."""
         from restock.cli import output
         from restock.errors import ConfigError
-        from restock.files import write_text
+        from restock.files import expect_file_place, write_text
 
         if self.name is not None and self.name not in CONFIGS:
             raise ConfigError(
@@ -57,6 +57,7 @@ class SchemaCommand:
                 remedy=f"choose one of {', '.join(CONFIGS)}",
             )
         if self.out is not None:
+            expect_file_place(self.out / "NAME.schema.json", "--out")
             for name in [self.name] if self.name else CONFIGS:
                 file = self.out / f"{name}.schema.json"
                 write_text(file, schema_of(name))

@@ -44,14 +44,16 @@ class CoverageCommand:
         """Ask, print, and write the page."""
         from restock.cli import output
         from restock.cli.command_line import refuse
-        from restock.files import refuse_folder
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
 
         if self.out is None:
             options, why = ("figures", "mixture", "every"), "applies only to the page"
             refuse(self, options, why, remedy="give --out FILE, too")
-        refuse_folder(self.out, "--out")
+        expect_file_place(self.out, "--out")
+        if self.figures is not None:
+            expect_file_place(self.figures / "figure.svg", "--figures")
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             if self.out is not None:

@@ -45,7 +45,7 @@ class ReportCommand:
 
     def run(self) -> int | None:
         from restock.errors import ConfigError
-        from restock.files import refuse_folder
+        from restock.files import expect_file_place
         from restock.ingest.store.location import Location
         from restock.replay.store.store import is_store
         from restock.report import build_report, write_card, write_gap_page
@@ -64,7 +64,9 @@ class ReportCommand:
             else:
                 sys.stdout.write(markdown)
             return None
-        refuse_folder(self.out, "--out")
+        expect_file_place(self.out, "--out", run=self.run_directory)
+        if self.figures is not None:
+            expect_file_place(self.figures / "figure.svg", "--figures", run=self.run_directory)
         with progress("report", None):
             if is_store(Location.of(self.run_directory)):
                 path = write_gap_page(self.run_directory / FOLDER, self.out, self.figures)

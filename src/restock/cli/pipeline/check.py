@@ -57,7 +57,7 @@ class CheckCommand:
         from restock.cli import output
         from restock.cli.command_line import refuse
         from restock.cli.pipeline.findings import markdown
-        from restock.files import refuse_folder, write_text
+        from restock.files import expect_file_place, write_text
         from restock.replay.store.audit import junit_suites
 
         if self.baseline is not None and self.run_dir is None:
@@ -71,8 +71,8 @@ class CheckCommand:
             from restock.train.evaluation.regression import check_margin
 
             check_margin(self.margin)
-        refuse_folder(self.junit, "--junit")
-        refuse_folder(self.summary, "--summary")
+        expect_file_place(self.junit, "--junit", run=self.run_dir)
+        expect_file_place(self.summary, "--summary", run=self.run_dir)
         parts = self._parts()
         failing = {"fail", "warn"} if self.strict else {"fail"}
         failed = sum(one.status in failing for part in parts for one in part.findings)

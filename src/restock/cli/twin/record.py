@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from restock.errors import ConfigError, RestockError
+from restock.errors import ConfigError, RecordingError, RestockError
 
 if TYPE_CHECKING:
     from restock.replay.fleet.missions_file import MissionsFile
@@ -39,7 +39,8 @@ class RecordCommand:
     out: Path
     """The recording to write: FILE.mcap, or a folder for rosbag2."""
     format: Literal["mcap", "rosbag2"] | None = None
-    """mcap (zstd) or rosbag2 (sqlite3). Default: mcap if --out ends in .mcap, else rosbag2."""
+    """mcap (zstd) or rosbag2 (sqlite3). Default: mcap if --out ends in .mcap, rosbag2 if it has no
+    ending."""
     minutes: float | None = None
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
@@ -82,6 +83,7 @@ class RecordCommand:
     def run(self) -> None:
         """Record, and print what was recorded."""
         from restock.cli import output
+        from restock.files import expect_place
         from restock.ingest.task.tags import parse_tags
         from restock.replay.fleet.missions_file import MissionsFile
         from restock.train.twin.env.floor_report import refuse_unfit, sealed
@@ -107,7 +109,7 @@ class RecordCommand:
             raise RestockError("--exact and --perturbation cannot be combined", remedy="give one")
         hardware = NOISELESS if self.exact else HARDWARE
         plan = RecordingPlan(
-            format=self.format or ("mcap" if self.out.suffix == ".mcap" else "rosbag2"),
+            format=self._format(),
             minutes=5.0 if self.minutes is None and self.missions is None else self.minutes,
             missions=_missions(self.missions),
             seed=self.seed,
@@ -132,6 +134,7 @@ class RecordCommand:
                 raise RestockError("--conditions and a missions file cannot be combined")
             ordered(plan, floors, planners(floors))
         refuse_existing(self.out)
+        expect_place(self.out, RecordingError)
         if self.dry_run:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
             output.print_json(wanted) if self.json else _print_plan(wanted)
@@ -151,6 +154,16 @@ class RecordCommand:
             output.print_json(done)
         else:
             _print_recording(done)
+
+    def _format(self) -> Literal["mcap", "rosbag2"]:
+        if self.format is None and self.out.suffix not in ("", ".mcap"):
+            raise ConfigError(
+                f"{self.out} is not the name of a recording",
+                where="--out",
+                remedy="name a file that ends in .mcap, or a folder for rosbag2: without an ending,"
+                " or with --format rosbag2",
+            )
+        return self.format or ("mcap" if self.out.suffix else "rosbag2")
 
 
 def _missions(text: str | None) -> int | MissionsFile | None:
