@@ -327,6 +327,18 @@ def test_names_that_begin_alike_are_told_apart_in_a_legend() -> None:
     assert texts["kept"].get("text-anchor") == "start"  # beside its line, not over the axis
 
 
+def test_a_legends_names_have_room_in_a_wider_font() -> None:
+    """In DejaVu Sans the first is 161 px wide, and it reached over the second one's mark."""
+    names = ["coverage quotas, adaptive", "uniform replay, n steps 3"]
+    rows = [{"env_steps": n, "success": 0.5, "who": name} for name in names for n in (0, 2000)]
+    drawn = lines(rows, x="env_steps", y="success", series="who", y_title="success")
+    _, entries = drawn.svg[470].split("role-legend-entry")
+    first, second = re.findall(r'translate\(([\d.]+),[\d.]+\)"><path[^>]* d="M0,0h[1-9]', entries)
+    label = re.search(r"role-legend-label.*?translate\(([\d.]+),", entries)
+    assert label is not None
+    assert float(second) - float(first) - float(label[1]) > 161
+
+
 def test_a_hostile_name_is_text_and_no_markup(html: str) -> None:
     assert "alert(1)" in html  # it is shown …
     assert HOSTILE not in html  # … as text

@@ -118,7 +118,7 @@ def print_skipped(reasons: Mapping[str, str | None]) -> None:
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
-    """A table on stdout, its title on a line of its own; numbers to the right.
+    """A table on stdout, its title above it; numbers to the right.
 
     As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe names of
     one word and cells up to SHORT are not: where columns leave too little, the table is wider. On a
@@ -154,8 +154,10 @@ def print_table(
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
     if title is not None:  # rich's own would be wrapped to the table's width
-        style = _STYLES.get(title.split(":")[0], "table.title")
-        console.print(visible(title), style=style, markup=False, soft_wrap=True)
+        style, lines = _STYLES.get(title.split(":")[0], "table.title"), [visible(title)]
+        if not piped:
+            lines = _wrapped(lines[0], console.width)
+        console.print("\n".join(lines), style=style, markup=False, soft_wrap=True)
     with console.capture() as captured:
         console.print(table, soft_wrap=False)
     # rich pads every line to the table's width; a pipe has no use for that.
@@ -181,8 +183,12 @@ def print_parted(
 
 def print_wrapped(text: str) -> None:
     """A paragraph after an empty line, wrapped as tables are: to the terminal, or PIPE_WIDTH."""
-    lines = textwrap.wrap(text, table_width(), break_on_hyphens=False, subsequent_indent="  ")
+    lines = _wrapped(text, table_width())
     stdout().print("\n".join(["", *lines]), markup=False, soft_wrap=True)
+
+
+def _wrapped(text: str, columns: int) -> list[str]:
+    return textwrap.wrap(text, columns, break_on_hyphens=False, subsequent_indent="  ")
 
 
 def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:

@@ -51,6 +51,7 @@ FEW_POINTS = 10  # of a line, with which each is drawn
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
 SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, nought is 0k
 LETTER_PX = 5.8  # of a label, about
+WIDER_FONT = 0.15  # by so much a label may be wider in a browser than in the font it was drawn with
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
 
 CONFIG = {
@@ -156,10 +157,12 @@ def palette(
 
 def legend(names: Sequence[str], width: int, labels_px: int = 60) -> alt.Legend:
     """Above the chart, in as many columns as fit beside the labels of its vertical axis."""
-    each = max((len(name) for name in names), default=1) * LETTER_PX + 36
-    columns = max(1, min(len(names), int((width - labels_px) // each)))
+    longest = max((len(name) for name in names), default=1) * LETTER_PX
+    apart = 10 + WIDER_FONT * longest  # of columns: a reader's font may be wider than ours
+    columns = max(1, min(len(names), int((width - labels_px) // (longest + 26 + apart))))
     # Names that begin alike end apart: as much of one is shown as there is room for.
-    return alt.Legend(columns=columns, symbolOpacity=1, labelLimit=max(width - labels_px - 30, 160))
+    limit = max(width - labels_px - 30, 160)
+    return alt.Legend(columns=columns, columnPadding=apart, symbolOpacity=1, labelLimit=limit)
 
 
 def coloured(
