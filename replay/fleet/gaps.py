@@ -76,7 +76,7 @@ def find_gaps(
 
     Raises:
         ConfigError, MixtureError, StoreError: as `plan_panel` does; columns that make none, and
-            kinds, audits and thresholds that there are not.
+            kinds, audits and thresholds that there are not, or thresholds of another kind.
     """
     unknown = sorted(set(by) - set(CELL))
     if isinstance(by, str) or unknown or len(set(by)) != len(by) or not by:

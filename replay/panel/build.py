@@ -168,7 +168,7 @@ def build_panel(
     force: bool = False,
     advance: Callable[[int], None] = lambda rows: None,
 ) -> Panel:
-    """Plan, pack and open a panel.
+    """Plan, pack and open a panel; its `warnings` are those of `restock mix`.
 
     Args:
         transitions: a store, or a table with the columns of `ingest.task.schema.transition_schema`.
@@ -388,6 +388,7 @@ def _header(
         as_of_ns=plan.as_of_ns,
         split_by=plan.split_by,
         split_note=plan.split_note,
+        warnings=list(plan.warnings),
         logs_share=plan.logs_share,
         conditions=[*(c.name for c in by_priority), NOMINAL],
         left_out=plan.left_out,

@@ -71,6 +71,7 @@ class Header(msgspec.Struct, frozen=True):
     as_of_ns: int | None = None  # what the mixture's max_age_days counted to, where it has one
     split_by: str = ""  # what the evaluation split is of; "": as its mixture says
     split_note: str = ""  # of a split within episodes, or of none for want of time
+    warnings: list[str] = []  # what `restock mix` warned of
 
 
 class Panel:
@@ -172,6 +173,12 @@ class Panel:
     @property
     def strata(self) -> list[Stratum]:
         return self.header.strata
+
+    @property
+    def warnings(self) -> list[str]:
+        """What `restock mix` warns of: a source that may be an archive, or a split that holds out
+        far more than was asked for."""
+        return self.header.warnings
 
     @property
     def meta(self) -> pa.Table:

@@ -23,13 +23,14 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, cast
 from xml.etree import ElementTree
 
 import duckdb
 
-from restock.errors import ConfigError, StoreError
+from restock.errors import ConfigError, StoreError, expect
 from restock.files import first_line
 from restock.interrupts import interrupts_raised
 from restock.replay.store.definitions import install_named, is_empty, rows_held
@@ -133,9 +134,7 @@ def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float
 
 def _check_value(key: str, value: object, shipped: float | str | None, where: str) -> None:
     """Refuse what is of another kind than the shipped threshold, and NaN: no row is above it."""
-    number = (
-        isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-    )
+    number = not isinstance(value, bool) and isinstance(value, Real) and not math.isnan(value)
     if shipped is None or (number if isinstance(shipped, int | float) else isinstance(value, str)):
         return
     kind = "a number" if isinstance(shipped, int | float) else "a text"
@@ -273,10 +272,12 @@ def check_thresholds(
     """Refuse thresholds that no audit uses. There may be `others`, of names unlike those of these.
 
     Raises:
-        ConfigError: a name of an audit or of a threshold that there is not.
+        ConfigError: a name of an audit or of a threshold that there is not, or a value of another
+            kind than the shipped one's.
     """
-    used = {audit.name: audit.parameters for audit in audits}
+    used, shipped = {audit.name: audit.parameters for audit in audits}, load_thresholds()
     for name, table in thresholds.items():
+        expect(f"thresholds[{name!r}]", table, Mapping, "give its thresholds by their names")
         if name not in used:
             likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
             if others and not likely and name not in RENAMED:
@@ -291,6 +292,8 @@ def check_thresholds(
                 where="thresholds",
                 remedy=_instead(unknown[0], likely, f"its thresholds are {names}"),
             )
+        for key, value in table.items():
+            _check_value(f"{name}.{key}", value, shipped.get(name, {}).get(key), "thresholds")
 
 
 def _instead(name: str, likely: Sequence[str], known: str) -> str:

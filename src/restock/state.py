@@ -101,13 +101,25 @@ def saved(value: Any) -> Any:
     return value
 
 
+def first_mismatch(error: RuntimeError) -> str:
+    """What PyTorch says first of weights of another network, below the name of the class."""
+    lines = str(error).splitlines()
+    return lines[min(1, len(lines) - 1)].strip()
+
+
 def restored(current: Any, state: Any) -> Any:
     """What `state` says, of the kind that `current` is: objects are changed in place."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current
     if hasattr(current, "load_state_dict"):
-        current.load_state_dict(state)
+        try:
+            current.load_state_dict(state)
+        except RuntimeError as error:  # PyTorch's
+            raise RunError(
+                f"the saved state is of another network: {first_mismatch(error)}",
+                remedy="give the settings and the task that it was saved with",
+            ) from error
         return current
     if state is None:
         return None
@@ -141,4 +153,4 @@ def _key(name: str) -> str:
     return name.removeprefix("_")
 
 
-__all__ = ["Stateful", "restored", "saved"]
+__all__ = ["Stateful", "first_mismatch", "restored", "saved"]

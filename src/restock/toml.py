@@ -110,6 +110,8 @@ def typed(
         return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
         what = _in_words(str(error), document, kind, prefix)
+        if meant := _key_meant(str(error), kind, prefix):
+            remedy = f"did you mean `{meant}`?" + (f" {remedy}" if remedy else "")
         raise ConfigError(what, where=where, remedy=remedy) from error
 
 
@@ -296,6 +298,36 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
         return f"`{key}`: {what}" if key else what
     # A check of a struct's own names its fields: `loss.margin …` where the struct is at `loss`.
     return what if what.startswith((key, "`")) or " " not in what else f"{key}.{what}"
+
+
+def _key_meant(message: str, kind: Any, prefix: str) -> str | None:
+    """The key that an unknown one was likely meant to be, where one is near it."""
+    what, _, path = message.partition(" - at `$")
+    path = path.rstrip("`")
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.S)
+    if unknown is None:
+        return None
+    from difflib import get_close_matches
+
+    near = get_close_matches(unknown[1], set(_keys(inspect.type_info(kind), path)), n=1)
+    return _join(prefix, path, near[0]) if near else None
+
+
+def _keys(kind: inspect.Type, path: str) -> Iterator[str]:
+    """The keys of the table that a message's path leads to; of several that it may be, of all."""
+    if isinstance(kind, inspect.UnionType):
+        for option in kind.types:
+            yield from _keys(option, path)
+    elif isinstance(kind, inspect.StructType) and not path:
+        yield from (field.encode_name for field in kind.fields)
+        yield from (kind.tag_field,) if kind.tag_field else ()
+    elif step := re.fullmatch(_STEP, path, re.S):
+        if isinstance(kind, inspect.StructType):
+            for field in kind.fields:
+                if field.encode_name == step[1][1:]:
+                    yield from _keys(field.type, step[2])
+        elif (item := _item(kind)) is not None:
+            yield from _keys(item, step[2])
 
 
 def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], Any, str] | None:

@@ -204,7 +204,8 @@ def test_a_network_that_was_edited_is_said_by_who_would_drive_it(
 ) -> None:
     run = edited(root, tmp_path, {"network.hidden": [9]})
     assert check(run_verbs(run, root, tmp_path)["export"], run, capsys, said := []) == 2
-    assert "its policy is not of the network that config.json describes" in said[0]
+    assert "its policy is not of the network that config.json describes: " in said[0]
+    assert "body." in said[0]  # which of its weights
 
 
 def test_a_table_that_is_missing_is_said_where_it_is_taken_as_empty(

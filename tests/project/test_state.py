@@ -133,6 +133,11 @@ def test_a_network_is_restored_in_place() -> None:
     assert torch.equal(first.weight, second.weight)
 
 
+def test_a_state_of_another_network_is_refused_with_what_differs() -> None:
+    with pytest.raises(RunError, match=r"of another network: size mismatch for weight.*\n.*give"):
+        restored(torch.nn.Linear(3, 1), saved(torch.nn.Linear(2, 1)))
+
+
 def test_a_list_or_mapping_of_another_length_is_taken_as_it_was_saved() -> None:
     assert restored([], [1, [2, 3]]) == [1, [2, 3]]
     assert restored({"a": 1}, {"b": 2, "c": 3}) == {"b": 2, "c": 3}

@@ -177,6 +177,26 @@ def test_a_file_names_the_key_where_it_stands(values: dict[str, Any], message: s
     assert refused.value.where == "config.toml"
 
 
+@pytest.mark.parametrize(
+    ("values", "kind", "meant"),
+    [
+        ({"shair": 0.5}, Config, "share"),
+        ({"inner": {"shair": 0.5}}, Config, "inner.share"),
+        ({"inners": [{}, {"part": []}]}, Config, "inners[1].parts"),
+        ({"loss": {"discont": 0.9}}, TrainConfig, "loss.discount"),
+        ({"target": {"rule": "polyak", "taw": 0.1}}, TrainConfig, "target.tau"),
+        ({"strata": [{"name": "a", "wher": "true"}]}, Mixture, "strata[0].where"),
+    ],
+)
+def test_an_unknown_key_names_the_one_that_was_likely_meant(
+    values: dict[str, Any], kind: type, meant: str
+) -> None:
+    for remedy, rest in (("see the docs", " see the docs"), (None, "")):
+        with pytest.raises(ConfigError, match="unknown key") as refused:
+            typed(values, kind, where="config.toml", remedy=remedy)
+        assert refused.value.remedy == f"did you mean `{meant}`?{rest}"
+
+
 def misspelt(kind: inspect.Type) -> Iterator[tuple[Any, set[str]]]:
     """Values that are wrong where a type has names to choose from, each with all names there."""
     if isinstance(kind, inspect.UnionType):

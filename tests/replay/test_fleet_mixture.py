@@ -126,10 +126,13 @@ def test_rows_of_an_unknown_robot_cannot_be_held_out_by_robot(fleet, tmp_path):
         planned(tables[0], text)
 
 
-def test_a_split_that_holds_out_far_more_than_was_asked_says_so() -> None:
+def test_a_split_that_holds_out_far_more_than_was_asked_says_so(tmp_path: Path) -> None:
     two = pa.concat_tables([recording_transitions(1), recording_transitions(2)])
-    plan = planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.1")
+    text = EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.1"
+    plan = planned(two, text)
     (warning,) = plan.warnings
+    assert panel_of(two, text, tmp_path / "panel").warnings == [warning]
+    assert Panel.open(tmp_path / "panel").warnings == [warning]
     assert f"holds out {plan.evaluation_split.mean():.0%} of the rows, where 10% were" in warning
     assert "1 of 2 recordings, whole" in warning
     assert not planned(two, EVERY + "[evaluation_split]\nby = 'recording'\nshare = 0.4").warnings

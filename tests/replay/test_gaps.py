@@ -131,6 +131,13 @@ def test_unknown_kinds_and_thresholds_are_refused_with_what_is_near(tmp_path: Pa
             "rare_condition.min_row is not a threshold.*\n.*mean 'min_rows'",
             thresholds={"rare_condition": {"min_row": 3}},
         )
+        refused(
+            "rare_condition.min_rows must be a number, got 'x'",
+            thresholds={"rare_condition": {"min_rows": "x"}},
+        )
+        refused(
+            r"thresholds\['rare_condition'\] must be a Mapping", thresholds={"rare_condition": 3}
+        )
         own = {"my_own_audit": {"least": 3.0}}  # of the same file as for `restock audit --audits`
         find_gaps(store, parse_mixture(ASKING), name="mine", kinds=["nominal"], thresholds=own)
 

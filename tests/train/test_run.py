@@ -86,6 +86,10 @@ def test_a_run_is_named_by_its_path_or_its_text_and_an_unknown_table_is_refused(
         run.table("audits")
 
 
+def test_a_run_shows_where_it_is(tmp_path: Path) -> None:
+    assert repr(Run.create(tmp_path / "a", {})) == f"<Run {tmp_path / 'a'}>"
+
+
 def test_reopening_truncates_to_the_checkpoint(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "a", {})
     run.append("policies", [policies(1, 10)])

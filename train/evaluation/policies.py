@@ -12,8 +12,8 @@ import numpy as np
 
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError, RunError
-from restock.files import first_line
 from restock.ingest.task.task import Task
+from restock.state import first_mismatch
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
 from restock.train.dqn.config import parse_config
 from restock.train.dqn.learner import greedy_actions
@@ -94,7 +94,7 @@ def load_agent(run: Run) -> GreedyPolicy:
         network.load_state_dict(state["network"])
     except RuntimeError as error:  # torch's of other shapes or names
         raise RunError(
-            f"its policy is not of the network that config.json describes: {first_line(error)}",
+            f"its policy is not of the network that config.json describes: {first_mismatch(error)}",
             where=str(run.best),
             remedy="put the settings back that were changed in config.json: network, teacher",
         ) from error

@@ -109,6 +109,9 @@ class Run:
             raise RunError(f"has format {form!r}, this Restock reads {FORMAT!r}", where=str(config))
         return cls(path, document)
 
+    def __repr__(self) -> str:
+        return f"<Run {self.path}>"
+
     @property
     def latest(self) -> Path:
         return self.path / "checkpoints" / "latest.safetensors"

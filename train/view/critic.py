@@ -70,9 +70,10 @@ def _packed(moment: Moment, discount: float) -> F32:
 def _of_checkpoint(run: Run, config: TrainConfig, rows: F32, moment: Moment) -> Critic:
     task = moment.task
     learner = Learner(config, task.observation_size, len(task.actions))
+    state = checkpoint.load(run.latest)
     try:
-        learner.load_state_dict(checkpoint.load(run.latest)["learner"])
-    except (KeyError, ValueError) as error:
+        learner.load_state_dict(state["learner"])
+    except (KeyError, ValueError, RunError) as error:
         raise RunError(
             f"contains no learner that this Restock can read: {error}",
             where=str(run.latest),
