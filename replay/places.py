@@ -59,12 +59,14 @@ def open_place(
         return
     place.expect_both_tables()
     path = place.folder
+    if not path.exists():
+        raise StoreError("it does not exist", where=str(path), remedy=place.remedy_if_absent())
     if version is not None:
         raise StoreError("only a store has versions", where=str(path), remedy="leave --version out")
     with duckdb.connect() as connection:
         if _add(connection, path, "main") is None:
             raise StoreError(
-                "it is not a store, a run or a panel" if path.exists() else "it does not exist",
+                "it is not a store, a run or a panel",
                 where=str(path),
                 remedy=place.remedy_if_absent(),
             )

@@ -17,14 +17,14 @@ OF_LEARNING = {"torch", "mujoco", "gymnasium", "scipy", "altair", "tensorboard",
 SLOW = OF_LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosbags", "ruamel.yaml"}
 
 
-def loaded(*args: str) -> set[str]:
+def loaded(*args: str, codes: tuple[int, ...] = (0, 1)) -> set[str]:
     """The modules that one command has imported when it ends."""
     code = (
         "import json, sys; from restock.cli import main; code = main(sys.argv[1:]);"
         "sys.stderr.write(json.dumps(sorted(sys.modules))); sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True)
-    assert done.returncode in (0, 1), done.stderr[-500:]
+    assert done.returncode in codes, done.stderr[-500:]
     return set(json.loads(done.stderr.splitlines()[-1]))
 
 
@@ -64,6 +64,24 @@ def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     bag = write_bag(Drive(), tmp_path / "bag")
     modules = loaded("ingest", str(bag), "--store", str(tmp_path / "store"), "--json")
     assert modules & (OF_LEARNING | {"pandas", "pyarrow.dataset"}) == set()
+
+
+@pytest.mark.parametrize(
+    ("command", "unused"),
+    [
+        (
+            ("ingest", "bag", "--store", "store", "--profile", "nowhere.toml"),
+            {"deltalake", "restock.ingest.batch", "restock.ingest.pipeline"},
+        ),
+        (("sql", "nowhere", "FROM coverage"), {"restock.replay.panel.panel"}),
+    ],
+    ids=["ingest", "sql"],
+)
+def test_what_is_not_there_is_said_before_what_would_read_it_is_imported(
+    command: tuple[str, ...], unused: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert loaded(*command, codes=(2,)) & unused == set()
 
 
 @pytest.mark.parametrize(

@@ -70,16 +70,11 @@ class IngestCommand:
 
     def run(self) -> int:
         """Ingest each recording; the exit code for them all."""
-        from restock.ingest.batch import warm_up
-
         if self.workers > 1 and self.engine == "processes":
+            from restock.ingest.batch import warm_up
+
             warm_up()
-        from restock.cli import output
-        from restock.ingest.batch import IngestJob, ingest_all
-        from restock.ingest.containers.open_recording import with_definitions
         from restock.ingest.profile.profile import load_profile
-        from restock.ingest.store.compaction import fold_if_many
-        from restock.ingest.store.writer import StoreWriter
         from restock.ingest.task.tags import parse_tags
 
         if not self.paths:
@@ -89,7 +84,14 @@ class IngestCommand:
         if self.workers < 1:
             raise ConfigError(f"--workers must be 1 or more, got {self.workers}")
         tags = parse_tags(self.tag, empty=True)
-        profile = load_profile(self.profile)
+        profile = load_profile(self.profile)  # before what is slow to import: it may not be there
+
+        from restock.cli import output
+        from restock.ingest.batch import IngestJob, ingest_all
+        from restock.ingest.containers.open_recording import with_definitions
+        from restock.ingest.store.compaction import fold_if_many
+        from restock.ingest.store.writer import StoreWriter
+
         store = None if self.dry_run else self.store
         if store is not None:
             StoreWriter(store).expect_folder()  # or say now why not, and not once a recording
