@@ -787,7 +787,7 @@ def test_the_verb_prints_where_the_page_is(
     assert said == {"report": str(out), "bytes": out.stat().st_size}
 
 
-def test_no_page_or_schema_is_written_into_a_store_nor_into_another_run(
+def test_no_file_of_a_command_is_written_into_a_store_nor_into_another_run(
     run: Path, store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own = tmp_path / "run"
@@ -800,6 +800,12 @@ def test_no_page_or_schema_is_written_into_a_store_nor_into_another_run(
         (["coverage", store, "--out", str(store_path / "page.html")], f"the store {store}"),
         (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
         (["schema", "--out", store], f"the store {store}"),
+        (["profile", "new", "a.mcap", "--out", f"{store}/p.toml"], f"the store {store}"),
+        (["label", store, "--review", "3", "--out", f"{store}/l.csv"], f"the store {store}"),
+        (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
+        (["gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
+        (["twin", "layout", "--png", f"{run}/floor.png"], f"the run {run}"),
+        (["twin", "fit", store, "--out", f"{store}/fitted.toml"], f"the store {store}"),
     ):
         assert cli.main(words) == 2
         assert f"is within {place}:" in " ".join(capsys.readouterr().err.split())

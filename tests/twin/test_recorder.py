@@ -147,6 +147,8 @@ def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
     assert "ends in .mcap, or a folder for rosbag2" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert cli.main([*words, "--format", "rosbag2", "--dry-run"]) == ExitCode.OK
+    dated = str(tmp_path / "drive.2026-10-05")  # a folder's
+    assert cli.main(["record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
 def test_no_recording_is_written_into_a_store(

@@ -140,9 +140,7 @@ def _dispatch(args: list[str]) -> int:
 
     asked = bool({"-h", "--help"} & set(args))
     command, name, rest = command_of(verb), f"restock {verb}", args[1:]
-    if job := jobs_of(command).get(
-        rest[0] if rest else ""
-    ):  # else tyro's hints have no verb in them
+    if rest and (job := jobs_of(command).get(rest[0])):  # as a job, tyro's hints leave the verb out
         command, name, rest = job, f"{name} {rest[0]}", rest[1:]
     try:
         command = prepared(command, explained=asked)

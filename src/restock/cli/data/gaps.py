@@ -64,6 +64,7 @@ class GapsCommand:
         from restock.cli import output
         from restock.cli.command_line import refuse
         from restock.errors import ConfigError
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.fleet.gaps import find_gaps
         from restock.replay.fleet.missions_file import of_list, refuse_existing, write_missions
@@ -81,6 +82,7 @@ class GapsCommand:
         thresholds = None if self.no_audits else load_thresholds(self.thresholds)
         if self.missions_out is not None and not self.force:
             refuse_existing(self.missions_out)
+        expect_file_place(self.missions_out, "--missions-out")
         with Store(self.store, version=given_version(self.version)) as store:
             yields, gaps = find_gaps(
                 store,

@@ -19,12 +19,13 @@ NONE = "none"  # in place of a file: takes all corrections out
 def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     """List the most doubtful events, and write them to a file for verdicts."""
     from restock.cli import output
-    from restock.files import write_text
+    from restock.files import expect_file_place, write_text
     from restock.replay.review.doubtful import doubtful_events, review_csv, review_rows
     from restock.replay.store.store import Store
 
     if most < 1:
         raise LabelError(f"--review must be 1 or more, got {most}")
+    expect_file_place(out, "--out")
     with Store(path) as store:
         rows = review_rows(doubtful_events(store, most), str(path))
     if out is not None:

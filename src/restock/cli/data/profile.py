@@ -101,12 +101,14 @@ class ProfileCommand:
 
     def _new(self) -> int:
         from restock.cli import output
+        from restock.files import expect_file_place
         from restock.ingest.containers.discover import recordings_in
         from restock.ingest.propose.drives import names_of, propose_for_drives
         from restock.ingest.propose.evidence.footprint import parse_footprint
 
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
+        expect_file_place(self.out, "--out")
         footprint = None if self.footprint is None else parse_footprint(self.footprint)
         stem = (self.out or Path(self.paths[0])).stem
         if self.out is None and self.robot is not None:  # of one name, they would be two versions

@@ -148,10 +148,12 @@ class SqlCommand:
 
     def _export(self, out: Path) -> None:
         from restock.cli import output
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.export_views import export_views
         from restock.replay.store.store import Store
 
+        expect_file_place(out, "--export")
         with Store(self.path, version=given_version(self.version)) as store:
             export_views(store, out)
             output.say(f"views of {self.path}, version {store.version} -> {out}")

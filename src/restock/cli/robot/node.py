@@ -76,12 +76,13 @@ class NodeCommand:
     def _write(self, profile: Profile, out: Path) -> int:
         from restock.cli.output import say
         from restock.errors import ConfigError
-        from restock.files import write_bytes
+        from restock.files import expect_file_place, write_bytes
         from restock.ingest.live.node_topics import with_node_topics
         from restock.ingest.profile.profile_text import profile_toml
 
         if out.exists():
             raise ConfigError("already exists", where=str(out), remedy="choose another file")
+        expect_file_place(out, "--write-profile")
         write_bytes(out, profile_toml(with_node_topics(profile)).encode())
         say(f"{out}: restock ingest RECORDINGS --profile {out} --store STORE")
         return 0

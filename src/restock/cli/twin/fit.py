@@ -74,6 +74,7 @@ class FitCommand:
         """Fit, print, write."""
         from restock.cli import output
         from restock.errors import ConfigError, ExitCode
+        from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
         from restock.train.twin.calibration.fitted_twin import write_fit
@@ -87,6 +88,7 @@ class FitCommand:
             )
         if self.out is not None and self.out.exists():
             raise ConfigError("already exists", where=str(self.out), remedy="choose another --out")
+        expect_file_place(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
             groups: list[tuple[str, ...]] = [self.recording]
             if self.per_recording:

@@ -103,6 +103,8 @@ class LayoutCommand:
         return 0
 
     def _to_write(self, maps: bool) -> list[Path]:
+        from restock.files import expect_file_place
+
         if self.out is not None and not maps and self.out.suffix != ".toml":
             raise RestockError(f"{self.out.name!r} ends in neither .toml nor .yaml", where="--out")
         if self.png is not None and self.png.suffix.lower() != ".png":
@@ -114,6 +116,8 @@ class LayoutCommand:
         written = [path for path in (self.out, self.png, self.zones) if path is not None]
         if maps and self.out is not None:
             written.append(self.out.with_suffix(".pgm"))
+        for option, path in (("--out", self.out), ("--png", self.png), ("--zones", self.zones)):
+            expect_file_place(path, option)
         for path in written:
             if path.exists():
                 raise RestockError(

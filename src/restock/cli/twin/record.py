@@ -156,14 +156,15 @@ class RecordCommand:
             _print_recording(done)
 
     def _format(self) -> Literal["mcap", "rosbag2"]:
-        if self.format is None and self.out.suffix not in ("", ".mcap"):
+        ending = self.out.suffix[1:]  # drive.2026-10-05 is the name of a folder
+        if self.format is None and ending != "mcap" and ending.isalnum() and not ending.isdigit():
             raise ConfigError(
                 f"{self.out} is not the name of a recording",
                 where="--out",
                 remedy="name a file that ends in .mcap, or a folder for rosbag2: without an ending,"
                 " or with --format rosbag2",
             )
-        return self.format or ("mcap" if self.out.suffix else "rosbag2")
+        return self.format or ("mcap" if ending == "mcap" else "rosbag2")
 
 
 def _missions(text: str | None) -> int | MissionsFile | None:
