@@ -91,7 +91,9 @@ def share_differences(
 
     An episode that both have is one draw for both: what they share varies in neither. Resamples
     are Poisson's (each episode so many times, 1 in the mean), which shares cannot tell from
-    drawing with replacement.
+    drawing with replacement. One in which a sample has no rows has no shares, and does not count.
+    With fewer than two episodes in a sample there is no interval: NaN. Nor is there a difference
+    where a sample has no rows.
 
     Args:
         first, second: scipy sparse (E, V) rows of each episode of either, by value.
@@ -100,7 +102,7 @@ def share_differences(
     episodes = first.shape[0]
     value = _shares(first.sum(axis=0)[None], groups), _shares(second.sum(axis=0)[None], groups)
     at = (value[1] - value[0])[0]
-    if episodes < 2:
+    if min(np.count_nonzero(sample.sum(axis=1)) for sample in (first, second)) < 2:
         return [ConfidenceInterval(float(one), float("nan"), float("nan")) for one in at]
     draws = []
     for start in range(0, resamples, _RESAMPLES_AT_ONCE):
@@ -116,9 +118,9 @@ def share_differences(
 
 
 def _shares(rows: Any, groups: Sequence[slice]) -> F64:
-    """Rows (R, V) as shares of their groups; 0 of a sample without rows."""
+    """Rows (R, V) as shares of their groups; NaN of a sample without rows."""
     rows = np.asarray(rows, np.float64)
-    shares: F64 = np.zeros(rows.shape)
+    shares: F64 = np.full(rows.shape, np.nan)
     for group in groups:
         total = rows[:, group].sum(axis=1, keepdims=True)
         np.divide(rows[:, group], total, out=shares[:, group], where=total > 0)

@@ -174,6 +174,27 @@ def test_intervals_of_share_differences_hold_the_truth_as_often_as_they_say() ->
     assert 0.90 <= held / 200 <= 0.99
 
 
+def test_an_interval_comes_from_resamples_in_which_both_samples_have_rows() -> None:
+    """Of two episodes, a Poisson resample has neither in one of seven."""
+    rng = np.random.default_rng(0)
+    first = csr_array(np.array([[9.0, 0], [6, 0], [0, 0], [0, 0]]))
+    second = csr_array(np.array([[0.0, 0], [0, 0], [5, 0], [8, 0]]))
+    for found in share_differences(first, second, [slice(0, 2)], rng=rng, resamples=200):
+        assert (found.low, found.value, found.high) == (0, 0, 0)
+
+
+def test_a_sample_of_one_episode_has_no_interval_and_one_of_none_no_difference() -> None:
+    rng = np.random.default_rng(0)
+    two = csr_array(np.array([[4.0, 0], [1, 3]]))
+    (found, _) = share_differences(
+        two, csr_array(np.array([[0.0, 0], [2, 2]])), [slice(0, 2)], rng=rng
+    )
+    assert found.value == 0.5 - 5 / 8
+    assert np.isnan([found.low, found.high]).all()
+    (found, _) = share_differences(two, csr_array(np.zeros((2, 2))), [slice(0, 2)], rng=rng)
+    assert np.isnan([found.value, found.low, found.high]).all()
+
+
 def test_adjusted_p_values_are_those_of_scipy_and_unknown_ones_stay() -> None:
     from scipy.stats import false_discovery_control
 

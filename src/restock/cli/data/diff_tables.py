@@ -236,7 +236,7 @@ def _share(row: dict[str, Any]) -> dict[str, Any]:
         "% a": _percent(row["share_a"]),
         "% b": _percent(row["share_b"]),
         "difference": _points(row["difference"]),
-        "interval": f"{_points(row['difference_low'])} to {_points(row['difference_high'])}",
+        "interval": _ends(row["difference_low"], row["difference_high"]),
     }
 
 
@@ -258,6 +258,10 @@ def _percent(share: float | None) -> float | None:
 
 def _points(difference: float) -> str:
     return f"{100 * difference:+.2f}" if difference == difference else "unknown"
+
+
+def _ends(low: float, high: float) -> str:
+    return f"{_points(low)} to {_points(high)}" if low == low else "unknown"
 
 
 def _short(value: Any) -> Any:
