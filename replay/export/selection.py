@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -106,6 +107,32 @@ def open_selection(
         yield _of_query(store, connection, text, panel, continuous, chosen)
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """What a column of a query must be, by DuckDB's names of types."""
+
+    words: str
+    names: frozenset[str]
+    listed: bool = False
+
+    def fits(self, kind: str) -> bool:
+        """As DECIMAL(3,1) or FLOAT[97] is."""
+        return kind.count("[") == self.listed and re.split(r"[(\[]", kind)[0] in self.names
+
+
+_SIZES = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT")
+_INTEGERS = frozenset(sign + size for sign in ("", "U") for size in _SIZES)
+_NUMBERS = _INTEGERS | {"FLOAT", "DOUBLE", "DECIMAL"}
+_EXPECTED = {
+    **dict.fromkeys(("action", "step_index"), _Kind("an integer", _INTEGERS)),
+    **dict.fromkeys(("reward", *COMMAND), _Kind("a number", _NUMBERS)),
+    **dict.fromkeys(("terminated", "truncated"), _Kind("true or false", frozenset({"BOOLEAN"}))),
+    **dict.fromkeys(
+        ("observation", "next_observation"), _Kind("a list of numbers", _NUMBERS, listed=True)
+    ),
+}
+
+
 def _of_query(
     store: Store,
     connection: duckdb.DuckDBPyConnection,
@@ -125,21 +152,23 @@ def _of_query(
             + ", ".join((*REQUIRED, *COMMAND) if continuous else REQUIRED),
         )
     for name, kind in zip(columns, result.types, strict=True):
-        if name in ("observation", "next_observation") and not str(kind).endswith("]"):
-            raise QueryError(f"its {name} is a {kind}, not a list of numbers", where=where)
+        expected = _EXPECTED.get(name)
+        if expected is not None and not expected.fits(str(kind)):
+            raise QueryError(f"its {name} is a {kind}, not {expected.words}", where=where)
     asked, left_out = text, dict[str, int]()
     for camera in cameras:
         text, left_out[f"no frame of camera {camera}"] = _with_frames(
             connection, text, columns, camera, where
         )
-    by_command = ", ".join(f"min({name}), max({name})" for name in COMMAND) if continuous else "0"
+    acted = COMMAND if continuous else ("action",)
+    extremes = ", ".join(f"min({name}), max({name})" for name in acted)
     hashes, recordings = (
         f"list(DISTINCT {name})" if name in columns else "NULL"
         for name in ("task_hash", "recording_id")
     )
     _, rows, _ = fetch(
         connection,
-        f"SELECT count(*), {hashes}, {recordings}, {by_command} FROM ({text})",
+        f"SELECT count(*), {hashes}, {recordings}, {extremes} FROM ({text})",
         where=where,
     )
     facts = rows[0]
@@ -152,6 +181,15 @@ def _of_query(
             remedy="add WHERE task_hash = '…'",
         )
     task = store.task(facts[1][0] if facts[1] else None)
+    if not continuous and any(
+        at is not None and not 0 <= at < len(task.actions) for at in facts[3:5]
+    ):
+        raise StoreError(
+            f"its actions go from {facts[3]} to {facts[4]}; its task has actions 0 to"
+            f" {len(task.actions) - 1}",
+            where=where,
+            remedy="export the actions as they are stored",
+        )
     # Episodes in the order they were driven, where the query says; else by their name.
     driven = ["recording_id", "episode_index"]
     order = [*(driven if set(driven) <= set(columns) else []), "episode_id", "step_index"]

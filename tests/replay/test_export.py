@@ -433,6 +433,26 @@ def test_a_query_that_lacks_columns_is_refused_by_their_names(
             QueryError,
             "its observation is a DECIMAL",
         ),
+        *(
+            (
+                {"query": f"SELECT * REPLACE ({value} AS {column}) FROM transitions"},
+                QueryError,
+                f"its {column} is a {kind}, not {words}",
+            )
+            # Before: a ValueError, an episode end in every row, and an action of 2.
+            for column, value, kind, words in (
+                ("action", "'a'", "VARCHAR", "an integer"),
+                ("terminated", "'no'", "VARCHAR", "true or false"),
+                ("action", "2.5", r"DECIMAL\(2,1\)", "an integer"),
+                ("reward", "'1'", "VARCHAR", "a number"),
+                ("next_observation", "['a']", r"VARCHAR\[\]", "a list of numbers"),
+            )
+        ),
+        (
+            {"query": "SELECT * REPLACE (99 AS action) FROM transitions"},
+            StoreError,
+            "its actions go from 99 to 99; its task has actions 0 to",
+        ),
         (
             {"query": "SELECT * REPLACE (observation[1:3] AS observation) FROM transitions"},
             StoreError,
