@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+
 
 def plural(number: int, noun: str) -> str:
     """`gap` of 1, else `gaps`."""
@@ -11,6 +13,11 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """`1 gap`, `1,200 gaps`."""
     return f"{number:,} {plural(number, noun)}"
+
+
+def typed(path: object) -> str:
+    """A path as it is typed into a shell, in a command that a message suggests."""
+    return shlex.quote(str(path))
 
 
 def verdict_said(verdict: str, *, decides: bool) -> str:

@@ -118,9 +118,11 @@ def test_doubtful_events_are_wrong_more_often_and_their_verdicts_mend_the_labels
 def test_the_list_is_a_file_whose_commands_open_the_moment(
     monday: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "review.csv"
+    file = tmp_path / "my review.csv"
     assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 0
-    shown = capsys.readouterr().out
+    shown, said = capsys.readouterr()
+    then = ["label", str(monday), "--corrections", str(file)]
+    assert shlex.split(said.split("then run: restock ")[1]) == then
     assert max(map(len, shown.splitlines())) <= 120  # what does not fit is a second table
     with file.open(newline="") as text:
         rows = list(csv.DictReader(text))

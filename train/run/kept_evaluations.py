@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.train.run.run_tables import EVAL_EPISODES
+from restock.words import typed
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
@@ -35,7 +36,10 @@ def read_evaluations(run: Path) -> pa.Table:
     if not file.is_file():
         return EVAL_EPISODES.empty_table()
     return read_table(
-        file, EVAL_EPISODES, error=RunError, remedy=f"remove it, then `restock eval {run}` again"
+        file,
+        EVAL_EPISODES,
+        error=RunError,
+        remedy=f"remove it, then `restock eval {typed(run)}` again",
     )
 
 

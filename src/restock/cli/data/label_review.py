@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import ExitCode, LabelError
+from restock.words import typed
 
 if TYPE_CHECKING:
     from restock.ingest.correct import Corrected
@@ -58,7 +59,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     output.say(f"to see the first: {rows[0]['open']}")
     output.say(
         f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "
-        f"is true), then run: restock label {path} --corrections {out}"
+        f"is true), then run: restock label {typed(path)} --corrections {typed(out)}"
         if out is not None
         else "--out FILE writes them to a CSV file with a column for verdicts"
     )

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from restock.words import typed
+
 if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing
     from restock.replay.trace.origin import Origin
@@ -92,7 +94,9 @@ class TraceCommand:
             if narrow:
                 output.say("more columns are shown in a wider terminal, a file or a pipe")
             if listed:
-                output.say(f"`restock trace {self.place} {listed[0]['row']}` traces one of them")
+                output.say(
+                    f"`restock trace {typed(self.place)} {listed[0]['row']}` traces one of them"
+                )
             return
         version = given_version(self.version)
         where = TracePlaces(self.store, self.panel, self.recording, self.profile, version)
@@ -122,7 +126,7 @@ class TraceCommand:
             raise ConfigError(
                 "needs one row",
                 where="--view",
-                remedy=f"give ROW; for a run, `restock trace {self.place}` lists some rows",
+                remedy=f"give ROW; for a run, `restock trace {typed(self.place)}` lists some rows",
             )
         for name in ("before", "after"):
             if not 0 <= getattr(self, name) <= 3600:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from restock.words import typed
+
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
 
@@ -84,5 +86,5 @@ class NodeCommand:
             raise ConfigError("already exists", where=str(out), remedy="choose another file")
         expect_file_place(out, "--write-profile")
         write_bytes(out, profile_toml(with_node_topics(profile)).encode())
-        say(f"{out}: restock ingest RECORDINGS --profile {out} --store STORE")
+        say(f"{out}: restock ingest RECORDINGS --profile {typed(out)} --store STORE")
         return 0

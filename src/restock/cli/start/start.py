@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from restock.errors import ConfigError, ExitCode, RecordingError
+from restock.words import typed
 
 
 @dataclass
@@ -112,7 +113,7 @@ class StartCommand:
             )
         if stopped is None:
             if not self.dry_run:
-                onnx = f"restock export {self.out / 'run'} --to onnx --out policy.onnx"
+                onnx = f"restock export {typed(self.out / 'run')} --to onnx --out policy.onnx"
                 say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
                 if (needs := node_refuses(self.profile or self.out / "profile.toml")) is not None:
                     say(f"   {escape(needs)} (docs/deploy.md#without-the-node)")
