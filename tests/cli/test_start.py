@@ -4,6 +4,7 @@ a person must decide."""
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from restock.cli.start.start import StartCommand
 from restock.cli.start.way import Way
 from restock.cli.start.work import Ended, Work
 from restock.errors import RestockError
+from restock.replay.store.store import Store
 
 SILENT = lambda line: None  # noqa: E731
 
@@ -133,13 +135,32 @@ def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
 def test_a_dry_run_prints_commands_and_writes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "out"
-    assert cli.main(["start", "bags", "--out", str(out), "--dry-run"]) == 0
+    out, bags = tmp_path / "out", tmp_path / "bags"
+    recording = write_bag(Drive(), bags / "drive")
+    assert cli.main(["start", str(bags), "--out", str(out), "--dry-run"]) == 0
     printed = capsys.readouterr().out
     commands = [line for line in printed.splitlines() if line.startswith("$ restock ")]
-    assert commands[0] == "$ restock info bags"
+    assert commands[0] == f"$ restock info {bags}"
+    assert commands[1].startswith(f"$ restock profile new {bags} --out ")
+    assert commands[2] == f"$ restock profile check {out / 'profile.toml'} {recording}"
     assert commands[-1] == f"$ restock report {out / 'run'}"
     assert not out.exists()
+
+
+def test_a_dry_run_refuses_what_the_run_would(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = str(write_bag(Drive(), tmp_path / "drive"))
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.tex").touch()
+    for bags, out, said in (
+        (str(tmp_path / "nowhere"), "out", "no such file or folder"),
+        (recording, "precious", "was not made by `restock start`"),
+    ):
+        assert cli.main(["start", bags, "--out", str(tmp_path / out), "--dry-run"]) == 2
+        printed = capsys.readouterr()
+        assert said in printed.err
+        assert printed.out == ""
 
 
 @pytest.mark.parametrize("fails", ["ways", "eval", "judge"])
@@ -256,6 +277,24 @@ def test_an_edited_profile_is_taken_and_never_replaced(
     assert "propose" not in [stage["name"] for stage in document["stages"]]
     assert {s["name"]: s["status"] for s in document["stages"]}["ingest"] == "done"
     assert profile.read_text() == mine
+
+
+def test_a_copy_of_a_recording_is_not_counted_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The store had half of the transitions that were told."""
+    bags = tmp_path / "bags"
+    recording = write_bag(Drive(), bags / "drive")
+    shutil.copytree(recording, bags / "again")
+    out = tmp_path / "out"
+    _, document = start(capsys, str(bags), "--out", str(out), *up_to_the_panel(tmp_path))
+    (stage,) = [stage for stage in document["stages"] if stage["name"] == "ingest"]
+    with Store(out / "store") as store:
+        ((rows, episodes),) = store.sql(
+            "SELECT count(*), count(DISTINCT episode_id) FROM transitions"
+        ).fetchall()
+    assert stage["outcome"][0].startswith(f"{rows:,} transitions in {episodes} episode")
+    assert stage["outcome"][1] == "1 recording given again, as a copy: not counted"
 
 
 @pytest.mark.long

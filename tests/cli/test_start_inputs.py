@@ -174,7 +174,8 @@ def test_definitions_go_to_every_stage_that_reads_recordings(
     (folder / "Level.msg").write_text("float64 value\n")
     out = str(tmp_path / "out")
     flag = ("--definitions", str(folder))
-    assert cli.main(["start", "bags", "--out", out, "--dry-run", *flag]) == 0
+    bags = str(write_bag(Drive(), tmp_path / "bags"))
+    assert cli.main(["start", bags, "--out", out, "--dry-run", *flag]) == 0
     printed = capsys.readouterr().out.splitlines()
     given = [line.split()[2] for line in printed if f"--definitions {folder}" in line]
     assert given == ["info", "profile", "profile", "ingest", "twin"]

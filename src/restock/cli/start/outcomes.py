@@ -64,13 +64,16 @@ _TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # of inputs that
 def ingest(document: Document) -> list[str]:
     """Rows, and what failed."""
     rows = document["recordings"]
-    good = [row for row in rows if row["status"] != "failed"]
+    held = [row for row in rows if row["status"] != "failed"]
+    good = list({row["recording_id"]: row for row in reversed(held)}.values())[::-1]
     transitions = sum(row["transitions"] for row in good)
     episodes = sum(row["episodes"] for row in good)
     lines = [
         f"{counted(transitions, 'transition')} in {counted(episodes, 'episode')} of"
         f" {counted(len(good), 'recording')}"
     ]
+    if copies := len(held) - len(good):
+        lines.append(f"{counted(copies, 'recording')} given again, as a copy: not counted")
     dropped: dict[str, int] = {}
     for row in good:
         for drop in row["drops"]:

@@ -90,8 +90,7 @@ class StartCommand:
         if not 0 < self.minutes < math.inf:
             raise ConfigError(f"must be a number above 0, got {self.minutes:g}", where="--minutes")
         self._check()
-        if not self.dry_run:
-            self._expect_a_recording()
+        first = self._expect_a_recording()
         console = stderr() if self.json else stdout()
 
         def say(line: str) -> None:
@@ -99,7 +98,7 @@ class StartCommand:
             console.file.flush()  # what is on stderr comes after it
 
         work = Work(self.out, main, say, plan=self.dry_run)
-        stopped = Way(self, work).go()
+        stopped = Way(self, work, first).go()
         page = self.out / "run" / "report.html"
         reported = stopped is None or any(e.name == "report" and e.good for e in work.ended)
         if self.json:
@@ -125,8 +124,9 @@ class StartCommand:
         sys.stdout.flush()
         return int(ExitCode.LOSSY)
 
-    def _expect_a_recording(self) -> None:
-        """That any of the paths is a recording, or a folder of some, by its first bytes.
+    def _expect_a_recording(self) -> str:
+        """The first of the paths, or in the folders among them, that by its first bytes is a
+        recording.
 
         Raises:
             RecordingError: none is; what is wrong with the other paths is printed before.
@@ -146,7 +146,7 @@ class StartCommand:
                 except RecordingError as error:
                     errors.append(error)
                 else:
-                    return
+                    return str(path)
         for other in errors[:-1]:
             sys.stderr.write(f"restock: {other}\n")
         last = errors[-1]

@@ -53,11 +53,13 @@ class Stopped(Exception):
 class Way:
     """From recordings to a report, one stage after the other.
 
-    `to` is what the stages share; it changes as the way goes on.
+    `to` is what the stages share; it changes as the way goes on. `first` is one of the recordings:
+    that of a plan, which reads none.
     """
 
-    def __init__(self, asked: StartCommand, work: Work) -> None:
+    def __init__(self, asked: StartCommand, work: Work, first: str | None = None) -> None:
         self.asked, self.work = asked, work
+        self.first = asked.paths[0] if first is None else first
         self.again = f"then run the same command again: finished stages are kept in {asked.out}"
         self.to = Settings(
             logs=asked.paths,
@@ -108,11 +110,11 @@ class Way:
     def _profile(self, readable: list[Document]) -> None:
         """The user's profile, or one that is proposed; and what it makes of a recording."""
         asked, to = self.asked, self.to
-        recording = fullest({"recordings": readable}) or asked.paths[0]
+        recording = fullest({"recordings": readable}) or self.first
         own = asked.profile is not None
         proposed = not own and not edited(to.profile, asked.out)
         if proposed:
-            self._propose(asked.paths if len(readable) > 1 else (recording,))
+            self._propose(asked.paths if len(readable) != 1 else (recording,))
         elif given := [name for name in OF_ONE_ROBOT if getattr(asked, name) is not None]:
             options, why = " and ".join(f"--{n}" for n in given), "given" if own else "edited"
             self._warn(

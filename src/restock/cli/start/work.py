@@ -63,8 +63,6 @@ class Work:
         self.ended: list[Ended] = []
         self._stamps: list[str] = []
         self._known: dict[str, Any] = {}
-        if plan:
-            return
         record = out / FOLDER / RECORD
         if record.is_file():
             self._known = read_json(record)
@@ -74,8 +72,9 @@ class Work:
                 where=str(out),
                 remedy="choose another --out",
             )
-        (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        self._keep()
+        if not plan:
+            (out / FOLDER).mkdir(parents=True, exist_ok=True)
+            self._keep()
 
     def do(self, stage: Stage) -> Ended:
         """Run a stage, or take what came of it before; says what it does and what came of it.
