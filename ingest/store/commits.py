@@ -260,15 +260,27 @@ class TableCommits(StoreReader):
         turns: Sequence[Transaction],
         operation: str = "restock ingest",
     ) -> None:
-        """Commit to a table. Raises CommitFailedError where another writer was faster."""
-        table.create_write_transaction(
-            list(actions),
-            mode="append",
-            schema=table.schema(),
-            commit_properties=CommitProperties(
-                custom_metadata={"operation_name": operation}, app_transactions=list(turns)
-            ),
-        )
+        """Commit to a table.
+
+        Raises:
+            CommitFailedError: another writer was faster.
+            StoreError: a folder cannot be written.
+        """
+        try:
+            table.create_write_transaction(
+                list(actions),
+                mode="append",
+                schema=table.schema(),
+                commit_properties=CommitProperties(
+                    custom_metadata={"operation_name": operation}, app_transactions=list(turns)
+                ),
+            )
+        except CommitFailedError:
+            raise
+        except (DeltaError, OSError) as error:
+            if self.path.folder is None:
+                raise  # `translate_errors` knows what S3 says
+            raise unwritten(self.path, error) from error
 
     def _still(self, instead_of: Mapping[str, str]) -> None:
         """Check that these ingests are the ones in the store."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from deltalake import DeltaTable
 from support.long import one_in
 from support.stores import one, shown
 
@@ -175,6 +176,26 @@ def overtake(
         transact(self, *args, **given)
 
     monkeypatch.setattr(StoreWriter, "transact", overtaken)
+
+
+def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkeypatch, capsys):
+    """Root, who may run the tests, may write all: this is what delta-rs says to others."""
+    three(tmp_path / "s")
+    said = (
+        "Generic LocalFileSystem error\n \x1b[31m↳\x1b[0m Unable to open file /s/3.json#1"
+        "\n \x1b[31m↳\x1b[0m Permission denied (os error 13)"
+    )
+
+    def denied(self, *args, **given):
+        raise OSError(said)
+
+    monkeypatch.setattr(DeltaTable, "create_write_transaction", denied)
+    assert main(["remove", str(tmp_path / "s"), name_of(1)]) == 2
+    told = capsys.readouterr().err
+    assert "cannot be written: " in told
+    assert "Permission denied" in told
+    assert "read" not in told
+    assert len(shown(tmp_path / "s")) == 3
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["own files", "joined files"])
