@@ -238,7 +238,7 @@ def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
 
 def _message(error: duckdb.Error) -> str:
     """What DuckDB says, or what a function in Python said, without DuckDB's words around it."""
-    text = _OWN_TABLE.sub("", str(error)).strip()
+    text = _OWN_TABLE.sub("", str(error)).strip().expandtabs(4)
     _, of_python, cause = text.partition("occurred while executing the UDF: ")
     return cause.partition(": ")[2] if of_python else text
 

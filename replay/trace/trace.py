@@ -46,7 +46,7 @@ class TracePlaces:
     version: Version | None = None  # of the store that a trace begins at
 
 
-def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> Trace:
+def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = None) -> Trace:
     """Follow one row of a run, a panel or a store down to its messages.
 
     Args:
@@ -60,7 +60,7 @@ def trace_row(place: str | Path, row: str, where: TracePlaces | None = None) -> 
             where it was.
         RecordingError: the recording given is not the one the row is of.
     """
-    path, where = Path(place), where or TracePlaces()
+    path, row, where = Path(place), str(row), where or TracePlaces()
     trace = Trace()
     if where.version is not None and not is_store(str(place)):
         raise StoreError(
@@ -190,7 +190,7 @@ def _of_twin(
 def _audit_row(run: Path, row: str) -> dict[str, Any]:
     table = _audit_table(run)
     step, _, place = row.partition("/")
-    if not (step.isdigit() and place.isdigit()):
+    if not (step.isdecimal() and place.isdecimal()):
         raise RunError(
             f"{row!r} is not an audited row",
             where=str(run),
@@ -219,7 +219,7 @@ def _audit_table(run: Path) -> str:
 
 
 def _number(row: str, where: Path, what: str) -> int:
-    if not row.isdigit():
+    if not row.isdecimal():
         raise StoreError(
             f"{row!r} is not a {what}",
             where=str(where),

@@ -160,7 +160,11 @@ def test_a_panel_is_queried_by_its_tables(
 
 @pytest.mark.parametrize(
     ("query", "message"),
-    [("FROM coverag", "Did you mean"), ("SELECT 'a'::INT", "Could not convert")],
+    [
+        ("FROM coverag", "Did you mean"),
+        ("SELECT 'a'::INT", "Could not convert"),
+        ("FROM ages_at('2026-12-01')", "\n    epoch_ns("),  # its tabs were written out
+    ],
 )
 def test_wrong_sql_is_one_message_and_exit_2(
     store_path: Path, capsys: pytest.CaptureFixture[str], query: str, message: str

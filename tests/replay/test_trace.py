@@ -191,6 +191,7 @@ def test_a_row_of_the_panel_can_be_followed_too(places: Places) -> None:
     assert found.panel is not None
     assert found.origin is not None
     assert found.panel["transition_id"] == found.origin.transition["transition_id"]
+    assert trace_row(places.panel, 5) == found
     with pytest.raises(PanelError, match="has rows 0 to"):
         trace_row(places.panel, "1000000")
 
@@ -204,6 +205,11 @@ def test_what_is_not_there_is_said(places: Places, tmp_path: Path) -> None:
         trace_row(places.store, "5")
     with pytest.raises(StoreError, match="is not a transition id\n  give a whole number"):
         trace_row(places.store, "seven")
+    for row in ("²", -1):
+        with pytest.raises(StoreError, match=f"'{row}' is not a transition id"):
+            trace_row(places.store, row)
+    with pytest.raises(RunError, match="is not an audited row"):
+        trace_row(places.run, "8/²")
     with pytest.raises(StoreError, match="it is not a run, a panel or a store"):
         trace_row(tmp_path, "1")
     with pytest.raises(StoreError, match="it does not exist"):
