@@ -151,6 +151,10 @@ def test_a_store_has_a_page_of_what_it_holds(
     assert "Has a robot changed?" in found.text
     assert "Where was it logged?" in found.text
     assert len(list(folder.glob("*.png"))) == found.tags.count("figure")
+    (shelves,) = folder.glob("shelves-*.svg")
+    labels = re.findall(r">([^<>]*)</text>", shelves.read_text("utf-8"))
+    assert "1" in labels
+    assert "500m" not in labels  # half a row, where the bars begin
     assert main(["coverage", str(store_path), "--figures", str(folder)]) == 2
     assert "give --out FILE, too" in capsys.readouterr().err
     assert main(["coverage", str(store_path), "--every", "hour"]) == 2

@@ -183,7 +183,8 @@ def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
         )
         most = max(row["to"] for row in shown)
         scale = alt.Scale(type="log", domain=[PALE_ROWS, most * 8])
-        x = alt.X("to:Q", title="rows", scale=scale, axis=charts.x_axis(width))
+        axis = charts.x_axis(width, f"datum.value < 1 ? '' : {charts.SHORT_NUMBERS}")
+        x = alt.X("to:Q", title="rows", scale=scale, axis=axis)
         bars = base.mark_bar(cornerRadiusEnd=2).encode(
             x=x,
             x2="from:Q",

@@ -287,9 +287,9 @@ def lines(
     return draw(chart)
 
 
-def x_axis(width: int) -> alt.Axis:
-    """A horizontal axis of steps, with no more labels than fit."""
-    return alt.Axis(labelExpr=SHORT_NUMBERS, grid=False, tickCount=max(3, width // 80))
+def x_axis(width: int, labels: str = SHORT_NUMBERS) -> alt.Axis:
+    """A horizontal axis of counts, with no more labels than fit."""
+    return alt.Axis(labelExpr=labels, grid=False, tickCount=max(3, width // 80))
 
 
 def ages(rows: Sequence[Row]) -> Drawing:
