@@ -116,8 +116,10 @@ def write_missions(path: Path, missions: MissionsFile) -> None:
 
 def as_toml(missions: MissionsFile) -> str:
     """The text of the file."""
+    driven = any(order.missions is not None for order in missions.missions)
+    how = "`restock record --missions` drives it" if driven else "the twin cannot drive hours"
     lines = [
-        "# What to log next, as `restock gaps` planned it; `restock record --missions` drives it.",
+        f"# What to log next, as `restock gaps` planned it; {how}.",
         f"format = {toml_value(missions.format)}",
         f"store = {toml_value(missions.store)}",
         f"store_version = {missions.store_version}",

@@ -19,6 +19,7 @@ from restock.cli import main
 from restock.replay.store.store import Store
 from restock.report import write_study_page
 from restock.report.fleet.coverage import coverage_facts, coverage_page
+from restock.report.fleet.shopping import shopping_section
 from restock.report.look import charts
 from restock.report.look.live import Charts
 from restock.report.study.comparison import gate_section
@@ -230,6 +231,16 @@ def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: 
     assert len(told) >= 4
     assert all(len(colours) == 1 for colours in told.values())
     assert len(set.union(*told.values())) == len(told)  # and nobody else's
+
+
+@pytest.mark.parametrize("unit", ["missions", "hours"])
+def test_missions_to_drive_are_offered_where_the_plan_is_of_missions(unit: str) -> None:
+    """The twin drives no hours of logging: `restock record --missions` refused the file."""
+    gap = {**NEVER_SEEN, "best": "logging", "amount": 3, "amount_low": 2, "amount_high": 5}
+    order = {"kind": None, "zone": None, "robot": None, "missions": 3, "hours": 0.1}
+    plan = {"orders": [{**order, "fills": ["wheel_slip"]}], "total": 3.0}
+    section = shopping_section(missing(gap, unit=unit, **plan))
+    assert ("--missions-out" in section.intro) == (unit == "missions")
 
 
 @pytest.mark.long

@@ -267,6 +267,8 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
     whole = MissionsFile(missions=(MissionOrder(kind="wheel_slip", missions=3, zone='"x"'),))
     (tmp_path / "good.toml").write_text(as_toml(whole))
     assert read_missions(tmp_path / "good.toml") == whole
+    assert "`restock record --missions` drives it" in as_toml(whole)
+    assert "restock record" not in as_toml(MissionsFile(missions=(MissionOrder(hours=8.8),)))
     for text, message in (
         ("[[missions]]\nkind = 'x'\n", "must be given"),
         ("[[missions]]\nkind = 'x'\nmissions = 0\n", "missions"),

@@ -81,9 +81,10 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
         which = "every gap that has a rate" if unknown else "every gap"
         intro.append(
             f"The least number of {unit} that fills {which} with {gaps['confidence']:.0%},"
-            " at the rates of the store's own episodes; intervals are 95 %. `restock gaps"
-            " --missions-out FILE` writes it as missions to drive."
+            " at the rates of the store's own episodes; intervals are 95 %."
         )
+    if orders and unit == "missions":  # the twin drives no hours
+        intro.append("`restock gaps --missions-out FILE` writes it as missions to drive.")
     if unknown:
         intro.append(
             "What was never logged has no rate, so no amount to fill it is known: to see one"
