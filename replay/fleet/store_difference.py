@@ -15,7 +15,7 @@ from typing import Any
 import duckdb
 import numpy as np
 
-from restock.errors import StoreError
+from restock.errors import StoreError, expect
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.interrupts import interrupts_raised
 from restock.replay.fleet.two_sample import (
@@ -116,7 +116,10 @@ def diff_stores(first: Store, second: Store, *, seed: int = 0) -> StoreDifferenc
 
     Raises:
         StoreError: their rows are of different tasks, or cannot be read.
+        ArgumentError: one is not a Store.
     """
+    for name, store in (("first", first), ("second", second)):
+        expect(name, store, Store, 'open it as Store("store")')
     _same_task(first, second)
     with (
         tempfile.TemporaryDirectory(prefix="restock-") as spill,

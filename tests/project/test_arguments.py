@@ -22,7 +22,16 @@ from restock.ingest import (
     relabel_store,
     remove_recordings,
 )
-from restock.replay import Store, build_panel, find_gaps, load_mixture, measure_drift
+from restock.replay import (
+    Store,
+    build_panel,
+    diff_panels,
+    diff_stores,
+    find_gaps,
+    load_mixture,
+    measure_drift,
+)
+from restock.train import compare, diagnose
 from restock.twin import RecordingPlan
 
 PROFILE = load_profile("warehouse_amr")
@@ -62,6 +71,11 @@ def test_a_name_in_place_of_what_bears_it_is_refused_by_name(store: Path, tmp_pa
             opened, ANY or "steps", name="steps"
         ),
         "store must be a Store, got 'c'": lambda: measure_drift(ANY or "c"),
+        "first must be a Store, got 'd'": lambda: diff_stores(ANY or "d", opened),
+        "second must be a Store, got 'e'": lambda: diff_stores(opened, ANY or "e"),
+        "first must be a Panel, got 'f'": lambda: diff_panels(ANY or "f", ANY or "g"),
+        "a run must be a Run, got 'runs/a'": lambda: diagnose([ANY or "runs/a"]),
+        "first must be a list of runs, got 'runs/b'": lambda: compare("runs/b", "runs/c"),
         "a store's place must be a str or Path, got <": lambda: StoreWriter(
             ANY or StoreWriter(store)
         ),

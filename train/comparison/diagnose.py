@@ -16,6 +16,7 @@ from math import isinf
 
 import msgspec
 
+from restock.errors import expect
 from restock.train.comparison.action_coverage import action_symptoms
 from restock.train.comparison.arms import refuse_dependent
 from restock.train.comparison.windows import (
@@ -58,7 +59,10 @@ def diagnose(
     Raises:
         RunError: no run is given, a run has no evaluation after its updates; or two of them are
             one run, have one seed or differ in more than it.
+        ArgumentError: one is not a Run.
     """
+    for run in runs:
+        expect("a run", run, Run, 'open it as Run.open("runs/a")')
     refuse_dependent(runs)
     windows = [windows_of(run) for run in runs]
     figures = [_figures(*pair) for pair in zip(runs, windows, strict=True)]
