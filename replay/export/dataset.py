@@ -80,6 +80,12 @@ def export_dataset(
             remedy=f"pip install {needs}, or {install_command('libraries')}",
         )
     check_license(license)
+    if license is not None and ending:
+        cards = ", ".join(name for name, (_, _, end) in FORMATS.items() if not end)
+        raise StoreError(
+            f"the format {to} has no card for a licence",
+            remedy=f"leave --license out, or export to {cards}",
+        )
     if cameras and to not in WITH_IMAGES:
         raise StoreError(
             f"the format {to} holds no images",

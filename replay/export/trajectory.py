@@ -135,6 +135,12 @@ class _Rows:
         self.terminated: Bools = np.asarray(_whole(table, "terminated", where), np.bool_)
         self.truncated: Bools = np.asarray(_whole(table, "truncated", where), np.bool_)
         self.reward: F32 = np.asarray(_whole(table, "reward", where), np.float32)
+        if count := int(np.isnan(self.reward).sum()):
+            raise StoreError(
+                f"{count} rows have a reward that is not a number",
+                where=where,
+                remedy="add WHERE NOT isnan(reward)",
+            )
         self.action: NDArray[Any] = (
             np.stack(
                 [np.asarray(_whole(table, name, where), np.float32) for name in COMMAND], axis=1

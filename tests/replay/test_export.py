@@ -472,6 +472,12 @@ def test_a_query_that_lacks_columns_is_refused_by_their_names(
             "rows have no reward",
         ),
         (
+            {"query": "SELECT * REPLACE ('nan'::FLOAT AS reward) FROM transitions"},
+            StoreError,
+            "rows have a reward that is not a number",
+        ),
+        ({"license": "cc-by-4.0"}, StoreError, "the format npz has no card for a licence"),
+        (
             {"query": "SELECT * REPLACE (error('boom')::FLOAT AS reward) FROM transitions"},
             QueryError,
             "boom",
