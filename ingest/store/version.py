@@ -42,7 +42,7 @@ def parse_version(text: str) -> Version:
             where="--version",
             remedy="give a number such as 12, or a time such as 2026-11-01T08:00Z",
         ) from None
-    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return moment
 
 
 def given_version(text: str | None) -> Version | None:
@@ -62,11 +62,12 @@ def split_version(place: str) -> tuple[str, Version | None]:
 
 
 def version_at(table: DeltaTable, moment: datetime, *, where: str) -> int:
-    """The newest version of a table that was there at a moment.
+    """The newest version of a table that was there at a moment; of UTC where it names no zone.
 
     Raises:
         StoreError: it was made later.
     """
+    moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
     # The time that a commit says, not that of its file, which a copy of the store changes.
     made = {
         int(commit["version"]): datetime.fromtimestamp(commit["timestamp"] / 1000, UTC)

@@ -106,7 +106,8 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
     if folder is not None:
         path = Path(folder)
         if not path.is_dir() or not list(path.glob("*.sql")):
-            raise ConfigError("it contains no audits (*.sql)", where=str(path))
+            what = "it contains no audits (*.sql)" if path.is_dir() else "no such folder"
+            raise ConfigError(what, where=str(path))
         by_name |= {audit.name: audit for audit in _load(path.iterdir(), str(path))}
     return [by_name[name] for name in sorted(by_name)]
 

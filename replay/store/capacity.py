@@ -9,7 +9,7 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from restock.errors import ConfigError, StoreError
+from restock.errors import ConfigError, StoreError, expect
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import found, interruptible
 
@@ -66,8 +66,10 @@ def recommend_capacity(
     `effective_episodes`. Below the first, a first-in-first-out buffer forgets whole cells, and no
     sampling brings them back; below the second, what it holds is a few drives.
 
-    Raises StoreError where there are no transitions, ConfigError for a share that is none.
+    Raises StoreError where there are no transitions, ConfigError for a share that is none, or for
+    a path in place of a connection.
     """
+    expect("connection", connection, duckdb.DuckDBPyConnection, 'give Store("store").connection')
     if not 0 <= cells_share <= 1 or not effective_episodes >= 0:
         raise ConfigError(
             f"cells_share must be in [0, 1], and effective_episodes at least 0, got {cells_share} "

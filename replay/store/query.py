@@ -59,7 +59,8 @@ def query(
             raise QueryError(
                 f"{kind} is refused: queries are read-only",
                 where=where,
-                remedy="print with --csv or --json and redirect, or use .to_arrow_table()",
+                remedy="ask for rows with SELECT; to keep them, redirect --csv or --json, or use"
+                " .to_arrow_table()",
             )
     if alone and statements[-1].type.name in _WITHOUT_ROWS:
         raise QueryError(

@@ -12,6 +12,7 @@ import re
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -19,7 +20,7 @@ import duckdb
 import msgspec
 import pyarrow as pa
 
-from restock.errors import QueryError, StoreError
+from restock.errors import QueryError, StoreError, expect
 from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
@@ -68,6 +69,7 @@ class Store:
 
     Raises:
         StoreError: nothing there, not a store, no such version, or it cannot be reached.
+        ArgumentError: a version of another kind.
     """
 
     @interrupts_raised
@@ -79,6 +81,8 @@ class Store:
         memory_limit: str | None = None,
     ) -> None:
         self.path = Location.of(path)
+        if version is not None:
+            expect("version", version, (int, datetime), "give a number, or a moment")
         _expect(self.path)
         transitions = self.path.open_table(TRANSITIONS, version)
         recordings = self.path.open_table(RECORDINGS)

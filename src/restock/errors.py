@@ -70,7 +70,8 @@ def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str)
     """
     if not isinstance(given, kind):
         kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
-        what = f"{name} must be a {kinds}, got {repr(given)[:80]}"
+        article = "an" if kinds[0].lower() in "aeiou" else "a"
+        what = f"{name} must be {article} {kinds}, got {repr(given)[:80]}"
         raise ArgumentError(what, remedy=remedy)
 
 

@@ -623,6 +623,8 @@ def test_an_audit_without_a_whole_header_is_refused(
 def test_wrong_files_of_audits_and_thresholds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no audits"):
         load_audits(tmp_path)
+    with pytest.raises(ConfigError, match="no such folder"):
+        load_audits(tmp_path / "audits")
     (tmp_path / "t.toml").write_text("rare_condition = 3")
     with pytest.raises(ConfigError, match="not a table"):
         load_thresholds(tmp_path / "t.toml")

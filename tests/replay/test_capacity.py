@@ -11,7 +11,7 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.errors import ConfigError
+from restock.errors import ArgumentError, ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
@@ -111,6 +111,11 @@ def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str
     assert document["curve"][-1]["cells_share"] == 1.0
     assert cli.main(["audit", str(store_path), "--capacity"]) == 0
     assert f"{document['recommended']:,} rows: " in capsys.readouterr().out
+
+
+def test_a_path_is_no_connection(store_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r'give Store\("store"\)\.connection'):
+        recommend_capacity(str(store_path))  # type: ignore[arg-type]
 
 
 def test_the_number_is_written_into_a_config(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from pathlib import Path
 
 import msgspec
@@ -15,7 +16,7 @@ from scipy.sparse import csr_array
 from support.stores import TASK, manifest, one, recording_transitions, write_store
 
 from restock.cli import main
-from restock.errors import StoreError
+from restock.errors import ArgumentError, StoreError
 from restock.ingest.store.version import parse_version, split_version
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.fleet.store_difference import diff_stores, shifted
@@ -106,6 +107,10 @@ def test_two_versions_of_a_store_by_number_and_by_time(
         Store(tmp_path / "store", version=parse_version("2001-01-01"))
     with pytest.raises(StoreError, match=f"its newest is {newest}"):
         Store(tmp_path / "store", version=99)
+    with Store(tmp_path / "store", version=datetime(2999, 1, 1)) as store:  # of UTC
+        assert store.version == newest
+    with pytest.raises(ArgumentError, match="version must be an int or datetime, got 'newest'"):
+        Store(tmp_path / "store", version="newest")  # type: ignore[arg-type]
 
 
 def test_stores_of_two_tasks_are_refused_with_both_names(

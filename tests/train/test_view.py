@@ -309,3 +309,5 @@ def test_the_command_names_the_file_and_its_layout(
     assert Path(made["layout"]).exists()
     assert cli.main(["trace", str(event.run), "--view", str(tmp_path / "x.mcap")]) == 2
     assert "give ROW" in capsys.readouterr().err
+    assert cli.main(["trace", str(event.store), row, "--before", "1"]) == 2
+    assert "--before: has no effect without --view" in capsys.readouterr().err

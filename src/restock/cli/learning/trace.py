@@ -111,6 +111,7 @@ class TraceCommand:
             _print_view(written)
 
     def _check_view(self) -> None:
+        from restock.cli.command_line import refuse
         from restock.errors import ConfigError
 
         if self.view is None:
@@ -118,6 +119,8 @@ class TraceCommand:
                 raise ConfigError(
                     "needs a file to write to", where="--beside", remedy="give --view FILE"
                 )
+            without = ("before", "after", "critic")
+            refuse(self, without, "has no effect without --view", remedy="give --view FILE")
             return
         from restock.train.view.view import check_view
 
