@@ -227,7 +227,7 @@ def test_a_new_plan_makes_no_jump_in_progress() -> None:
 
 
 def test_a_fixed_episode_that_is_no_spec_is_refused_at_once(env: WarehouseVectorEnv) -> None:
-    with pytest.raises(ConfigError, match="an episode must be a EpisodeSpec, got 'nominal'"):
+    with pytest.raises(ConfigError, match="an episode must be an EpisodeSpec, got 'nominal'"):
         env.set_episodes(["nominal"])  # type: ignore[list-item]
 
 
