@@ -7,7 +7,6 @@ those of GROUP_S seconds together, or as soon as MOST wait.
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ from restock.ingest.store.repeated import RepeatedDrive
 from restock.ingest.store.writer import Staged, StoreWriter
 from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.tags import in_words
-from restock.words import counted
+from restock.words import counted, quoted
 
 GROUP_S = 5.0
 MOST = 64
@@ -115,7 +114,7 @@ def _refusal(
 
 
 def _removal(store: StoreWriter, recording_id: str) -> str:
-    return f"`restock remove {shlex.quote(str(store.path))} {recording_id}`"
+    return f"`restock remove {quoted(store.path)} {recording_id}`"
 
 
 def _commit(

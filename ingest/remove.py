@@ -16,7 +16,7 @@ from typing import Any
 
 from restock.errors import StoreError, expect
 from restock.ingest.store.writer import StoreWriter
-from restock.words import counted, typed
+from restock.words import counted, quoted
 
 OPERATION = "restock remove"
 ID_DIGITS = 16
@@ -104,7 +104,7 @@ def _chosen(
             "\n    ".join(["nothing was removed:", *problems]),
             where=where,
             remedy="name each recording by its id (or at least its first"
-            f" {PREFIX_DIGITS} digits) or its path; `restock sql {typed(where)}"
+            f" {PREFIX_DIGITS} digits) or its path; `restock sql {quoted(where)}"
             ' "SELECT recording_id, source_file FROM recordings"` lists them',
         )
     return sorted(chosen.values(), key=_by_path)

@@ -24,7 +24,7 @@ from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import found
-from restock.words import typed
+from restock.words import quoted
 
 DISCOUNT = 0.99  # of a store's rows, unless another is asked for
 NAMES = ("reward_order", "reward_undetermined")
@@ -118,7 +118,7 @@ def _check_evaluated(connection: duckdb.DuckDBPyConnection, run: Path) -> None:
         raise RunError(
             "has no evaluation with discounted returns",
             where=str(run),
-            remedy=f"restock eval {typed(run)} --policies agent,planner,operator --episodes 200"
+            remedy=f"restock eval {quoted(run)} --policies agent,planner,operator --episodes 200"
             " --perturbations none",
         )
 

@@ -24,7 +24,7 @@ from deltalake import DeltaTable
 from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.location import TRANSITIONS, Location, open_parquet
-from restock.words import typed
+from restock.words import quoted
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
 INGESTS = b"restock.ingests"  # key in the metadata of a compacted file
@@ -132,8 +132,8 @@ def damage_remedy(place: Location, path: str) -> str:
     if name == TRANSITIONS and OWN_PATH.fullmatch(file):
         return "restore the file from a copy, or ingest its recording again with --force"
     return (
-        f"restore the file from a copy, or let `restock compact {typed(place)} --drop-damaged` take"
-        " it out of the store: it names the recordings to ingest again"
+        f"restore the file from a copy, or let `restock compact {quoted(place)} --drop-damaged`"
+        " take it out of the store: it names the recordings to ingest again"
     )
 
 

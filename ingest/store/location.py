@@ -36,7 +36,7 @@ from restock.ingest.store.version import (
     split_version,
     version_at,
 )
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     import pyarrow.compute as pc
@@ -197,7 +197,7 @@ class Location:
                 f"`{path}` is a store: name its version with --version"
                 f" {self.text.removeprefix(f'{path}@')}, where the command has that option"
             )
-        return f"`restock ingest RECORDINGS --store {typed(self.text)}` makes a store"
+        return f"`restock ingest RECORDINGS --store {quoted(self.text)}` makes a store"
 
     def open_table(self, name: str, version: Version | None = None) -> DeltaTable:
         """One of its tables, at a version (or the newest of a moment) or at its newest.

@@ -25,12 +25,11 @@ FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden b
 LEAST_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
-# The signals that it takes.
-MOTION = (
+_MOTION = (
     *("stamp_ns", "gyro_yaw_rate_radps"),
     *("localised_speed_mps", "localised_lateral_mps"),
 )
-SCANNED = (*MOTION, "sector_clearance_m")
+SCANNED = (*_MOTION, "sector_clearance_m")  # the signals that `came_nearer` takes
 _ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
 
 
@@ -108,7 +107,7 @@ def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked
 def _motions(scans: Sequence[Signals]) -> F64:
     """Of steps, the last one first: from each one's body frame to that of the step before, as x, y,
     cosine and sine of the turn, (steps - 1, 4, N)."""
-    stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in MOTION)
+    stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in _MOTION)
     elapsed_s = (stamp_ns[:-1] - stamp_ns[1:]) * 1e-9
     turn = elapsed_s * (rate[:-1] + rate[1:]) / 2
     forward, left = elapsed_s * forward[:-1], elapsed_s * left[:-1]

@@ -21,7 +21,7 @@ from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
 from restock.replay.store.store import Store, is_store
 from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
-from restock.words import typed
+from restock.words import quoted
 
 
 @dataclass
@@ -195,7 +195,7 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
             f"{row!r} is not an audited row",
             where=str(run),
             remedy="write STEP/ROW, a gradient step and a row of its batch, e.g. 1200/17;"
-            f" `restock trace {typed(run)}` lists some",
+            f" `restock trace {quoted(run)}` lists some",
         )
     query = "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place"
     values = {"file": table, "step": int(step), "place": int(place)}
@@ -205,7 +205,7 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
         raise RunError(
             f"the batch of gradient step {step} was not audited, or has no row {place}",
             where=str(run),
-            remedy=f"`restock trace {typed(run)}` lists audited rows; record.audit_share sets how"
+            remedy=f"`restock trace {quoted(run)}` lists audited rows; record.audit_share sets how"
             " many there are",
         )
     return rows[0]

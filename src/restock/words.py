@@ -15,7 +15,7 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {plural(number, noun)}"
 
 
-def typed(path: object) -> str:
+def quoted(path: object) -> str:
     """A path as it is typed into a shell, in a command that a message suggests."""
     return shlex.quote(str(path))
 

@@ -41,7 +41,7 @@ from restock.train.comparison.comparability import (
 )
 from restock.train.evaluation.regression import LEAST_EPISODES, agent_episodes
 from restock.train.run.run import Run
-from restock.words import counted, typed
+from restock.words import counted, quoted
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
@@ -251,7 +251,9 @@ def last_evaluation(run: Run) -> pa.Table:
     table = run.table("evaluations")
     if not len(table):
         raise RunError(
-            "has no evaluation", where=str(run.path), remedy=f"run `restock eval {typed(run.path)}`"
+            "has no evaluation",
+            where=str(run.path),
+            remedy=f"run `restock eval {quoted(run.path)}`",
         )
     last = pc.max(table["gradient_steps"])
     return table.filter(pc.equal(table["gradient_steps"], last))

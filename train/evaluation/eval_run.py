@@ -31,7 +31,7 @@ from restock.train.run.kept_evaluations import LIMITED, add_evaluation, shown_ev
 from restock.train.run.measures import summary_rows
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.words import typed
+from restock.words import quoted
 
 Results = dict[tuple[str, str], list[EpisodeResult]]  # (policy, perturbation) -> episodes
 
@@ -141,7 +141,7 @@ def recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
         raise RunError(
             "has no recorded evaluation",
             where=str(run),
-            remedy=f"run `restock eval {typed(run)}` (without --no-drive)",
+            remedy=f"run `restock eval {quoted(run)}` (without --no-drive)",
         )
     return table.to_pylist(), text
 

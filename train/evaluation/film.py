@@ -30,7 +30,7 @@ from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.model import PEOPLE
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -116,7 +116,7 @@ def film_evaluation(
         raise RunError(
             f"has no episode on floors {plan.layouts} to film",
             where=str(plan.run.path),
-            remedy=f"run `restock eval {typed(plan.run.path)}` first",
+            remedy=f"run `restock eval {quoted(plan.run.path)}` first",
         )
     folder = plan.run.path / FOLDER
     folder.mkdir(parents=True, exist_ok=True)

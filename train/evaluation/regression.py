@@ -25,7 +25,7 @@ from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.words import counted, typed
+from restock.words import counted, quoted
 
 AGENT = "agent"
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
@@ -245,7 +245,7 @@ def _driven(run: Run, policy: str) -> pa.Table:
     raise RunError(
         f"has no evaluation of {'its own policy' if policy == AGENT else policy}",
         where=str(run.path),
-        remedy=f"run `restock eval {typed(run.path)} --policies {policy}`",
+        remedy=f"run `restock eval {quoted(run.path)} --policies {policy}`",
     )
 
 

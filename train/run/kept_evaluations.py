@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from restock.errors import RunError
 from restock.files import read_table, write_table
 from restock.train.run.run_tables import EVAL_EPISODES
-from restock.words import typed
+from restock.words import quoted
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
@@ -39,7 +39,7 @@ def read_evaluations(run: Path) -> pa.Table:
         file,
         EVAL_EPISODES,
         error=RunError,
-        remedy=f"remove it, then `restock eval {typed(run)}` again",
+        remedy=f"remove it, then `restock eval {quoted(run)}` again",
     )
 
 

@@ -11,7 +11,6 @@ eval/                  what `restock eval` measured
 from __future__ import annotations
 
 import json
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -32,6 +31,7 @@ from restock.files import (
 )
 from restock.train.run.run_lock import LOCK
 from restock.train.run.run_tables import TABLES
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -240,7 +240,7 @@ def check_free(path: Path) -> None:
 
 def resuming(path: Path) -> str:
     """The command that continues a run, to be pasted in a shell."""
-    return f"`restock train --resume {shlex.quote(str(path))}`"
+    return f"`restock train --resume {quoted(path)}`"
 
 
 def software_versions() -> dict[str, str]:

@@ -36,7 +36,7 @@ from restock.train.run.run import Run
 from restock.train.study.space import MIXTURE, Parameter, Search, settings_of, trial_name
 from restock.train.study.study import DONE
 from restock.train.study.study_run import Say, episodes_flags, pack, restock_verb, train_words
-from restock.words import typed
+from restock.words import quoted
 
 SEARCH, TRIALS = "search.json", "trials.log"  # what was asked; Optuna's journal
 _POLL_S = 0.5
@@ -298,7 +298,7 @@ def _found(plan: SearchPlan, study: Any) -> dict[str, Any]:
     if best is not None:
         panel = plan.panel(best["values"])
         lines = [f"# trial {best['trial']}: at least {best['worst_lower_bound']:.3f}"]
-        lines += [f"# restock train --config best.toml --panel {typed(panel)}"] if panel else []
+        lines += [f"# restock train --config best.toml --panel {quoted(panel)}"] if panel else []
         lines += [
             " = ".join(line.split("=", 1)) for line in settings_of(plan.search, best["values"])
         ]

@@ -28,7 +28,7 @@ from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Step
 from restock.train.view.critic import Critic
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -111,7 +111,7 @@ def evaluated_moment(run: Path, name: str, *, begins_ns: int) -> Evaluated:
         raise RunError(
             f"episode {name} driven again has another {', '.join(differing)} than recorded",
             where=str(run),
-            remedy=f"`restock eval {typed(run)}` drives its evaluation again",
+            remedy=f"`restock eval {quoted(run)}` drives its evaluation again",
         )
     stamps = np.array([one["stamp_ns"] for one in steps], np.int64)
     ways = [way if len(way) else None for way in plans]
@@ -147,7 +147,7 @@ def _recorded(plan: EvaluationPlan, name: str) -> dict[str, Any]:
         where="--beside",
         remedy=f"give CONDITION/SEED of one: {known}"
         if known
-        else f"run `restock eval {typed(plan.run.path)}` first",
+        else f"run `restock eval {quoted(plan.run.path)}` first",
     )
 
 

@@ -181,7 +181,7 @@ def _settle_pandas() -> None:
 
 def _start_no_blas_threads() -> None:
     """NumPy's OpenBLAS starts a thread a core while it is imported, and they wait for work in a
-    loop: a fifth of the CPU time of a short command on two cores, more on more. What it computes
+    loop: a tenth of the CPU time of a short command on two cores, more on more. What it computes
     then depends on the number of cores no more. A number that the environment gives stands."""
     if "numpy" not in sys.modules:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -64,6 +64,23 @@ static int get_vector(PyObject *from, Py_buffer *view, char kind, int writes, co
     return -1;
 }
 
+/* Vectors of float64, of which those from `written` on are filled. Returns how many there are: fewer
+ * than `count` with an error. */
+static int get_vectors(PyObject **from, Py_buffer *view, int count, int written,
+                       const char *const *names) {
+    int held = 0;
+    while (held < count && get_vector(from[held], &view[held], 'd', held >= written, names[held]) == 0)
+        held++;
+    return held;
+}
+
+/* The answer, with the buffers that were held given back. */
+static PyObject *released(Py_buffer *view, int held, PyObject *answer) {
+    while (held)
+        PyBuffer_Release(&view[--held]);
+    return answer;
+}
+
 static int wrong_shape(const char *name) {
     PyErr_Format(PyExc_ValueError, "%s has another shape than the others ask for", name);
     return -1;

@@ -99,9 +99,7 @@ static PyObject *td_loss(PyObject *Py_UNUSED(module), PyObject *args) {
 done:
     if (masked)
         PyBuffer_Release(&mask);
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }
 
 /* Rounded where PyTorch's fused Adam and `lerp_` round, fused multiply-adds included: built for AVX2
@@ -172,7 +170,5 @@ static PyObject *adam(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_END_ALLOW_THREADS
     answer = Py_NewRef(Py_None);
 done:
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }

@@ -161,7 +161,5 @@ static PyObject *ranges(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_END_ALLOW_THREADS
     answer = Py_NewRef(Py_None);
 done:
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }

@@ -129,7 +129,5 @@ static PyObject *find_places(PyObject *Py_UNUSED(module), PyObject *args) {
     }
     answer = Py_NewRef(Py_None);
 done:
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }

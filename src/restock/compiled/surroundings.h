@@ -3,6 +3,8 @@
 #include "buffers.h"
 #include <math.h>
 
+#define ROUNDING 1e-13 /* of squared distances: `route.ROUNDING` */
+
 PyDoc_STRVAR(
     view_plans_doc,
     "view_plans(plans, x, y, cosine, sine, ahead, look_ahead, remaining, offset)\n--\n\n"
@@ -62,7 +64,7 @@ NARROW static void view_plan(const double *restrict plan, Size points, double x,
         least = least_of(at.distance2[i], least);
     }
     /* Where a plan comes by twice it is at the first time, whatever rounding makes of the two. */
-    double within = least + 1e-13 * (least + 0.1);
+    double within = least + ROUNDING * (least + 0.1);
     while (nearest < legs && !(at.distance2[nearest] <= within))
         nearest++;
     if (nearest == legs)
@@ -91,14 +93,13 @@ static PyObject *view_plans(PyObject *Py_UNUSED(module), PyObject *args) {
                                      "ahead", "look_ahead", "remaining", "offset"};
     PyObject *from[ALL], *answer = NULL;
     Py_buffer view[ALL];
-    int held = 0;
     double *scratch = NULL;
     if (!PyArg_ParseTuple(args, "OOOOOOOOO", &from[0], &from[1], &from[2], &from[3], &from[4],
                           &from[5], &from[6], &from[7], &from[8]))
         return NULL;
-    for (; held < ALL; held++)
-        if (get_vector(from[held], &view[held], 'd', held >= LOOK_AHEAD, names[held]) < 0)
-            goto done;
+    int held = get_vectors(from, view, ALL, LOOK_AHEAD, names);
+    if (held < ALL)
+        goto done;
     Size count = view[X].shape[0], looks = view[DISTANCES].shape[0];
     Size points = count ? view[PLANS].shape[0] / (2 * count) : 2;
     int fits = points >= 2 && view[PLANS].shape[0] == 2 * count * points &&
@@ -130,9 +131,7 @@ static PyObject *view_plans(PyObject *Py_UNUSED(module), PyObject *args) {
     answer = Py_NewRef(Py_None);
 done:
     free(scratch);
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }
 
 /* How far points (count,) are off a plan, squared, and how far along it that is. */
@@ -164,20 +163,19 @@ static PyObject *find_returns(PyObject *Py_UNUSED(module), PyObject *args) {
     static const char *names[ALL] = {"x", "y", "clearance", "plan", "way", "gap"};
     PyObject *from[ALL], *answer = NULL;
     Py_buffer view[ALL];
-    int held = 0;
     double range, range2, on2, ahead, *scratch = NULL;
     if (!PyArg_ParseTuple(args, "OOOOOO(dddd)", &from[0], &from[1], &from[2], &from[3], &from[4],
                           &from[5], &range, &range2, &on2, &ahead))
         return NULL;
-    for (; held < ALL; held++)
-        if (get_vector(from[held], &view[held], 'd', held >= WAY, names[held]) < 0)
-            goto done;
+    int held = get_vectors(from, view, ALL, WAY, names);
+    if (held < ALL)
+        goto done;
     Size count = view[WAY].shape[0];
     Size sectors = count ? view[X].shape[0] / count : 0;
     Size points = count ? view[PLAN].shape[0] / (2 * count) : 0;
-    if ((count && points < 1) || view[X].shape[0] != count * sectors || view[Y].shape[0] != count * sectors ||
-        view[CLEARANCE].shape[0] != count * sectors || view[PLAN].shape[0] != 2 * count * points ||
-        view[GAP].shape[0] != count) {
+    if ((count && points < 1) || view[X].shape[0] != count * sectors ||
+        view[Y].shape[0] != count * sectors || view[CLEARANCE].shape[0] != count * sectors ||
+        view[PLAN].shape[0] != 2 * count * points || view[GAP].shape[0] != count) {
         wrong_shape("an argument");
         goto done;
     }
@@ -205,9 +203,7 @@ static PyObject *find_returns(PyObject *Py_UNUSED(module), PyObject *args) {
     answer = Py_NewRef(Py_None);
 done:
     free(scratch);
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }
 
 /* What grows with the bearing of (x, y) as that does: `surroundings._turned`. */
@@ -264,13 +260,12 @@ static PyObject *find_came(PyObject *Py_UNUSED(module), PyObject *args) {
     PyObject *from[ALL], *answer = NULL;
     Py_buffer view[ALL];
     Sectors of;
-    int held = 0;
     if (!PyArg_ParseTuple(args, "OOOOOOOOO(ddd)", &from[0], &from[1], &from[2], &from[3], &from[4],
                           &from[5], &from[6], &from[7], &from[8], &of.near, &of.range, &of.lever))
         return NULL;
-    for (; held < ALL; held++)
-        if (get_vector(from[held], &view[held], 'd', held == CAME, names[held]) < 0)
-            goto done;
+    int held = get_vectors(from, view, ALL, CAME, names);
+    if (held < ALL)
+        goto done;
     Size count = view[CAME].shape[0], sectors = view[REACH].shape[0];
     Size steps = count && sectors ? view[BEFORE].shape[0] / (count * sectors) : 0;
     if (sectors < 1 || (count && steps < 1) || view[CLEARANCE].shape[0] != count * sectors ||
@@ -306,7 +301,5 @@ static PyObject *find_came(PyObject *Py_UNUSED(module), PyObject *args) {
     Py_END_ALLOW_THREADS
     answer = Py_NewRef(Py_None);
 done:
-    while (held)
-        PyBuffer_Release(&view[--held]);
-    return answer;
+    return released(view, held, answer);
 }

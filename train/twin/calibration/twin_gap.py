@@ -23,7 +23,7 @@ from restock.errors import RunError
 from restock.files import write_table, write_text
 from restock.stats import ConfidenceInterval
 from restock.toml import Checked
-from restock.words import typed
+from restock.words import quoted
 
 Rows = list[dict[str, Any]]
 
@@ -208,7 +208,7 @@ def read_gap(folder: Path) -> TwinGap:
     Raises:
         RunError: there is no gap in `folder`, or it cannot be read.
     """
-    remedy = f"`restock twin gap STORE --out {typed(folder)}` measures one"
+    remedy = f"`restock twin gap STORE --out {quoted(folder)}` measures one"
     if not (folder / DOCUMENT).exists():
         raise RunError("no gap of the twin has been measured", where=str(folder), remedy=remedy)
     try:

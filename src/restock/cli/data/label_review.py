@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.errors import ExitCode, LabelError
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.ingest.correct import Corrected
@@ -59,7 +59,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     output.say(f"to see the first: {rows[0]['open']}")
     output.say(
         f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "
-        f"is true), then run: restock label {typed(path)} --corrections {typed(out)}"
+        f"is true), then run: restock label {quoted(path)} --corrections {quoted(out)}"
         if out is not None
         else "--out FILE writes them to a CSV file with a column for verdicts"
     )

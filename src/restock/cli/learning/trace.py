@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.replay.trace import trace as tracing
@@ -95,7 +95,7 @@ class TraceCommand:
                 output.say("more columns are shown in a wider terminal, a file or a pipe")
             if listed:
                 output.say(
-                    f"`restock trace {typed(self.place)} {listed[0]['row']}` traces one of them"
+                    f"`restock trace {quoted(self.place)} {listed[0]['row']}` traces one of them"
                 )
             return
         version = given_version(self.version)
@@ -129,7 +129,7 @@ class TraceCommand:
             raise ConfigError(
                 "needs one row",
                 where="--view",
-                remedy=f"give ROW; for a run, `restock trace {typed(self.place)}` lists some rows",
+                remedy=f"give ROW; for a run, `restock trace {quoted(self.place)}` lists some rows",
             )
         for name in ("before", "after"):
             if not 0 <= getattr(self, name) <= 3600:

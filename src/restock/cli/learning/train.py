@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +12,8 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.train.flush_fresh import Flushed
@@ -269,6 +270,6 @@ def _print(
         )
     say(
         f"{outcome.env_steps:,} environment steps and {outcome.gradient_steps:,} updates in"
-        f" {outcome.wall_s:.0f} s\nnext: restock eval {shlex.quote(path)}"
+        f" {outcome.wall_s:.0f} s\nnext: restock eval {quoted(path)}"
         + ("" if rows else " --on-logs own")
     )

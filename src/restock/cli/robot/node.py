@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.ingest.profile.profile import Profile
@@ -86,5 +86,5 @@ class NodeCommand:
             raise ConfigError("already exists", where=str(out), remedy="choose another file")
         expect_file_place(out, "--write-profile")
         write_bytes(out, profile_toml(with_node_topics(profile)).encode())
-        say(f"{out}: restock ingest RECORDINGS --profile {typed(out)} --store STORE")
+        say(f"{out}: restock ingest RECORDINGS --profile {quoted(out)} --store STORE")
         return 0

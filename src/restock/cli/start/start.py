@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from restock.errors import ConfigError, ExitCode, RecordingError
-from restock.words import typed
+from restock.words import quoted
 
 
 @dataclass
@@ -112,7 +112,7 @@ class StartCommand:
             )
         if stopped is None:
             if not self.dry_run:
-                onnx = f"restock export {typed(self.out / 'run')} --to onnx --out policy.onnx"
+                onnx = f"restock export {quoted(self.out / 'run')} --to onnx --out policy.onnx"
                 say(f"\nThe policy, for the robot: {escape(onnx)} (docs/deploy.md)")
                 if (needs := node_refuses(self.profile or self.out / "profile.toml")) is not None:
                     say(f"   {escape(needs)} (docs/deploy.md#without-the-node)")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from restock.cli.start.settings import Settings
 from restock.cli.start.stages import fed_uniformly, from_logs_alone
 from restock.stats import wilson
-from restock.words import typed
+from restock.words import quoted
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -106,7 +106,7 @@ def trained(to: Settings) -> str:
             "Fed uniformly has the same network, settings and seed"
             + (", as many steps, and every" if most else ", and every"),
             "row of the logs has the same probability. This compares feeds, not methods, so",
-            f"`restock compare {typed(to.uniform)} {typed(to.run)}` refuses",
+            f"`restock compare {quoted(to.uniform)} {quoted(to.run)}` refuses",
             "(unless --treatment mixture is given). One seed each is a sample of one:",
             "docs/evidence.md has ten.",
         ]
@@ -150,9 +150,9 @@ def rare_event(to: Settings) -> list[str]:
     name = f"{row['gradient_step']}/{row['batch_row']}"
     trace = trace_row(to.run, name)
     recording = trace.origin.transition["source_file"] if trace.origin is not None else ""
-    command = f"restock trace {typed(to.run)} {name}"
+    command = f"restock trace {quoted(to.run)} {name}"
     if recording and Path(recording).exists():
-        command += f" --recording {typed(recording)}"
+        command += f" --recording {quoted(recording)}"
         with suppress(RestockError):  # one that changed since is no reason to end the demo
             trace = trace_row(to.run, name, TracePlaces(recording=Path(recording)))
     return [*_told(trace, to), f"All of it: {command}"]
@@ -243,11 +243,11 @@ def next_steps(to: Settings) -> list[str]:
     return [
         "restock start BAG --out mine",
         "    the same stages on your own bag or MCAP file; it proposes how topics become signals",
-        f'restock sql {typed(store)} "FROM coverage_by_condition"',
+        f'restock sql {quoted(store)} "FROM coverage_by_condition"',
         "    your questions, in SQL: docs/sql.md lists tables and columns",
-        f"restock gaps {typed(store)} --mixture coverage",
+        f"restock gaps {quoted(store)} --mixture coverage",
         "    what the logs lack, and which missions would fill the gaps",
-        f"restock diagnose {typed(run)}",
+        f"restock diagnose {quoted(run)}",
         "    why a critic fails: because of what it was fed, or of its target?",
         "docs/tutorial.md, docs/your-robot.md",
         "    what replay and target do, cell by cell; your robot, from bags to a policy",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from restock.errors import ConfigError, ExitCode
-from restock.words import counted, typed
+from restock.words import counted, quoted
 
 if TYPE_CHECKING:
     from restock.ingest.remove import Removed
@@ -60,7 +60,7 @@ class RemoveCommand:
             raise ConfigError(
                 "names no recording to remove",
                 where="restock remove",
-                remedy=f'`restock sql {typed(self.store)} "SELECT recording_id, source_file FROM'
+                remedy=f'`restock sql {quoted(self.store)} "SELECT recording_id, source_file FROM'
                 ' recordings"` lists them',
             )
         done = remove_recordings(store, self.recordings, dry_run=self.dry_run)
@@ -93,8 +93,8 @@ class RemoveCommand:
             return [f"{self.store}: would remove {what}, {rows} ({left})"]
         lines = [f"{self.store}: removed {what}, {rows} ({left}); store version {done.version}"]
         it = "it" if len(done.recordings) == 1 else "them"
-        store = typed(self.store)
-        paths = [typed(one.source_file) for one in done.recordings[:SHOWN]]
+        store = quoted(self.store)
+        paths = [quoted(one.source_file) for one in done.recordings[:SHOWN]]
         paths += ["…"] * (len(done.recordings) > SHOWN)
         lines.append(f"to get {it} back: restock ingest {' '.join(paths)} --store {store}")
         if corrections := sum(one.corrections for one in done.recordings):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from restock.report.look.blocks import Rows, Section, Table, estimate
 from restock.report.run.facts import Facts
-from restock.words import typed
+from restock.words import quoted
 
 _NAMES = {
     "logged": "the logs' drivers",
@@ -62,7 +62,7 @@ def judged_section(facts: Facts) -> Section:
         return Section(
             "judged",
             "How good is it?",
-            intro=f"{NOTHING_DROVE} `restock eval --on-logs own {typed(facts.run)}` evaluates it"
+            intro=f"{NOTHING_DROVE} `restock eval --on-logs own {quoted(facts.run)}` evaluates it"
             " on episodes that it did not learn from.",
         )
     return Section(
