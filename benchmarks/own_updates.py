@@ -56,7 +56,7 @@ class Restock:
             logs_share=0.5 if logs else 0.0,
             seed=0,
         )
-        ring.strata.move(np.arange(ROWS), 1)  # as where episodes have ended
+        ring.by_condition.move(np.arange(ROWS), 1)  # as where episodes have ended
         self.blocks: UpdateBlocks | None = None
         if blocks:
             none = LogTerms(None, None)

@@ -123,13 +123,17 @@ class Prepared:
         layouts: str,
         episodes: list[EpisodeSpec] | None,
     ) -> Session:
+        profile = self.profile
+        conditions, exposures = (
+            conditions_in_twin(of_kind, profile.signals, lidar=profile.task.lidar)[0]
+            for of_kind in (profile.conditions, profile.exposures)
+        )
         return open_session(
             run,
             self.config,
-            task=self.profile.task,
-            conditions=conditions_in_twin(
-                self.profile.conditions, self.profile.signals, lidar=self.profile.task.lidar
-            )[0],
+            task=profile.task,
+            conditions=conditions,
+            exposures=exposures,
             env=env,
             evaluation_env=make_twin(
                 self.config,

@@ -20,6 +20,7 @@ from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.share_controller import FreshSupply
 from restock.state import Stateful
 from restock.toml import by_path
 from restock.train.dqn.behaviour import PolicyNetwork
@@ -32,6 +33,7 @@ from restock.train.evaluation.policies import kept_one, load_kept, save_agent
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.collector import Collector, ring_conditions
+from restock.train.feed.fresh_strata import FreshStrata
 from restock.train.feed.imitation import Imitation
 from restock.train.feed.log_fidelity import LogFidelity
 from restock.train.feed.logs import Logs, LogTerms
@@ -276,6 +278,7 @@ def open_session(
     resume: bool = False,
     episodes: Sequence[EpisodeSpec] | None = None,
     reference: Mapping[str, float] | None = None,
+    exposures: Sequence[Condition] = (),
 ) -> Session:
     """Put the parts of a run together, new or as its latest checkpoint left them.
 
@@ -286,6 +289,9 @@ def open_session(
     seed = config.seed
     learner = Learner(config, task.observation_size, len(task.actions))
     names = ring_conditions(conditions)
+    strata = None
+    if logs is not None and logs.panel is not None:
+        strata = FreshStrata.of(logs.panel, [*conditions, *exposures])
     reserved = int(config.replay.ring_rows * config.replay.ring_reserved / len(names))
     ring = FreshRing(
         config.replay.ring_rows,
@@ -294,6 +300,7 @@ def open_session(
         discount=config.loss.discount,
         n_step=config.loss.n_step,
         conditions=names,
+        strata=None if strata is None else strata.names,
         behaviour_policies=POLICIES,
         reserved=dict.fromkeys(names, reserved),
     )
@@ -303,9 +310,10 @@ def open_session(
         batch_size=config.replay.batch_size,
         logs_share=config.replay.logs_share,
         seed=seed,
+        fresh=None if strata is None else FreshSupply(strata.known),
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
-    collector = Collector(env, ring, conditions, task, executor, teacher)
+    collector = Collector(env, ring, conditions, task, executor, teacher, strata)
     fidelity = LogFidelity.of(logs, task.observation_size) if logs is not None else None
     session = Session(
         run=run,
@@ -328,6 +336,7 @@ def open_session(
             greedy=learner.greedy,
             labels=collector.labels,
             perturbations=collector.perturbations,
+            quotas=None if strata is None else batches.controller,
         ),
         events=Events(),
         probe=Probe.of_logs(logs, config.record.probe_rows) if logs is not None else None,

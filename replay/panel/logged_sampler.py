@@ -30,6 +30,7 @@ from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.sampler import QuotaSampler, Sampler
 from restock.replay.sampling.share_controller import (
+    FreshSupply,
     PlannedDraws,
     SampledStratum,
     ShareController,
@@ -98,9 +99,18 @@ class LoggedSampler(Stateful):
         """Whether `gather` must be asked for the rows: they are not in memory."""
         return isinstance(self.sampler, ChunkedSampler)
 
-    def move_to(self, env_steps: int) -> None:
-        """Before an online batch is drawn: shares with a schedule move with the steps."""
-        if self.controller.at(env_steps):
+    def move_to(self, env_steps: int, stock: F64 | None = None) -> bool:
+        """Before an online batch is drawn: shares move. True if they changed.
+
+        `stock` (S,): see `ShareController.at`.
+        """
+        if changed := self.controller.at(env_steps, stock):
+            self._follow()
+        return changed
+
+    def replan(self, planned: PlannedDraws) -> None:
+        """Plan for other draws from the next batch on."""
+        if self.controller.replan(planned):
             self._follow()
 
     def draw(self, count: int | None = None) -> BatchDraw:
@@ -189,6 +199,8 @@ class LoggedSampler(Stateful):
             return None
         others = self._rng.permutation(len(shares))
         by_share = sorted(others.tolist(), key=lambda s: -shares[s] * self._rng.random())
+        if self.controller.online:  # the ring gives the others
+            by_share = []
         for code in [stratum, *by_share]:
             members = self._stratum_rows[code]
             free = members[replays[members] < limit]
@@ -224,6 +236,7 @@ def sampler_for(
     planned: PlannedDraws | None = None,
     logs_share: float | None = None,
     lap_floor: float = 1.0,
+    fresh: FreshSupply | None = None,
 ) -> LoggedSampler:
     """The sampler that draws from a panel as its mixture says.
 
@@ -234,6 +247,7 @@ def sampler_for(
             mixture says under [planned].
         logs_share: of an online batch, in place of the mixture's.
         lap_floor: the threshold of the Huber loss, where `within = "lap"`.
+        fresh: what a ring beside the panel can give of each stratum; None: there is no ring.
 
     Raises:
         MixtureError: rows too few for what is planned, where the mixture refuses that; too little
@@ -242,7 +256,7 @@ def sampler_for(
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
     within = [stratum.within for stratum in panel.strata]
-    controller = controller_for(panel, planned or planned_by(mixture), logs_share)
+    controller = controller_for(panel, planned or planned_by(mixture), logs_share, fresh)
     seeds = _seeds(seed)
     rng = np.random.default_rng([*seeds, 2])
     sampler: Sampler
@@ -320,7 +334,10 @@ def planned_by(mixture: Mixture) -> PlannedDraws:
 
 
 def controller_for(
-    panel: Panel, planned: PlannedDraws, logs_share: float | None = None
+    panel: Panel,
+    planned: PlannedDraws,
+    logs_share: float | None = None,
+    fresh: FreshSupply | None = None,
 ) -> ShareController:
     """The shares of a learner that draws so much from a panel.
 
@@ -337,10 +354,11 @@ def controller_for(
             size,
             stratum.episodes,
             stratum.natural_share if stands_for_others(mixture, stratum.source) else None,
+            stratum.correction != "none",
         )
         for stratum, rule, size in zip(panel.strata, rules_of(mixture, names), sizes, strict=True)
     ]
-    return ShareController(mixture, strata, planned, logs_share=logs_share)
+    return ShareController(mixture, strata, planned, logs_share=logs_share, fresh=fresh)
 
 
 def _weights(panel: Panel) -> WeightsInForce | F32 | None:

@@ -8,6 +8,9 @@ belong to no stratum.
 A condition that is seldom met would be washed out by those that are met all the time. Rows may be
 reserved for it: then the next row overwrites the oldest of those conditions that hold more than
 what is reserved for them.
+
+Labelled rows also have a stratum, of the mixture that the logs are drawn by, so that a quota can be
+filled with fresh rows where the logs have too few.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ from restock.replay.ring.slots import NONE, Reserve, StratumSlots
 from restock.state import Stateful
 
 UNLABELLED = NONE
+_OF_SLOTS = ("rows", "stratum", "draws")  # arrays with a value a slot, besides META
 
 # Metadata of a row, one array (capacity,) each: name -> type.
 META: dict[str, type[np.generic]] = {
@@ -132,6 +136,7 @@ class FreshRing(Stateful):
         discount: gamma of one step.
         n_step: steps of a return.
         conditions: names that labels index, e.g. `["nominal", "wheel_slip"]`.
+        strata: names of the strata that rows are drawn by; default: the conditions.
         behaviour_policies: names that behaviour codes index.
         reserved: rows of a condition that others' rows do not overwrite, by its name; together at
             most `capacity`. Without, the oldest row is overwritten whatever its condition. With
@@ -142,10 +147,10 @@ class FreshRing(Stateful):
     """
 
     SAME: ClassVar[tuple[str, ...]] = (
-        *("capacity", "num_envs", "observation_size", "n_step", "conditions"),
+        *("capacity", "num_envs", "observation_size", "n_step", "conditions", "strata"),
     )
     STATE: ClassVar[tuple[str, ...]] = (
-        *("_reserve", "_filled", "_pending", "strata"),
+        *("_reserve", "_filled", "_pending", "by_condition", "by_stratum"),
         *("episode_key", "_episode_step", "_next_key"),
     )
 
@@ -158,6 +163,7 @@ class FreshRing(Stateful):
         discount: float,
         n_step: int = 1,
         conditions: Sequence[str] = (),
+        strata: Sequence[str] | None = None,
         behaviour_policies: Sequence[str] = ("dqn",),
         reserved: Mapping[str, int] | None = None,
     ) -> None:
@@ -178,8 +184,14 @@ class FreshRing(Stateful):
         self.meta: dict[str, NDArray[Any]] = {
             name: np.zeros(capacity, dtype) for name, dtype in META.items()
         }
-        self.strata = StratumSlots(capacity, len(self.conditions))
-        self._reserve = Reserve(capacity, self.strata, self.conditions, reserved or {})
+        self.strata = self.conditions if strata is None else tuple(strata)
+        self.by_condition = StratumSlots(capacity, len(self.conditions))
+        self._reserve = Reserve(capacity, self.by_condition, self.conditions, reserved or {})
+        # The stratum of each row, -1 without one; rows of each that `draw` may still give; and how
+        # often it gave each row.
+        self.stratum: NDArray[np.int16] = np.full(capacity, NONE, np.int16)
+        self.by_stratum = StratumSlots(capacity, len(self.strata))
+        self.draws: NDArray[np.int32] = np.zeros(capacity, np.int32)
         self._pending = PendingSteps(
             num_envs, observation_size, discount=discount, n_step=n_step, meta=META
         )
@@ -263,6 +275,8 @@ class FreshRing(Stateful):
         rows, meta = self._pending.pack(envs, next_observation, terminated)
         slots = self._reserve.take(len(envs))
         self.rows[slots] = rows
+        self.by_stratum.move(slots, NONE)
+        self.stratum[slots], self.draws[slots] = NONE, 0
         if self.written is not None:
             self.written.append(slots)
         for name, values in meta.items():
@@ -273,13 +287,18 @@ class FreshRing(Stateful):
                 self._env_slots = np.concatenate([self._env_slots, self._env_slots], axis=1)
             self._env_slots[envs, steps] = slots
 
-    def set_labels(self, episode_key: int, conditions: NDArray[Any]) -> int:
+    def set_labels(
+        self, episode_key: int, conditions: NDArray[Any], strata: NDArray[Any] | None = None
+    ) -> int:
         """Label the rows of an ended episode: `conditions[t]` (T,) codes its step t.
+
+        `strata` (T,) codes its strata, -1 where a step is in none; None: as the conditions.
 
         Returns how many of its rows were still in the ring. Raises MixtureError for a code that
         names no condition or a row beyond the labels given.
         """
         codes = np.asarray(conditions, np.int64)
+        of_strata = codes if strata is None else np.asarray(strata, np.int64)
         if len(codes) and not ((codes >= 0) & (codes < len(self.conditions))).all():
             raise MixtureError(
                 f"labels {sorted(set(codes.tolist()))} name no condition of {self.conditions}",
@@ -297,14 +316,50 @@ class FreshRing(Stateful):
                 f"{len(codes)} labels for an episode of at least {int(steps.max()) + 1} steps",
                 where=f"episode {episode_key} of the fresh ring",
             )
-        for code in np.unique(codes[steps]):
-            self.strata.move(slots[codes[steps] == code], int(code))
+        for slots_of, found in ((self.by_condition, codes), (self.by_stratum, of_strata)):
+            for code in np.unique(found[steps]):
+                slots_of.move(slots[found[steps] == code], int(code))
+        self.stratum[slots] = of_strata[steps]
         return len(slots)
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
         """The condition code of each slot (n,); -1 where it has no label yet."""
-        codes: NDArray[np.int16] = self.strata.stratum[slots]
+        codes: NDArray[np.int16] = self.by_condition.stratum[slots]
         return codes
+
+    @property
+    def stratum_rows(self) -> Ints:
+        """How many rows of each stratum it holds, (S,)."""
+        in_one = self.stratum[: len(self)]
+        return np.bincount(in_one[in_one >= 0], minlength=len(self.strata))
+
+    def draw(
+        self,
+        counts: Ints,
+        rng: np.random.Generator,
+        limit: int | None = None,
+        since: int | None = None,
+    ) -> Ints:
+        """Slots (n,) of so many rows of each stratum (S,), each of its rows alike.
+
+        Args:
+            limit: a row that was drawn so often is not drawn again.
+            since: the environment step of the oldest row that may be drawn.
+
+        A stratum without such rows gives none.
+        """
+        found: list[Ints] = [np.empty(0, np.int64)]
+        for stratum in np.flatnonzero(counts).tolist():
+            members = self.by_stratum.members(stratum)
+            if since is not None:
+                members = members[self.meta["env_step"][members] >= since]
+            if len(members):
+                found.append(members[rng.integers(len(members), size=int(counts[stratum]))])
+        slots = np.concatenate(found)
+        np.add.at(self.draws, slots, 1)
+        if limit is not None and len(used_up := slots[self.draws[slots] >= limit]):
+            self.by_stratum.move(np.unique(used_up), NONE)
+        return slots
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Ints:
         """Slots (B,), every row in the ring with the same probability.
@@ -317,15 +372,16 @@ class FreshRing(Stateful):
 
     @property
     def _filled(self) -> dict[str, NDArray[Any]]:
-        """What the filled slots hold: rows (n, W), and each of META (n,)."""
+        """What the filled slots hold: rows (n, W), and the rest of _OF_SLOTS and META (n,)."""
         filled = len(self)
         meta = {name: values[:filled] for name, values in self.meta.items()}
-        return {"rows": self.rows[:filled], **meta}
+        own = {name: getattr(self, name)[:filled] for name in _OF_SLOTS}
+        return {**own, **meta}
 
     @_filled.setter
     def _filled(self, filled: dict[str, NDArray[Any]]) -> None:
         for name, values in filled.items():
-            place = self.rows if name == "rows" else self.meta[name]
+            place = getattr(self, name) if name in _OF_SLOTS else self.meta[name]
             place[: len(values)] = values
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
@@ -344,7 +400,7 @@ class FreshRing(Stateful):
 
     def _find_slots(self) -> None:
         """Where the steps of episodes without labels are, from the rows themselves."""
-        slots = np.flatnonzero(self.strata.stratum[: len(self)] == UNLABELLED)
+        slots = np.flatnonzero(self.by_condition.stratum[: len(self)] == UNLABELLED)
         keys, steps = self.meta["episode"][slots], self.meta["episode_step"][slots]
         longest = max(256, 2 * int(steps.max(initial=0)), 2 * int(self._episode_step.max()))
         self._env_slots = np.full((self.num_envs, longest), NONE, np.int64)

@@ -4,6 +4,12 @@ A panel's shares are a plan for the mixture's `[planned]` draws. A run knows how
 at which environment step, and where its TD errors are: the controller plans the mixture for that
 run, follows its schedules and its [adaptive] rule, and counts what is drawn, so that no stratum
 gives more than its rows may give under `max_replays_per_row`.
+
+A quota is a stratum's share of the batch, whether its rows are logged or fresh. Logged rows give
+what the mixture asks of the logs, as far as `max_replays_per_row` lets them, spread evenly over the
+run. Fresh rows of the same stratum give the rest. If the ring has too few of them, logged rows that
+may still be drawn fill in. What neither has is short, and its places go to fresh rows of any kind.
+A learner without a ring has logged rows alone: there, `shortfall` decides.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Adaptive, Mixture, Shortfall, SourceShares, StratumRule
 from restock.replay.mixture.schedules import knots, mean_over, value_at
@@ -28,7 +34,10 @@ from restock.replay.mixture.shares import (
 from restock.replay.sampling.sampler import checked_errors
 from restock.state import Stateful
 
-REFRESH_BATCHES = 64  # shares with a schedule are worked out again after so many
+REFRESH_BATCHES = 64  # shares that move are worked out again after so many
+_SAME = 0.01  # of a share: a smaller change waits
+_MOMENTS = 17  # of a run, at which a forecast looks
+_SHORT = 1e-3  # of the rows fed: less is rounding
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,13 @@ class PlannedDraws:
 
 
 @dataclass(frozen=True)
+class FreshSupply:
+    """Which strata (S,) fresh rows can be told to be in."""
+
+    known: Bools
+
+
+@dataclass(frozen=True)
 class SampledStratum:
     """A stratum of a panel, as the controller needs it."""
 
@@ -51,6 +67,7 @@ class SampledStratum:
     rows: int  # in the panel; 0 where it is never drawn
     episodes: int
     occurs: float | None = None  # how often, where its rows were chosen (an archive, a cap)
+    corrected: bool = False  # whether importance weights take its boost away
 
 
 class GroupDro(Stateful):
@@ -124,9 +141,12 @@ class ShareController(Stateful):
         strata: of the panel, source by source.
         planned: what the run will draw.
         logs_share: a share of an online batch, in place of the mixture's.
+        fresh: what a ring of fresh rows can give; None: there is none.
 
-    `shares` (S,) are of the logged part of a batch and sum to 1, `logs_share` is that part of an
-    online batch, `drawn` (S,) what was drawn of each stratum.
+    With K sources of S strata, `shares` (K * S,) are of the logged part of a batch and sum to 1,
+    `logs_share` is that part of an online batch, `drawn` (K * S,) what was drawn of each stratum.
+    Of a whole batch, `wanted` (S,) is the quota of each stratum, `fresh_shares` (S + 1,) what the
+    ring is to give of it and, last, of rows of any kind.
 
     Raises:
         MixtureError: too few rows for the offline phase, or a shortfall the mixture refuses.
@@ -135,6 +155,7 @@ class ShareController(Stateful):
     SAME: ClassVar[tuple[str, ...]] = ("names",)
     STATE: ClassVar[tuple[str, ...]] = (
         *("drawn", "batches", "learnt", "env_steps", "sources", "shares", "logs_share"),
+        *("online", "wanted", "fresh_shares", "stock"),
     )
 
     def __init__(
@@ -144,8 +165,15 @@ class ShareController(Stateful):
         planned: PlannedDraws,
         *,
         logs_share: float | None = None,
+        fresh: FreshSupply | None = None,
     ) -> None:
         self.mixture, self.strata, self.planned = mixture, list(strata), planned
+        self.supply, self.online = fresh, False
+        size = len(strata) // len(mixture.sources.parts)
+        self._of: Ints = np.arange(len(strata)) % size  # the stratum of each source's stratum
+        self.wanted: F64 = np.zeros(size)
+        self.fresh_shares: F64 = np.append(np.zeros(size), 1.0)
+        self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in batches
         self._share_given = logs_share
         self.drawn: Ints = np.zeros(len(strata), np.int64)
         self.batches = self.learnt = 0  # drawn, and learnt from
@@ -157,7 +185,11 @@ class ShareController(Stateful):
         portions = [p for p in shares if not isinstance(p, str)]
         portions += mixture.sources.parts.values()
         self._moves = any(knots(portion) for portion in portions)
+        # Where no stratum has a quota, a ring is drawn from as it is.
+        self._steers = mixture.adaptive is not None or any(share != "natural" for share in shares)
         self._work_out(mixture.shortfall)
+        if fresh is not None and mixture.shortfall == "refuse":
+            self._refuse_short()
         self.planned_shares = self.shares.copy()
         if mixture.adaptive is not None:
             for source in self.sources:
@@ -183,21 +215,25 @@ class ShareController(Stateful):
         places = [i for i, stratum in enumerate(self.strata) if stratum.source == name]
         of_source = slice(places[0], places[-1] + 1)
         strata = self.strata[of_source]
-        sources, planned = self.mixture.sources, self.planned
-        parts = self.parts_at(0)
-        span = (planned.begin_env_steps, planned.end_env_steps)
-        mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
         return _SourceDraws(
             name,
             of_source,
             [stratum.rule for stratum in strata],
             np.array([stratum.rows for stratum in strata], np.int64),
             np.array([self._cap_of(stratum.rule) for stratum in strata]),
-            planned.offline * parts[name] / max(sum(parts.values()), 1e-12),
-            planned.online * mean[name],
+            *self._draws_of(name),
             np.zeros(len(strata)),
             np.array([s.rows if s.occurs is None else s.occurs for s in strata]),
         )
+
+    def _draws_of(self, name: str) -> tuple[float, float]:
+        """The rows that a source is to give offline, and online."""
+        planned, sources = self.planned, self.mixture.sources
+        parts = self.parts_at(0)
+        span = (planned.begin_env_steps, planned.end_env_steps)
+        mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
+        offline = planned.offline * parts[name] / max(sum(parts.values()), 1e-12)
+        return offline, planned.online * mean[name]
 
     def _cap_of(self, rule: StratumRule) -> float:
         adaptive = self.mixture.adaptive
@@ -226,12 +262,31 @@ class ShareController(Stateful):
         """The most draws of a row."""
         return self.mixture.most_draws
 
-    def at(self, env_steps: float) -> bool:
-        """Before a batch is drawn: move to its moment. True where the shares changed."""
+    def at(self, env_steps: float, stock: F64 | None = None) -> bool:
+        """Before an online batch is drawn: move to its moment. True if the shares changed.
+
+        `stock` (S,) is how many fresh rows of each stratum may be drawn, in batches.
+        """
         self.env_steps = env_steps
-        if not self._moves or self.batches % REFRESH_BATCHES:
+        began = self.supply is not None and not self.online
+        if not (began or self._moves or self.supply is not None):
             return False
+        if self.batches % REFRESH_BATCHES and not began:
+            return False
+        self.online = self.supply is not None
+        if stock is not None:
+            self.stock = stock
         return self._work_out("redistribute")
+
+    def replan(self, planned: PlannedDraws) -> bool:
+        """Plan for other draws from the next batch on. True if the shares changed."""
+        self._plan_for(planned)
+        return self._work_out("redistribute")
+
+    def _plan_for(self, planned: PlannedDraws) -> None:
+        self.planned = planned
+        for source in self.sources:
+            source.offline, source.online = self._draws_of(source.name)
 
     def count(self, stratum: NDArray[Any]) -> None:
         """A batch was drawn, its logged rows from these strata (n,)."""
@@ -267,7 +322,9 @@ class ShareController(Stateful):
 
     def _work_out(self, shortfall: Shortfall) -> bool:
         """Shares for this moment, within what the rows still allow."""
-        if self.mixture.shortfall == "shrink":
+        if self.online:
+            return self._beside_ring()
+        if self.mixture.shortfall == "shrink" and self.supply is None:
             shortfall = "shrink"
         parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
         for source in self.sources:
@@ -277,17 +334,175 @@ class ShareController(Stateful):
             logs_share += parts[source.name] * online_filled
         total = shares.sum()
         shares = shares / total if total > 0 else self.shares
+        asked = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
+        self.wanted = np.bincount(self._of, asked) / max(sum(parts.values()), 1e-12)
         changed = logs_share != self.logs_share or not np.array_equal(shares, self.shares)
         self.shares, self.logs_share = shares, logs_share
         return changed
 
+    def _wanted(self, source: _SourceDraws) -> F64:
+        """The shares (S,) of a source's rows that the mixture asks for now."""
+        if source.dro is not None:
+            return source.dro.shares
+        return wanted_shares(source.rules, source.natural, self.env_steps)
+
+    def _beside_ring(self) -> bool:
+        """Shares of an online batch, of logged rows and of fresh ones. True if they changed."""
+        logs, fresh, wanted = self._split(self.stock, self._limits())
+        self.wanted = wanted
+        fresh_shares = np.append(fresh, max(1.0 - logs.sum() - fresh.sum(), 0.0))
+        logs_share = float(logs.sum())
+        before = self.shares * self.logs_share
+        # A small change waits: with each, what was drawn ahead is drawn again.
+        same = np.abs(np.append(logs, fresh_shares) - np.append(before, self.fresh_shares))
+        if (same < _SAME * np.append(logs, fresh_shares) + 1e-9).all():
+            return False
+        self.shares = logs / logs_share if logs_share > 0 else self.shares
+        self.logs_share, self.fresh_shares = logs_share, fresh_shares
+        return True
+
+    def _split(self, stock: F64, limit: F64) -> tuple[F64, F64, F64]:
+        """What of a batch comes from the logs (K * S,) and the ring (S,), and is wanted (S,).
+
+        `stock` (S,) bounds what the ring gives, `limit` (K * S,) what logged rows bear.
+        """
+        parts = self.parts_at(self.env_steps)
+        asked = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
+        logged = sum(parts.values())
+        wanted = np.bincount(self._of, asked) + max(1.0 - logged, 0.0) * self._wanted_fresh(stock)
+        logs = np.minimum(asked, limit)
+        if not self._steers:
+            return logs, np.zeros(len(wanted)), wanted
+        rest = np.maximum(wanted - np.bincount(self._of, logs), 0.0)
+        fresh = np.minimum(rest * self.boosted, stock)
+        # Logged rows fill in for what the ring has not, if they may be drawn more often.
+        room = limit - logs
+        of_stratum = np.bincount(self._of, room)
+        lack = np.minimum((rest - fresh) * self.boosted, of_stratum)
+        part = np.divide(lack, of_stratum, out=np.zeros(len(lack)), where=of_stratum > 0)
+        return logs + room * part[self._of], fresh, wanted
+
+    @property
+    def natural(self) -> F64:
+        """How often each stratum occurs in the logs, (S,)."""
+        rows = np.sum([source.natural for source in self.sources], axis=0, dtype=np.float64)
+        return np.asarray(rows / max(rows.sum(), 1e-12))
+
+    @property
+    def boosted(self) -> Bools:
+        """Whether fresh rows of a stratum (S,) are drawn by quota.
+
+        Not those of a stratum whose boost weights are to take away: fresh rows have no weights.
+        """
+        corrected = np.array([stratum.corrected for stratum in self.strata[: len(self.wanted)]])
+        known = np.zeros(len(corrected), np.bool_) if self.supply is None else self.supply.known
+        return np.asarray(known & ~corrected, np.bool_)
+
+    def _wanted_fresh(self, stock: F64) -> F64:
+        """The shares (S,) of fresh rows: natural strata as often as the ring has them."""
+        source = self.sources[0]
+        if source.dro is not None:
+            every = [s.dro.shares for s in self.sources if s.dro is not None]
+            return np.asarray(np.mean(every, axis=0))
+        have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural
+        return wanted_shares(source.rules, have, self.env_steps)
+
+    def _limits(self, *, from_start: bool = False) -> F64:
+        """The share of an online batch that the logged rows of each stratum bear, (K * S,)."""
+        rows = np.array([stratum.rows for stratum in self.strata], np.float64)
+        if self.max_replays is None:
+            return np.where(rows > 0, 1.0, 0.0)
+        planned = self.planned
+        begin, end = planned.begin_env_steps, planned.end_env_steps
+        now = begin if from_start else min(max(self.env_steps, begin), end)
+        drawn: F64 = self.drawn.astype(np.float64)
+        if from_start:  # as the offline phase will have drawn
+            offline = [source.offline * source.got for source in self.sources]
+            drawn = np.maximum(drawn, np.concatenate(offline))
+        left = np.maximum(self.max_replays * rows - drawn, 0.0)
+        ahead = planned.online * (end - now) / max(end - begin, 1)
+        return np.minimum(left / max(ahead, 1.0), 1.0)
+
+    def forecast(self) -> list[dict[str, Any]]:
+        """What a run will be fed, as far as can be known before it: a row a stratum, (S,).
+
+        Shares of all rows of its batches: natural, wanted, from logs, from the ring, and short,
+        with the reason. It counts on the ring for every stratum that fresh rows can be in.
+        """
+        planned, size = self.planned, len(self.wanted)
+        names = [stratum.name for stratum in self.strata[:size]]
+        parts = [("offline", planned.offline)]
+        online = planned.online if self.supply is not None else 0.0
+        step_now, wanted_now = self.env_steps, self.wanted
+        logs, fresh, wanted = np.zeros(size), np.zeros(size), np.zeros(size)
+        total = max(planned.offline + online, 1e-12)
+        if parts[0][1]:
+            logs += planned.offline / total * np.bincount(self._of, self.shares)
+            wanted += planned.offline / total * self.wanted
+        moments = np.linspace(planned.begin_env_steps, planned.end_env_steps, _MOMENTS)
+        for moment in moments if online else ():
+            self.env_steps = float(moment)
+            of_logs, of_ring, asked = self._split(
+                np.full(size, np.inf), self._limits(from_start=True)
+            )
+            if not self._steers:  # the ring as it is: nothing is asked of it
+                of_ring = np.maximum(asked - np.bincount(self._of, of_logs), 0.0)
+            part = online / total / _MOMENTS
+            logs += part * np.bincount(self._of, of_logs)
+            fresh += part * of_ring
+            wanted += part * asked
+        self.env_steps, self.wanted = step_now, wanted_now
+        natural = self.natural
+        short = np.maximum(wanted - logs - fresh, 0.0)
+        short[short < 1e-6] = 0.0
+        return [
+            {
+                "stratum": names[i],
+                "natural_share": float(natural[i]),
+                "wanted_share": float(wanted[i]),
+                "logs_share": float(logs[i]),
+                "fresh_share": float(fresh[i]),
+                "short_share": float(short[i]),
+                "reason": self.why_short(i) if short[i] else None,
+            }
+            for i in range(size)
+        ]
+
+    def why_short(self, stratum: int) -> str:
+        """Why a stratum gets less of a batch than its quota, in words."""
+        rows = sum(of.rows for of, i in zip(self.strata, self._of, strict=True) if i == stratum)
+        limit = self.max_replays
+        reason = "the logs have no row of it"
+        if rows:
+            reason = f"its {rows:,} logged rows"
+            reason += " are all there is" if limit is None else f" give {limit:,} draws each"
+        if self.supply is None:
+            return reason
+        if not self.supply.known[stratum]:
+            return f"{reason}, and fresh rows of the twin cannot be told to be in it"
+        if not self.boosted[stratum]:
+            return f"{reason}, and fresh rows are not boosted where importance weights correct it"
+        if not self.online:
+            return f"{reason}, and the offline phase has no fresh rows"
+        return f"{reason}, and the ring has too few fresh rows of it"
+
+    def _refuse_short(self) -> None:
+        """Raises MixtureError if a quota cannot be met, where the mixture refuses that."""
+        short = [row for row in self.forecast() if row["short_share"] > _SHORT]
+        if short:
+            raise MixtureError(
+                "; ".join(
+                    f"{row['stratum']} wants {row['wanted_share']:.1%} of the rows fed and gets"
+                    f" {row['wanted_share'] - row['short_share']:.1%}: {row['reason']}"
+                    for row in short
+                ),
+                remedy='lower the shares, raise max_replays_per_row, or set shortfall ='
+                ' "redistribute"',
+            )
+
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
         """A source's shares, and how much it can fill of its draws to come, and of online ones."""
-        wanted = (
-            wanted_shares(source.rules, source.natural, self.env_steps)
-            if source.dro is None
-            else source.dro.shares
-        )
+        wanted = self._wanted(source)
         drawn = self.drawn[source.strata]
         ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
         limit = np.where(source.rows > 0, 1.0, 0.0)
@@ -322,6 +537,8 @@ class ShareController(Stateful):
 
     def _ahead(self, source: _SourceDraws, drawn: float) -> float:
         """The draws that batches to come ask of a source: not what those before did not get."""
+        if self.supply is not None:  # online, the ring gives what these rows do not bear
+            return source.offline - drawn
         by_draws = source.offline + source.online - drawn
         begin, end = self.planned.begin_env_steps, self.planned.end_env_steps
         if drawn < source.offline or self.env_steps <= begin or end <= begin:
@@ -365,14 +582,13 @@ class ShareController(Stateful):
         return super().state_dict() | {"planned": asdict(self.planned)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on where `state_dict` was taken; a budget that was extended is planned again.
+        """Goes on where `state_dict` was taken, with the plan of then.
 
         Raises:
             MixtureError: the state is of other strata.
         """
         super().load_state_dict(state)
-        if state["planned"] != asdict(self.planned):
-            self._work_out("redistribute")
+        self._plan_for(PlannedDraws(**state["planned"]))
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
         """Of a state of other strata."""

@@ -169,7 +169,7 @@ def test_labels_put_rows_in_their_strata_and_eviction_takes_them_out() -> None:
     )
     np.testing.assert_array_equal(codes[ended], expected)
     for code in range(3):
-        assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
+        assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
 
 
 def test_uniform_draws_cover_every_row() -> None:
@@ -261,14 +261,14 @@ def test_rare_rows_are_not_washed_out_where_they_are_reserved() -> None:
     label_rarely(plain, drive, 1500)
     kept, drive = reserving(seed=3, wheel_slip=25, blocked_aisle=10)
     label_rarely(kept, drive, 1500)
-    assert plain.strata.counts[0] < 15
-    assert 25 <= kept.strata.counts[0] <= 60
+    assert plain.by_condition.counts[0] < 15
+    assert 25 <= kept.by_condition.counts[0] <= 60
     # What is not used of a reserve is anybody's; nominal rows stay the newest there are.
-    assert kept.strata.counts[2] >= 20
-    newest = np.sort(kept.meta["env_step"][kept.strata.members(2)])[-10:]
+    assert kept.by_condition.counts[2] >= 20
+    newest = np.sort(kept.meta["env_step"][kept.by_condition.members(2)])[-10:]
     assert newest.min() > len(drive.steps) - 40
     # Of the rare ones, too, the oldest went first.
-    slips = kept.meta["env_step"][kept.strata.members(0)]
+    slips = kept.meta["env_step"][kept.by_condition.members(0)]
     assert slips.min() > 100
 
 
@@ -292,7 +292,7 @@ def test_a_ring_with_reserves_stays_whole(
     assert filled == min(ring.appended, capacity)
     codes = ring.condition(np.arange(filled))
     for code in range(3):
-        assert sorted(ring.strata.members(code)) == np.flatnonzero(codes == code).tolist()
+        assert sorted(ring.by_condition.members(code)) == np.flatnonzero(codes == code).tolist()
     # Every row is a step of its own, and as it was when it was appended.
     key = (ring.meta["episode"][:filled] << 20) + ring.meta["episode_step"][:filled]
     assert len(np.unique(key)) == filled

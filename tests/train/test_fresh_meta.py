@@ -100,7 +100,7 @@ def test_metadata_beside_a_buffer_is_what_a_ring_of_single_steps_keeps() -> None
             )
         everywhere = np.arange(len(ring))
         np.testing.assert_array_equal(meta.condition(everywhere), ring.condition(everywhere))
-        np.testing.assert_array_equal(meta.strata.counts, ring.strata.counts)
+        np.testing.assert_array_equal(meta.by_condition.counts, ring.by_condition.counts)
     assert len(meta) == len(ring) == 12
 
 
@@ -115,4 +115,4 @@ def test_a_part_of_the_environments_may_step_alone() -> None:
     assert meta.condition(np.array([0, 2, 3])).tolist() == [-1, 0, 0]
     meta.forget()
     assert len(meta) == 0
-    assert meta.strata.counts.tolist() == [0]
+    assert meta.by_condition.counts.tolist() == [0]

@@ -24,7 +24,7 @@ def ring_of(rng: np.random.Generator) -> FreshRing:
     )
     for name in ("episode", "episode_step", "behaviour_policy", "env_step", "gradient_step"):
         ring.meta[name][:] = rng.integers(0, 30_000, CAPACITY)
-    ring.strata.stratum[:] = rng.integers(-1, 2, CAPACITY)
+    ring.by_condition.stratum[:] = rng.integers(-1, 2, CAPACITY)
     return ring
 
 

@@ -109,7 +109,7 @@ class EvaluationBuffer:
                 {
                     "condition": name,
                     "rows": part.stop - part.start,
-                    "rows_met": int(ring.strata.counts[ring.conditions.index(name)]),
+                    "rows_met": int(ring.by_condition.counts[ring.conditions.index(name)]),
                     "td_abs_mean": float(td[part].abs().mean()),
                     "td_online_abs_mean": float(online[part].abs().mean()),
                     "explained": _explained_share(td[part], chosen[part] - td[part]),

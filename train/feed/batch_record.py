@@ -1,9 +1,9 @@
 """What the critic was fed: exact sums over every batch, and every row of a seeded few.
 
 A batch's rows, strata, TD errors and values are kept as they are sampled (no statistics inside the
-update loop) and summed once an interval. The sums go to the run's tables `strata`, `conditions`,
-`actions`, `ages`, `sampled_episodes` and `policies`; the rows of audited batches to `audit`. Fresh
-rows are written once their episodes have ended, when their conditions are known.
+update loop) and summed once an interval. The sums go to the run's tables `fed`, `strata`,
+`conditions`, `actions`, `ages`, `sampled_episodes` and `policies`; the rows of audited batches to
+`audit`. Fresh rows are written once their episodes have ended, when their conditions are known.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 from restock import native
 from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.share_controller import ShareController
 from restock.state import Stateful
 from restock.train.dqn.loss import Loss
 from restock.train.feed import interval_tables
@@ -56,6 +57,7 @@ class FeedRecord(Stateful):
         greedy: the policy's action (B,) for observations (B, D), asked for audited batches.
         labels: of the ring's episodes as they end; None: nobody tells, and no row waits for them.
         perturbations: in force in the ring's episodes, where they are known.
+        quotas: what decides the shares of a batch; None: nothing does, and `fed` has no rows.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -68,6 +70,8 @@ class FeedRecord(Stateful):
         "_held",
         "_quota",
         "_quota_batches",
+        "_wanted",
+        "_batches",
     )
 
     def __init__(
@@ -82,7 +86,9 @@ class FeedRecord(Stateful):
         greedy: Callable[[F32], Ints] | None = None,
         labels: EpisodeLabels | None = None,
         perturbations: FreshPerturbations | None = None,
+        quotas: ShareController | None = None,
     ) -> None:
+        self.quotas = quotas
         self.run, self.logs, self.ring = run, logs, ring
         self.actions, self.greedy = actions, greedy
         self.labels, self.perturbations = labels, perturbations
@@ -93,7 +99,7 @@ class FeedRecord(Stateful):
             np.maximum(logs.as_of_ns - logs.stamp_ns, 0) / _NS_PER_DAY if logs is not None else None
         )
         # Rows since the run began, by stratum: (S,) of each source.
-        sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.conditions) + 1}
+        sizes = {"logs": 0 if logs is None else len(logs.strata), "fresh": len(ring.strata) + 1}
         self._total = {name: np.zeros(size, np.int64) for name, size in sizes.items()}
         self._logged, self._fresh = SampledRows(LOGGED), SampledRows(FRESH)
         # Of audited batches in the open interval: logged rows, and columns of the fresh ones.
@@ -103,6 +109,9 @@ class FeedRecord(Stateful):
         # Of batches with logged rows in the open interval: the sum (S,) of the shares in force.
         self._quota = np.zeros(sizes["logs"])
         self._quota_batches = 0
+        # Of all batches in it: the sum (S,) of the quotas of the batch.
+        self._wanted = np.zeros(0 if quotas is None else len(quotas.wanted))
+        self._batches = 0
         # Of the last two batches: rows of the panel, the ring's episodes, and their steps.
         none: NDArray[np.int64] = np.empty(0, np.int64)
         self._last: tuple[NDArray[np.int64], ...] = (none, none, none)
@@ -144,6 +153,9 @@ class FeedRecord(Stateful):
         if batch.logged:
             self._quota += batch.quota
             self._quota_batches += 1
+        if self.quotas is not None:
+            self._wanted += batch.wanted
+            self._batches += 1
         self._before = self._last
         self._last = batch.log_rows, *self._fresh.last_of("episode", "episode_step")
         if self._rng.random() < self.audit_share:
@@ -174,13 +186,14 @@ class FeedRecord(Stateful):
             }
         if self.logs is not None and len(self._logged):
             self._write(self._of_logs(self.logs), clocks, phase)
-        if len(self._fresh):
+        if drawn:
             self._held.append(self._closed(clocks, phase))
         self._release()
         for rows in (self._logged, self._fresh, self._greedy):
             rows.clear()
         self._audits = []
         self._quota[:], self._quota_batches = 0.0, 0
+        self._wanted[:], self._batches = 0.0, 0
         return means
 
     def write_held(self) -> None:
@@ -196,15 +209,40 @@ class FeedRecord(Stateful):
 
     def _closed(self, clocks: dict[str, int], phase: str) -> HeldInterval:
         """The fresh rows of the open interval."""
-        ring, labelled = self.ring, self.ring.strata.counts
+        ring, filled = self.ring, len(self.ring)
+        waiting = ring.by_condition.stratum[:filled] == WAITING
+        available = self._by_stratum(ring.stratum[:filled][~waiting])
         open_rows = {}
-        if self.labels is not None:
-            slots = np.flatnonzero(ring.strata.stratum[: len(ring)] == WAITING)
+        if self.labels is None:
+            available[-1] += waiting.sum()
+        else:
+            slots = np.flatnonzero(waiting)
             open_rows = {name: ring.meta[name][slots] for name in ("episode", "episode_step")}
-            open_rows["condition"] = np.full(len(slots), WAITING, np.int16)
-        available = np.append(labelled, len(ring) - labelled.sum())
+            for name in ("condition", "stratum"):
+                open_rows[name] = np.full(len(slots), WAITING, np.int16)
         rows = dict(self._fresh.columns)
-        return HeldInterval(clocks, phase, rows, available, open_rows, self._audits)
+        quotas = self._quotas_met()
+        return HeldInterval(clocks, phase, rows, available, open_rows, self._audits, quotas)
+
+    def _by_stratum(self, stratum: NDArray[Any]) -> Ints:
+        """Fresh rows (n,) counted by stratum (S + 1,), last those that are in none."""
+        size = len(self.ring.strata)
+        return np.bincount(_told(stratum, size), minlength=size + 1)
+
+    def _quotas_met(self) -> dict[str, NDArray[Any]] | None:
+        """Of the open interval, by stratum (S,): the quota of the batches, how often the logs have
+        it, the logged rows drawn, and why it is short if it is."""
+        quotas = self.quotas
+        if quotas is None or not self._batches:
+            return None
+        size = len(quotas.wanted)
+        drawn = np.bincount(self._logged.columns["stratum"] % size, minlength=size)
+        return {
+            "wanted": self._wanted / self._batches,
+            "natural": quotas.natural,
+            "logged": drawn,
+            "reason": np.array([quotas.why_short(i) for i in range(size)]),
+        }
 
     def _release(self) -> None:
         """Write the intervals whose rows have their conditions by now, in their order."""
@@ -221,10 +259,18 @@ class FeedRecord(Stateful):
             self._write_fresh(interval)
 
     def _write_fresh(self, interval: HeldInterval) -> None:
-        self._write(self._of_ring(interval), interval.clocks, interval.phase)
+        if len(interval.rows["td"]):
+            self._write(self._of_ring(interval), interval.clocks, interval.phase)
         for audit in interval.audits:
-            columns = named(audit, self.ring.conditions, UNLABELLED)
+            columns = named(audit, self.ring.conditions, self.ring.strata, UNLABELLED)
             self.run.append_columns("audit", columns)
+        if interval.quotas is not None and self.quotas is not None:
+            steps = {**interval.clocks, "phase": interval.phase}
+            fresh = self._by_stratum(interval.rows["stratum"])
+            columns = interval_tables.fed(
+                self.quotas.names[: len(fresh) - 1], interval.quotas, fresh, interval.available
+            )
+            self.run.append_columns("fed", {**steps, **columns})
 
     def _write(self, source: SourceRows, clocks: Mapping[str, int], phase: str) -> None:
         total = self._total[source.name]
@@ -273,29 +319,29 @@ class FeedRecord(Stateful):
 
     def _of_ring(self, interval: HeldInterval) -> SourceRows:
         ring, rows = self.ring, interval.rows
-        names = [*ring.conditions, UNLABELLED]
-        stratum = self._stratum(rows["condition"])  # a ring's strata are conditions
-        available = interval.available.copy()
+        conditions = [*ring.conditions, UNLABELLED]
+        strata = [*ring.strata, UNLABELLED]
         if interval.open_rows:
-            available[-1] = 0
-            found = self._stratum(interval.open_rows["condition"])
-            available += np.bincount(found, minlength=len(names))
-        audited = [self._stratum(audit["condition"]) for audit in interval.audits]
+            interval.available[:] += self._by_stratum(interval.open_rows["stratum"])
+            interval.open_rows.clear()
+
+        def audited(name: str, kinds: int) -> Ints:
+            found = [_told(audit[name], kinds) for audit in interval.audits]
+            return np.concatenate([np.empty(0, np.int64), *found])
+
         wanted = [audit["greedy_action"] for audit in interval.audits]
-        none: list[Ints] = [np.empty(0, np.int64)]
-        of_greedy = np.concatenate(none + audited)
         return SourceRows(
             name="fresh",
             rows=rows,
-            stratum=stratum,
-            strata=names,
+            stratum=_told(rows["stratum"], len(ring.strata)),
+            strata=strata,
             row=rows["episode"] * (int(rows["episode_step"].max(initial=0)) + 1)
             + rows["episode_step"],
-            available=available,
-            timings=[None] * len(names),
-            quota=[None] * len(names),
-            condition=stratum,
-            conditions=names,
+            available=interval.available,
+            timings=[None] * len(strata),
+            quota=[None] * len(strata),
+            condition=_told(rows["condition"], len(ring.conditions)),
+            conditions=conditions,
             episode=rows["episode"],
             episodes=None,
             policy=rows["policy"],
@@ -306,13 +352,12 @@ class FeedRecord(Stateful):
             },
             greedy=None
             if self.greedy is None
-            else GreedyRows(of_greedy, of_greedy, np.concatenate(none + wanted)),
+            else GreedyRows(
+                audited("of_stratum", len(ring.strata)),
+                audited("condition", len(ring.conditions)),
+                np.concatenate([np.empty(0, np.int64), *wanted]),
+            ),
         )
-
-    def _stratum(self, condition: NDArray[Any]) -> Ints:
-        """Codes of conditions (n,), with a last one for rows that have none."""
-        unlabelled = len(self.ring.conditions)
-        return np.where(condition < 0, unlabelled, condition).astype(np.int64)
 
     def _audit(self, step: int, batch: ReplayBatch, last_sync: int) -> None:
         """Every row of the batch last kept: logged ones are written, fresh ones wait."""
@@ -341,6 +386,11 @@ class FeedRecord(Stateful):
         if len(batch.slots):
             rows = fresh_audit(self._fresh.last, batch.slots, self.ring, self.perturbations)
             self._audits.append(whole(slice(logged, len(packed)), rows))
+
+
+def _told(code: NDArray[Any], kinds: int) -> Ints:
+    """Codes (n,) of `kinds` names, with one more for rows that have none."""
+    return np.where(code < 0, kinds, code).astype(np.int64)
 
 
 def row_ids(

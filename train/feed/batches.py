@@ -1,8 +1,9 @@
-"""What a batch is made of: rows of logs by quota, and fresh rows from the twin.
+"""What a batch is made of: rows of logs and fresh rows from the twin, both by quota.
 
 The half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948) is put together here,
-from two sources that share one packed row layout, by one gather each. How large the half is, and
-what each stratum has of it, the share controller says (`restock.replay.sampling.share_controller`).
+from two sources that share one packed row layout, by one gather each. What each stratum has of the
+batch, and how much of it is logged, the share controller says
+(`restock.replay.sampling.share_controller`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,18 @@ from restock.replay.panel.logged_sampler import (
 )
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.gather import gather_rows
-from restock.replay.sampling.share_controller import ShareController
+from restock.replay.sampling.quotas import Quotas
+from restock.replay.sampling.share_controller import (
+    FreshSupply,
+    PlannedDraws,
+    ShareController,
+)
 from restock.state import Stateful
 from restock.train.feed.logs import Logs
 
 _NO_ROWS: Ints = np.empty(0, np.int64)
-_NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
+_NO_SHARES = np.empty(0)
+_NOTHING = BatchDraw(_NO_ROWS, _NO_ROWS, None, _NO_SHARES)
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,8 @@ class ReplayBatch:
     log_rows: Ints  # (L,) rows of the panel
     log_stratum: Ints = field(default_factory=lambda: _NO_ROWS)  # (L,)
     slots: Ints = field(default_factory=lambda: _NO_ROWS)  # (B - L,) slots of the ring
-    quota: F64 = field(default_factory=lambda: np.empty(0))  # (S,) shares in force, of the logs
+    quota: F64 = field(default_factory=lambda: np.empty(0))  # (K * S,) in force, of the logs
+    wanted: F64 = field(default_factory=lambda: np.empty(0))  # (S,) quotas, of the batch
 
     @property
     def logged(self) -> int:
@@ -60,12 +68,15 @@ class Batches(Stateful):
 
     Args:
         logs_share: of an online batch; None leaves it to the mixture of the logs' panel.
+        fresh: what the ring can give of each stratum; None: it is drawn from as it is.
 
     Raises:
         MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
     """
 
-    STATE: ClassVar[tuple[str, ...]] = ("_rng", "_draws")
+    STATE: ClassVar[tuple[str, ...]] = (
+        *("_rng", "_draws", "_logged", "_owed", "_taken_over", "_fresh_quotas"),
+    )
 
     def __init__(
         self,
@@ -75,6 +86,7 @@ class Batches(Stateful):
         batch_size: int,
         logs_share: float | None,
         seed: int,
+        fresh: FreshSupply | None = None,
     ) -> None:
         self.logs, self.ring = logs, ring
         self.batch_size = batch_size
@@ -82,8 +94,14 @@ class Batches(Stateful):
         self._fresh = torch.from_numpy(ring.rows)  # shares memory with the ring
         self._draws: LoggedSampler | None = None
         self._max_age: int | None = None  # of fresh rows, in environment steps
+        # Logged rows of an online batch, and what rounding them owes; quotas of the fresh ones,
+        # the last for rows of any kind.
+        self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
+        strata = 0 if fresh is None else len(fresh.known)
+        self._fresh_quotas = Quotas(np.append(np.zeros(strata), 1.0), batch_size)
         if logs is not None:
-            self._draws = logs.sampler(batch_size, logs_share, seed)
+            self._draws = logs.sampler(batch_size, logs_share, seed, fresh)
+            self._share_out()
             if logs.panel is not None:
                 self._max_age = logs.panel.header.mixture.max_age_env_steps
 
@@ -126,13 +144,48 @@ class Batches(Stateful):
         """A batch from logs and the fresh ring, after `env_steps` environment steps."""
         drawn = _NOTHING
         if self._draws is not None:
-            self._draws.move_to(env_steps)
-            if logged := round(self.batch_size * self._draws.controller.logs_share):
-                drawn = self._draws.draw(logged)
+            stock = self.ring.by_stratum.counts / self.batch_size
+            moved = self._draws.move_to(env_steps, stock)
+            if moved or self._draws.controller.logs_share != self._taken_over:
+                self._share_out()
+            if self._logged:
+                drawn = self._draws.draw(self._logged)
         slots = _NO_ROWS
-        if len(drawn.rows) < self.batch_size:
-            slots = self._sample_fresh(self.batch_size - len(drawn.rows), env_steps)
+        if (count := self.batch_size - len(drawn.rows)) > 0:
+            slots = self._draw_fresh(count, env_steps)
         return self._gather(drawn, slots)
+
+    def replan(self, planned: PlannedDraws) -> None:
+        """Plan the shares for other draws than before."""
+        if self._draws is not None:
+            self._draws.replan(planned)
+            self._share_out()
+
+    def _share_out(self) -> None:
+        """Take over the controller's shares of logged and fresh rows."""
+        controller = self.controller
+        if controller is None:
+            return
+        self._taken_over = controller.logs_share
+        exact = self.batch_size * controller.logs_share + self._owed
+        self._logged = min(max(round(exact), 0), self.batch_size)
+        self._owed = min(max(exact - self._logged, -1.0), 1.0)
+        fresh = controller.fresh_shares
+        if len(fresh) == len(self._fresh_quotas.shares) and fresh.sum() > 0:
+            self._fresh_quotas.set_shares(fresh / fresh.sum())
+
+    def _draw_fresh(self, count: int, env_steps: int) -> Ints:
+        """`count` slots: of each stratum what its quota says, and of the whole ring the rest."""
+        quotas = self._fresh_quotas
+        if quotas.shares[-1] == 1.0:
+            return self._sample_fresh(count, env_steps)
+        quotas.set_batch_size(count)
+        limit = None if self.controller is None else self.controller.max_replays
+        since = None if self._max_age is None else env_steps - self._max_age
+        slots = self.ring.draw(quotas.next()[:-1], self._rng, limit, since)
+        if (rest := count - len(slots)) > 0:
+            slots = np.concatenate([slots, self._sample_fresh(rest, env_steps)])
+        return slots
 
     def learnt(self, batch: ReplayBatch, td: Tensor) -> None:
         """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
@@ -173,4 +226,5 @@ class Batches(Stateful):
                 parts.append(gather_rows(self._fresh, torch.from_numpy(slots)))
             return parts[0] if len(parts) == 1 else torch.cat(parts)
 
-        return ReplayBatch(gather, weight, drawn.rows, drawn.strata, slots, drawn.quota)
+        wanted = _NO_SHARES if self.controller is None else self.controller.wanted
+        return ReplayBatch(gather, weight, drawn.rows, drawn.strata, slots, drawn.quota, wanted)

@@ -25,6 +25,7 @@ from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful, saved
 from restock.train.dqn.behaviour import UNKNOWN
 from restock.train.feed.fresh_log import FreshLog, FreshPerturbations, values_entries
+from restock.train.feed.fresh_strata import FreshStrata
 from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.teacher import AskedTeacher, Label
 from restock.train.twin.env.interface import Twin
@@ -87,8 +88,10 @@ class Collector(Stateful):
         task: Task,
         executor: Executor | None,
         teacher: AskedTeacher | None = None,
+        strata: FreshStrata | None = None,
     ) -> None:
         self.env, self.ring, self.task = env, ring, task
+        self.strata = strata  # of the ring's rows; None: their conditions
         self.goal = task.goal != "none"  # else success is not defined
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
@@ -304,7 +307,9 @@ class Collector(Stateful):
             return []
         self._unlabelled = []
         self.perturbations.forget(self.ring.meta["episode"][: len(self.ring)])
-        labels = label(steps_table(waiting), self.conditions)
+        exposures = [] if self.strata is None else self.strata.exposures
+        held = label(steps_table(waiting), [*self.conditions, *exposures])
+        labels = {condition.name: held[condition.name] for condition in self.conditions}
         if self.log is not None:
             self.log.labelled(waiting, labels)
         names = primary(labels, self.conditions)
@@ -314,8 +319,12 @@ class Collector(Stateful):
             inside = slice(begin, begin + episode.steps)  # the last step is no transition
             begin += episode.steps + 1
             of_steps = codes[inside] if len(codes) else np.zeros(episode.steps, np.int64)
-            self.ring.set_labels(episode.key, of_steps)
-            self.labels.note(episode.key, of_steps)
+            strata = None
+            if self.strata is not None:
+                of_episode = {name: of[inside] for name, of in held.items()}
+                strata = self.strata.codes(of_episode, episode.steps, self.ring.stratum_rows)
+            self.ring.set_labels(episode.key, of_steps, strata)
+            self.labels.note(episode.key, of_steps, strata)
             rows.append(
                 {
                     "env_steps": episode.env_steps,

@@ -21,19 +21,21 @@ WAITING, NEVER = -1, -2  # codes of a row without a condition: its episode goes 
 
 
 class EpisodeLabels(Stateful):
-    """Conditions of ended episodes since the last `clear`: a code per step, by the ring's key."""
+    """Conditions and strata of ended episodes since the last `clear`, by the ring's key."""
 
     STATE: ClassVar[tuple[str, ...]] = ("_keys", "_codes", "_given_up")
 
     def __init__(self) -> None:
         self._keys: list[int] = []
-        self._codes: list[NDArray[np.int16]] = []  # (T,) of each
+        self._codes: list[NDArray[np.int16]] = []  # (2, T) of each: conditions and strata
         self._given_up: list[int] = []  # keys
 
-    def note(self, key: int, codes: NDArray[Any]) -> None:
-        """Episode `key` ended; `codes[t]` (T,) is the condition of its step t."""
+    def note(self, key: int, codes: NDArray[Any], strata: NDArray[Any] | None = None) -> None:
+        """Episode `key` ended; `codes[t]` (T,) is the condition of its step t, `strata[t]` its
+        stratum; None: as the condition."""
         self._keys.append(int(key))
-        self._codes.append(np.asarray(codes, np.int16))
+        both = (codes, codes if strata is None else strata)
+        self._codes.append(np.asarray(np.stack(both), np.int16))
 
     def give_up(self, key: int) -> None:
         """No labels will come for episode `key`."""
@@ -46,8 +48,11 @@ class EpisodeLabels(Stateful):
     def restored(self) -> None:
         self._codes = [np.asarray(codes, np.int16) for codes in self._codes]
 
-    def fill(self, condition: NDArray[Any], key: Ints, step: NDArray[Any]) -> None:
-        """Give the rows (n,) of `condition` that are WAITING theirs, where it is known by now."""
+    def fill(
+        self, condition: NDArray[Any], stratum: NDArray[Any], key: Ints, step: NDArray[Any]
+    ) -> None:
+        """Give the rows (n,) of `condition` that are WAITING theirs, and their stratum, where they
+        are known by now."""
         waiting = np.flatnonzero(condition == WAITING)
         if self._given_up:
             lost = np.isin(key[waiting], self._given_up)
@@ -58,12 +63,13 @@ class EpisodeLabels(Stateful):
         order = np.argsort(self._keys)
         keys = np.array(self._keys, np.int64)[order]
         codes = [self._codes[at] for at in order.tolist()]
-        lengths = np.array([len(of_episode) for of_episode in codes])
-        begins, flat = np.cumsum(lengths) - lengths, np.concatenate(codes)
+        lengths = np.array([of_episode.shape[1] for of_episode in codes])
+        begins, flat = np.cumsum(lengths) - lengths, np.concatenate(codes, axis=1)
         place = np.minimum(np.searchsorted(keys, key[waiting]), len(keys) - 1)
         at = step[waiting].astype(np.int64)
         known = (keys[place] == key[waiting]) & (at < lengths[place])
-        condition[waiting[known]] = flat[begins[place[known]] + at[known]]
+        found = flat[:, begins[place[known]] + at[known]]
+        condition[waiting[known]], stratum[waiting[known]] = found
 
 
 @dataclass(frozen=True)
@@ -78,15 +84,20 @@ class HeldInterval:
     phase: str
     rows: dict[str, NDArray[Any]]
     available: Ints  # (S,) labelled rows of the ring, by stratum
-    open_rows: dict[str, NDArray[Any]]  # condition, episode, episode_step
+    open_rows: dict[str, NDArray[Any]]  # condition, stratum, episode, episode_step
     audits: Sequence[dict[str, Any]]  # columns of `audit`, with condition, key and greedy action
+    quotas: Mapping[str, NDArray[Any]] | None = None  # of the batch, as `interval_tables.fed` takes
 
     def fill(self, labels: EpisodeLabels) -> None:
         """Conditions that are known by now."""
         for part in (self.rows, self.open_rows):
-            labels.fill(part["condition"], part["episode"], part["episode_step"])
+            labels.fill(
+                part["condition"], part["stratum"], part["episode"], part["episode_step"]
+            )
         for audit in self.audits:
-            labels.fill(audit["condition"], audit["key"], audit["episode_step"])
+            labels.fill(
+                audit["condition"], audit["of_stratum"], audit["key"], audit["episode_step"]
+            )
 
     @property
     def waits(self) -> bool:

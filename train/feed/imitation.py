@@ -124,7 +124,7 @@ class Imitation(Stateful):
                 rows = _some(self.cloned[codes == code], rng)
                 groups["logs", self.logs.condition.names[code]] = self._logged_states(rows)
         for code, name in enumerate(self.ring.conditions):
-            slots = _some(np.sort(self.ring.strata.members(code)), rng)
+            slots = _some(np.sort(self.ring.by_condition.members(code)), rng)
             if len(slots):
                 groups["fresh", name] = self._fresh_states(slots)
         return [

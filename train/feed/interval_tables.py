@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Ints
 from restock.train.feed.sampled_rows import Columns, episode_sums
 
+_SHORT = 1e-3  # of the rows fed: less is rounding
 _MOST_MARKS = 1 << 25  # keys that are marked in place; those of a wider range are sorted instead
 
 
@@ -144,6 +145,43 @@ def strata(source: SourceRows, total: Ints) -> Columns:
     }
 
 
+def fed(
+    names: Sequence[str], quotas: Mapping[str, NDArray[Any]], fresh: Ints, available: Ints
+) -> Columns:
+    """Of `fed`: a row a stratum (S,), and one of rows in none if there are any.
+
+    Args:
+        quotas: `wanted` and `natural` shares, `logged` rows drawn, and the `reason` for one that is
+            short, (S,) each.
+        fresh: (S + 1,) fresh rows drawn, last those in no stratum.
+        available: (S + 1,) rows in the ring.
+    """
+    logged = np.append(quotas["logged"], 0)
+    total = max(int(logged.sum() + fresh.sum()), 1)
+    wanted = np.append(quotas["wanted"], 0.0)
+    in_logs = np.append(quotas["natural"], 0.0)
+    in_ring = available / max(int(available.sum()), 1)
+    drawn = (logged + fresh) / total
+    short = np.maximum(wanted - drawn, 0.0)
+    count = len(names) + bool(fresh[-1])
+    part = slice(count)
+    reasons = [*quotas["reason"].tolist(), None]
+    return {
+        "stratum": [*names, "unlabelled"][part],
+        "natural_share": (logged.sum() * in_logs + fresh.sum() * in_ring)[part] / total,
+        "wanted_share": wanted[part],
+        "drawn_share": drawn[part],
+        "logs_share": (logged / total)[part],
+        "fresh_share": (fresh / total)[part],
+        "short_share": short[part],
+        "reason": [
+            why if lack > _SHORT else None
+            for why, lack in zip(reasons[part], short[part].tolist(), strict=True)
+        ],
+        "drawn_rows": (logged + fresh)[part],
+    }
+
+
 def conditions(source: SourceRows) -> Columns:
     """Of `conditions`."""
     drawn = source.drawn.sum(axis=(0, 2))
@@ -240,6 +278,7 @@ __all__ = [
     "actions",
     "ages",
     "conditions",
+    "fed",
     "one_of_each",
     "policies",
     "sampled_episodes",

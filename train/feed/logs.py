@@ -15,7 +15,7 @@ from torch import Tensor
 from restock.arrays import F32, Ints
 from restock.errors import ConfigError
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
-from restock.replay.sampling.share_controller import PlannedDraws
+from restock.replay.sampling.share_controller import FreshSupply, PlannedDraws
 from restock.train.dqn.config import LossConfig
 
 if TYPE_CHECKING:
@@ -121,8 +121,16 @@ class Logs:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def sampler(self, batch_size: int, logs_share: float | None, seed: int) -> LoggedSampler:
+    def sampler(
+        self,
+        batch_size: int,
+        logs_share: float | None,
+        seed: int,
+        fresh: FreshSupply | None = None,
+    ) -> LoggedSampler:
         """What draws from them: by the mixture of their panel, else by their shares.
+
+        `fresh` is what a ring beside them can give; None: there is none.
 
         Raises:
             MixtureError: see `sampler_for`.
@@ -145,6 +153,7 @@ class Logs:
             planned=self.planned,
             logs_share=logs_share,
             lap_floor=self.huber_delta,
+            fresh=fresh,
         )
 
 

@@ -44,7 +44,7 @@ class Probe:
     def of_ring(cls, ring: FreshRing, per_condition: int) -> Probe | None:
         """Without logs: labelled rows of the ring, copied, so that they stay when it moves on."""
         count = len(ring)
-        codes = ring.strata.stratum[:count].astype(np.int32)
+        codes = ring.by_condition.stratum[:count].astype(np.int32)
         key = (ring.meta["episode"][:count] << 20) | ring.meta["episode_step"][:count]
         rows = torch.from_numpy(ring.rows[:count])
         return cls._choose(codes, list(ring.conditions), key, per_condition, rows, "fresh")

@@ -31,6 +31,7 @@ LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: 
 GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited, of logs
 FRESH: dict[str, DTypeLike] = {
     "condition": "i2",  # held_rows.WAITING while its episode goes on
+    "stratum": "i2",  # of the mixture; as the condition where it has none
     "episode": "i8",  # the ring's key
     "episode_step": "i4",
     "policy": "i2",
@@ -134,8 +135,8 @@ def keep_rows(
     by_native: bool,
 ) -> None:
     """Append a batch to the rows of both sources, LOGGED and FRESH; or have compiled code do it."""
-    meta, condition = ring.meta, ring.strata.stratum
-    of_ring = (condition, *(meta[name] for name in _OF_RING))
+    meta, condition = ring.meta, ring.by_condition.stratum
+    of_ring = (condition, ring.stratum, *(meta[name] for name in _OF_RING))
     logged_to, logged_at = logged.grow(len(log_rows))
     fresh_to, fresh_at = fresh.grow(len(slots))
     if by_native:
@@ -153,10 +154,10 @@ def keep_rows(
         return
     weight = np.ones_like(values.td) if values.weight is None else values.weight
     of_rows = (values.td, values.q, weight, *values.tail.T)
-    condition, episode, step, policy, env_step, gradient_step = (of[slots] for of in of_ring)
+    *kinds, episode, step, policy, env_step, gradient_step = (of[slots] for of in of_ring)
     ages = (clocks[0] - env_step, clocks[1] - gradient_step)
     of_logs = (log_rows, log_stratum, *(of[: len(log_rows)] for of in of_rows))
-    of_fresh = (condition, episode, step, policy, *ages, *(of[len(log_rows) :] for of in of_rows))
+    of_fresh = (*kinds, episode, step, policy, *ages, *(of[len(log_rows) :] for of in of_rows))
     for columns, begin, every in ((logged_to, logged_at, of_logs), (fresh_to, fresh_at, of_fresh)):
         for column, found in zip(columns, every, strict=True):
             column[begin : begin + len(found)] = found
@@ -241,6 +242,7 @@ def fresh_audit(
         "age_env_steps": rows["age_env_steps"],
         "age_gradient_steps": rows["age_gradient_steps"],
         "condition": rows["condition"].copy(),
+        "of_stratum": rows["stratum"].copy(),
         "behaviour_policy": [ring.behaviour_policies[code] for code in rows["policy"].tolist()],
         "behaviour_version": [str(v) for v in ring.meta["policy_version"][slots].tolist()],
         "perturbation": perturbations.names(keys) if perturbations else None,
@@ -249,21 +251,23 @@ def fresh_audit(
     }
 
 
-def named(audit: Columns, conditions: Sequence[str], unlabelled: str) -> Columns:
+def named(
+    audit: Columns, conditions: Sequence[str], strata: Sequence[str], unlabelled: str
+) -> Columns:
     """What `fresh_audit` gave, once conditions are known; `unlabelled` is the stratum of others."""
-    codes = audit["condition"].tolist()
-    names = [conditions[code] if code >= 0 else None for code in codes]
+    names = [conditions[code] if code >= 0 else None for code in audit["condition"].tolist()]
+    of_strata = audit["of_stratum"].tolist()
     values = audit["perturbation_values"]  # a checkpoint gives back lists
     columns = {
         **audit,
         "episode": [str(key) for key in audit["key"].tolist()],
-        "stratum": [unlabelled if name is None else name for name in names],
+        "stratum": [strata[code] if code >= 0 else unlabelled for code in of_strata],
         "condition": names,
         "perturbation_values": None
         if values is None
         else [None if of is None else [tuple(pair) for pair in of] for of in values],
     }
-    del columns["key"]
+    del columns["key"], columns["of_stratum"]
     return columns
 
 

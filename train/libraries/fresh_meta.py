@@ -31,7 +31,7 @@ class FreshMeta:
     """Metadata beside `capacity` slots that N environments' steps are written to, a step a slot.
 
     Has what a `FreshRing` has for the record of batches: `meta`, `conditions`, `condition`,
-    `strata`, `behaviour_policies` and its length.
+    `by_condition`, `strata`, `stratum`, `behaviour_policies` and its length.
     """
 
     def __init__(
@@ -45,7 +45,8 @@ class FreshMeta:
         }
         self.meta["action_probability"][:] = np.nan
         self.meta["teacher_action"][:] = -1
-        self.strata = StratumSlots(capacity, len(self.conditions))
+        self.strata = self.conditions  # nothing else tells these rows apart
+        self.by_condition = StratumSlots(capacity, len(self.conditions))
         self.filled = np.zeros(capacity, np.bool_)
         self.episode_key: Ints = np.arange(num_envs, dtype=np.int64)
         self._episode_step: Ints = np.zeros(num_envs, np.int64)
@@ -65,7 +66,7 @@ class FreshMeta:
         gradient_step: int,
     ) -> Ints:
         """One step of `envs` (n,) went to `slots` (n,); returns their episodes' keys (n,)."""
-        self.strata.move(slots, NONE)
+        self.by_condition.move(slots, NONE)
         keys = self.episode_key[envs].copy()
         now = {
             "env_step": env_step,
@@ -94,17 +95,22 @@ class FreshMeta:
         slots = slots[self.meta["episode"][slots] == episode_key]  # the others were overwritten
         steps = self.meta["episode_step"][slots]
         for code in np.unique(codes[steps]):
-            self.strata.move(slots[codes[steps] == code], int(code))
+            self.by_condition.move(slots[codes[steps] == code], int(code))
         return len(slots)
+
+    @property
+    def stratum(self) -> NDArray[np.int16]:
+        """The stratum of each slot (capacity,): its condition's code."""
+        return self.by_condition.stratum
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
         """The condition code of each slot (n,); -1 where it has no label yet."""
-        codes: NDArray[np.int16] = self.strata.stratum[slots]
+        codes: NDArray[np.int16] = self.by_condition.stratum[slots]
         return codes
 
     def forget(self) -> None:
         """The library emptied its buffer."""
-        self.strata.move(np.flatnonzero(self.filled), NONE)
+        self.by_condition.move(np.flatnonzero(self.filled), NONE)
         self.filled[:] = False
         self._episode_step[:] = 0
         self.episode_key = self._next_key + np.arange(self.num_envs, dtype=np.int64)

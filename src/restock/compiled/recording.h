@@ -9,16 +9,16 @@ PyDoc_STRVAR(
     "Append a batch (B,), its logged rows first, to the columns of both sources.\n\n"
     "`values` are td, q and weight (B,) float32, the last of them None where all are 1, and the tail\n"
     "(B, 3) float32: action, reward, discount. `logged` are row and stratum (L,) int64; `ring` the\n"
-    "ring's condition int16, episode int64, episode_step int32, behaviour_policy int16, env_step and\n"
+    "ring's condition and stratum int16, episode int64, episode_step int32, behaviour_policy int16, env_step and\n"
     "gradient_step int64 (n,), of which the fresh rows are `slots` (B - L,) int64. Columns of\n"
-    "`logged_to` begin with row and stratum int64, those of `fresh_to` with condition int16, episode\n"
-    "int64, episode_step int32, policy int16 and both ages int64: those of `clocks` less the ring's.\n"
+    "`logged_to` begin with row and stratum int64, those of `fresh_to` with condition and stratum\n"
+    "int16, episode int64, episode_step int32, policy int16 and both ages int64: those of `clocks` less the ring's.\n"
     "Both end with td, q, weight float32, action int16, reward and discount float32; they are\n"
     "written from `logged_at` and `fresh_at` on.\n\n"
     "IndexError: a slot outside the ring, or no room in a column; nothing is written then.");
 
 enum { OF_ROW, OF_STRATUM, OF_LOGS };
-enum { OF_CONDITION, OF_EPISODE, OF_EPISODE_STEP, OF_POLICY, OF_ENV_STEP, OF_GRADIENT_STEP, OF_RING };
+enum { OF_CONDITION, OF_FRESH_STRATUM, OF_EPISODE, OF_EPISODE_STEP, OF_POLICY, OF_ENV_STEP, OF_GRADIENT_STEP, OF_RING };
 enum { VALUE_TD, VALUE_Q, VALUE_WEIGHT, VALUE_ACTION, VALUE_REWARD, VALUE_DISCOUNT, VALUES };
 #define MOST_VIEWS 40
 
@@ -114,13 +114,13 @@ static PyObject *keep_rows(PyObject *Py_UNUSED(module), PyObject *args) {
     }
     if (get_columns(&views, logged_from, "ll", logged, 0, logged_of) < 0 ||
         get_columns(&views, logged_into, "llfffhff", logged_at + logged, 1, logged_to) < 0 ||
-        get_columns(&views, ring_from, "hlihll", 0, 0, ring) < 0)
+        get_columns(&views, ring_from, "hhlihll", 0, 0, ring) < 0)
         goto done;
     Size rows = views.view[views.held - OF_RING].shape[0];
     for (int name = 1; name < OF_RING; name++)
         if (views.view[views.held - name].shape[0] < rows)
             rows = views.view[views.held - name].shape[0];
-    if (get_columns(&views, fresh_into, "hlihllfffhff", fresh_at + fresh, 1, fresh_to) < 0)
+    if (get_columns(&views, fresh_into, "hhlihllfffhff", fresh_at + fresh, 1, fresh_to) < 0)
         goto done;
     for (Size i = 0; i < fresh; i++)
         if (slot[i] < 0 || slot[i] >= rows) {
@@ -133,6 +133,7 @@ static PyObject *keep_rows(PyObject *Py_UNUSED(module), PyObject *args) {
     const float *tail = tail_view.buf;
     keep_values(logged_to + OF_LOGS, logged_at, value, tail, stride, 0, logged);
     int16_t *condition = (int16_t *)fresh_to[OF_CONDITION] + fresh_at;
+    int16_t *stratum = (int16_t *)fresh_to[OF_FRESH_STRATUM] + fresh_at;
     int64_t *episode = (int64_t *)fresh_to[OF_EPISODE] + fresh_at;
     int32_t *episode_step = (int32_t *)fresh_to[OF_EPISODE_STEP] + fresh_at;
     int16_t *policy = (int16_t *)fresh_to[OF_POLICY] + fresh_at;
@@ -141,6 +142,7 @@ static PyObject *keep_rows(PyObject *Py_UNUSED(module), PyObject *args) {
     for (Size i = 0; i < fresh; i++) { /* no load waits for another: memory gives several at once */
         int64_t from = slot[i];
         condition[i] = ((const int16_t *)ring[OF_CONDITION])[from];
+        stratum[i] = ((const int16_t *)ring[OF_FRESH_STRATUM])[from];
         episode[i] = ((const int64_t *)ring[OF_EPISODE])[from];
         episode_step[i] = ((const int32_t *)ring[OF_EPISODE_STEP])[from];
         policy[i] = ((const int16_t *)ring[OF_POLICY])[from];
