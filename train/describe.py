@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from restock.ingest.task.signals import LIDAR_SIGNALS
-from restock.replay.mixture.schedules import mean_over
 from restock.replay.panel.panel import Panel
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig
@@ -13,6 +12,7 @@ from restock.train.feed.cloned_rows import cloned
 from restock.train.feed.practice import MOVING
 from restock.train.loop import TrainResult, time_left
 from restock.train.prepare import Prepared, rows_by_policy
+from restock.train.run.fed_shares import SHORT
 from restock.train.session import Session
 from restock.train.twin.env.floor_report import sealed
 from restock.train.twin.floors.floors import open_floors
@@ -26,11 +26,7 @@ def describe_run(prepared: Prepared) -> str:
     schedule = config.schedule
     fed = "no panel: online only"
     if panel is not None:
-        share = document["panel"].get("logs_share", 0.0)
-        few = share < 0.1
-        fed = f"panel {panel.id} ({len(panel):,} rows), "
-        part = f"{share:.{int(few)}%} of each batch{_short(panel, config, share)}"
-        fed += part if config.env.twin else "all of each batch"
+        fed = f"panel {panel.id} ({len(panel):,} rows)"
     steps = f"up to {schedule.env_steps:,} environment steps"
     if not config.env.twin:
         steps = f"{schedule.offline_updates:,} updates on the logs alone, without a twin"
@@ -40,6 +36,8 @@ def describe_run(prepared: Prepared) -> str:
         f"run {prepared.path}: {fed}; target {config.target}; {steps};"
         f" seed {config.seed}, {config.device}"
     ]
+    if panel is not None:
+        lines += describe_forecast(document["panel"], config)
     if ring := document.get("ring_capacity"):
         lines.append(f"a ring of {ring['ring_rows']:,} rows: {ring['reason']}")
     if config.teacher.filters:
@@ -66,23 +64,54 @@ def describe_run(prepared: Prepared) -> str:
     return "\n".join(lines)
 
 
-def _short(panel: Panel, config: TrainConfig, logs_share: float) -> str:
-    """Why logs get less of an online batch than they are to; "" where they do not."""
-    wanted = config.replay.logs_share
-    if wanted is None:
-        schedule = config.schedule
-        parts = panel.header.mixture.sources.parts.values()
-        span = (min(schedule.warmup_env_steps, schedule.env_steps), schedule.env_steps)
-        wanted = sum(mean_over(part, *span) for part in parts)
-    most = panel.header.mixture.max_replays_per_row
-    if most is None or not config.schedule.env_steps or logs_share > 0.99 * wanted:
-        return ""
-    return (
-        f" (the mixture wants {wanted:.0%}: a row may be drawn {most:g} times, "
-        f"{config.schedule.offline_updates:,} offline updates draw first, and the rest is spread "
-        f"over {config.schedule.env_steps:,} steps; log more, shorten the schedule, or raise "
-        "max_replays_per_row)"
+def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
+    """Say what a run's batches are to be made of, and what they will be short of.
+
+    `fed` is the panel's part of config.json.
+    """
+    rows, planned = fed["forecast"], fed["planned_draws"]
+    total = planned["offline"] + planned["online"]
+    steps = planned["end_env_steps"]
+    budget = f"{total:,.0f} rows"
+    if config.env.twin:
+        budget += f" in {steps:,} environment steps"
+        if config.schedule.seconds is not None:
+            budget += (
+                f" (a first guess for {config.schedule.seconds:g} s; planned again from the"
+                " measured speed)"
+            )
+    parts = ", ".join(
+        f"{row['stratum']} {row['wanted_share']:.1%} ({row['logs_share']:.1%} logged"
+        + (f", {row['fresh_share']:.1%} fresh)" if config.env.twin else ")")
+        for row in rows
     )
+    lines = [f"quotas of the {budget} that the critic is fed: {parts}"]
+    lines += [
+        f"warning: {row['stratum']} will be short by {row['short_share']:.1%} of the rows fed, of"
+        f" {row['wanted_share']:.1%} wanted: {row['reason']}; log more of it, let the twin drive"
+        " it, raise max_replays_per_row, or lower its share in the mixture"
+        for row in rows
+        if row["short_share"] >= SHORT
+        or (row["wanted_share"] and row["short_share"] > 0.5 * row["wanted_share"])
+    ]
+    return lines
+
+
+def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows for people of what the critic was fed, in % of all rows: `fed_shares`."""
+    columns = {
+        "natural": "natural_share",
+        "wanted": "wanted_share",
+        "drawn": "drawn_share",
+        "logged": "logs_share",
+        "fresh": "fresh_share",
+        "short": "short_share",
+    }
+    return [
+        {"stratum": row["stratum"]}
+        | {name: f"{100 * row[column]:.1f}" for name, column in columns.items()}
+        for row in fed
+    ]
 
 
 def nothing_to_do(session: Session) -> str | None:

@@ -7,6 +7,7 @@ arXiv:2412.07762). Read `_train` from top to bottom: it is the whole of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -41,6 +42,9 @@ from restock.train.twin.env.interface import epsilon_greedy
 from restock.train.update_blocks import Made
 
 _OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
+# Of a budget in seconds, what may have passed when the teacher's rows are cloned, and when the
+# updates on the logs end: the other half is for the twin.
+_OF_CLONING, _OF_LOGS = 0.25, 0.5
 Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "evaluation"), values
 
 
@@ -104,11 +108,15 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     # 1. Offline, the logs alone: what their teacher finds plausible, then values.
     _clone_teacher(session, stop)
-    while (left := offline_updates - learner.gradient_steps) > 0 and time_left(session):
+    of_logs = _OF_LOGS if config.env.twin else 1.0
+    began_s, made = session.wall_s, learner.gradient_steps
+    while (left := offline_updates - learner.gradient_steps) > 0 and time_left(session, of_logs):
         _interrupt(session, stop)
         _updates(
             session, min(left, 1 if session.blocks is None else _OFFLINE_BLOCK), "offline", notify
         )
+    if learner.gradient_steps > made:
+        progress.offline_update_s = (session.wall_s - began_s) / (learner.gradient_steps - made)
     if progress.evaluated_at < 0 and offline_updates:
         if session.interval.updates:
             _close_interval(session, "offline", notify)
@@ -126,7 +134,9 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
         if progress.online_from is None and warm and len(session.ring) >= config.replay.batch_size:
-            progress.online_from = progress.env_steps
+            progress.online_from, progress.online_from_s = progress.env_steps, session.wall_s
+            if schedule.seconds is not None:
+                session.plan()
             _close_interval(session, "warmup", notify)
 
         # 3. Act, epsilon-greedy; the twin steps on its own thread …
@@ -180,6 +190,8 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             >= config.record.checkpoint_every_env_steps
             and progress.env_steps < schedule.env_steps
         ):
+            if schedule.seconds is not None:
+                session.plan()
             _save(session)
 
     session.run.append("episodes", session.collector.label(all_of_them=True))
@@ -207,7 +219,11 @@ def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
     behaviour, imitation = session.learner.behaviour, session.imitation
     if behaviour is None or imitation is None or session.learner.gradient_steps:
         return
-    while behaviour.updates < imitation.offline_updates and time_left(session):
+    seconds = session.config.schedule.seconds
+    most_s = math.inf if seconds is None else _OF_CLONING * seconds
+    while behaviour.updates < imitation.offline_updates and (
+        session.wall_s < most_s or behaviour.updates < session.config.record.every_updates
+    ):
         _interrupt(session, stop)
         behaviour.learn(imitation.draw_offline())
 
@@ -355,6 +371,7 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
         "last_sync": learner.target.last_sync,
         "steps_since_sync": learner.gradient_steps - learner.target.last_sync,
         "ring_rows": len(session.ring),
+        "planned_env_steps": progress.planned_env_steps,
         "episodes": episodes,
         "success": interval.successes / episodes if episodes and session.collector.goal else None,
         "return_mean": interval.returns / episodes if episodes else None,
@@ -436,12 +453,14 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
     config, progress, learner = session.config, session.progress, session.learner
     policy = GreedyPolicy(session.starting or learner.policy)
     discount = config.loss.discount
+    began_s = session.wall_s
     results = session.evaluation_buffer.drive(
         policy, session.fixed_episodes, discount, between=lambda: _interrupt(session, stop)
     )
     measured = session.evaluation_buffer.measure(learner)
     session.run.append("evaluation_buffer", [{**session.steps, **row} for row in measured])
     progress.evaluated_at = progress.env_steps
+    progress.evaluation_s = session.wall_s - began_s
     session.last = score(results)
     best = session.last.beats(session.best)
     if best:
@@ -467,18 +486,16 @@ def _save(session: Session) -> None:
     session.save()
 
 
-def time_left(session: Session) -> bool:
-    """Whether the time is not up.
+def time_left(session: Session, part: float = 1.0) -> bool:
+    """Return whether this part of the budget of time leaves room for more than an evaluation.
 
-    Whatever it is, a first interval of updates is made, so that there is something to keep and to
-    report; and half of it is spent in the twin, however long the logs took before that.
+    The budget is all that a user waits for: cloning, updates on the logs, driving, evaluations.
+    Whatever it is, a first interval of updates is made, so that there is something to report.
     """
     seconds = session.config.schedule.seconds
     if seconds is None or session.learner.gradient_steps < session.config.record.every_updates:
         return True
-    driving_from_s = session.progress.driving_from_s
-    in_twin = 0.0 if driving_from_s is None else driving_from_s + seconds / 2
-    return session.wall_s < max(seconds, in_twin)
+    return session.wall_s + session.progress.evaluation_s < part * seconds
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -12,18 +13,22 @@ from typing import Any
 import msgspec
 
 from restock.arrays import F32, Ints
-from restock.errors import PanelError, RunError
+from restock.errors import ConfigError, PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
+from restock.ingest.task.conditions import Condition
 from restock.interrupts import interrupts_raised
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
+from restock.replay.sampling.share_controller import FreshSupply
 from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
+from restock.train.evaluation.evaluate import evaluation_time_s
 from restock.train.feed.collector import conditions_in_twin
+from restock.train.feed.fresh_strata import FreshStrata
 from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Logs
 from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher
@@ -124,11 +129,8 @@ class Prepared:
         episodes: list[EpisodeSpec] | None,
     ) -> Session:
         profile = self.profile
-        conditions, exposures = (
-            conditions_in_twin(of_kind, profile.signals, lidar=profile.task.lidar)[0]
-            for of_kind in (profile.conditions, profile.exposures)
-        )
-        return open_session(
+        conditions, exposures = told_in_twin(profile)
+        session = open_session(
             run,
             self.config,
             task=profile.task,
@@ -148,6 +150,9 @@ class Prepared:
             resume=self.resumed is not None,
             reference=self._reference() if self.resumed is None else None,
         )
+        if self.resumed is None and self.config.env.twin and self.config.schedule.seconds:
+            refuse_short_budget(session, self.config.schedule.seconds)
+        return session
 
     def _reference(self) -> dict[str, float] | None:
         """The success of whom practice by regret is against; None of another rule."""
@@ -288,6 +293,34 @@ def prepare_resumed(
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
 
 
+def told_in_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
+    """The conditions and the exposures of a profile that can be told of fresh rows."""
+    conditions, exposures = (
+        conditions_in_twin(kind, profile.signals, lidar=profile.task.lidar)[0]
+        for kind in (profile.conditions, profile.exposures)
+    )
+    return conditions, exposures
+
+
+def refuse_short_budget(session: Session, seconds: float) -> None:
+    """Estimate the time of an evaluation, and refuse a budget that two of them would use up.
+
+    Raises:
+        ConfigError: says what the budget must be.
+    """
+    env, specs = session.evaluation_buffer.env, session.fixed_episodes
+    one_s = evaluation_time_s(env, specs, session.task.time_limit_steps)
+    if seconds < 2 * one_s:
+        raise ConfigError(
+            f"{seconds:g} s are too short: an evaluation of {len(specs)} episodes takes about"
+            f" {one_s:.1f} s here, and there is one before driving and one at the end",
+            where="schedule.seconds",
+            remedy=f"give --seconds {math.ceil(4 * one_s)} or more, or evaluate fewer episodes"
+            " (evaluation.episodes)",
+        )
+    session.progress.evaluation_s = one_s
+
+
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
     """A panel, every byte of it checked, and against the twin's task and the config's discount.
 
@@ -363,15 +396,17 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
     fed = None
     if panel is not None:
-        controller = controller_for(panel, planned_draws(config), config.replay.logs_share)
+        supply = None
+        if config.env.twin:
+            conditions, exposures = told_in_twin(profile)
+            supply = FreshSupply(FreshStrata.of(panel, [*conditions, *exposures]).known)
+        planned = planned_draws(config)
+        controller = controller_for(panel, planned, config.replay.logs_share, supply)
         fed = {
             **panel_document(panel),
-            # The mixture worked out for this run's own draws: shares as it begins.
-            "strata": dict(
-                zip([s.name for s in panel.strata], controller.shares.tolist(), strict=True)
-            ),
-            "logs_share": controller.logs_share,
-            "planned_draws": asdict(planned_draws(config)),
+            # The quotas, and what fills them, as far as this run's own draws say.
+            "forecast": controller.forecast(),
+            "planned_draws": asdict(planned),
         }
     return {
         "created_ns": now_ns(),

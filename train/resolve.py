@@ -31,15 +31,27 @@ def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
     return msgspec.structs.replace(config, epsilon=epsilon, env=env)
 
 
-def planned_draws(config: TrainConfig) -> PlannedDraws:
-    """The rows that a run of this config will draw, if nothing ends it before its budget."""
+FIRST_GUESS = 800.0  # environment steps a second, of a budget in seconds, until it is measured
+
+
+def planned_env_steps(config: TrainConfig) -> int:
+    """The environment steps that a budget allows, before the speed of this machine is known."""
+    schedule = config.schedule
+    if schedule.seconds is None:
+        return schedule.env_steps
+    return min(schedule.env_steps, round(FIRST_GUESS * schedule.seconds))
+
+
+def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedDraws:
+    """The rows that a run will draw in so many environment steps; None: `planned_env_steps`."""
     schedule, batch_size = config.schedule, config.replay.batch_size
-    online = max(schedule.env_steps - schedule.warmup_env_steps, 0)
+    end = planned_env_steps(config) if env_steps is None else env_steps
+    begin = min(schedule.warmup_env_steps, end)
     return PlannedDraws(
         offline=schedule.offline_updates * batch_size,
-        online=online * schedule.updates_per_env_step * batch_size,
-        begin_env_steps=min(schedule.warmup_env_steps, schedule.env_steps),
-        end_env_steps=schedule.env_steps,
+        online=(end - begin) * schedule.updates_per_env_step * batch_size,
+        begin_env_steps=begin,
+        end_env_steps=end,
     )
 
 

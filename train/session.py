@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 import torch
 
@@ -41,6 +42,7 @@ from restock.train.feed.practice import Practice
 from restock.train.feed.probe import Probe
 from restock.train.feed.teacher import AskedTeacher
 from restock.train.jump_start import POLICIES, JumpStart
+from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
 from restock.train.run.events import Events, TensorBoard
@@ -65,6 +67,10 @@ class Progress:
     checkpointed_at: int = 0
     wall_s: float = 0.0  # of training, before this process
     driving_from_s: float | None = None  # of training, when it began to drive in the twin
+    online_from_s: float | None = None  # of training, when online updates began
+    offline_update_s: float = 0.0  # of an update on the logs, on average
+    evaluation_s: float = 0.0  # of the last evaluation; before it, an estimate
+    planned_env_steps: int = 0  # that the shares of batches are planned for
     rollbacks: int = 0
     stopped: bool = False  # by the guard
 
@@ -156,6 +162,36 @@ class Session(Stateful):
             "gradient_steps": self.learner.gradient_steps,
         }
 
+    def plan(self) -> None:
+        """Plan the shares of batches for the environment steps that the budget still allows.
+
+        Of a budget in seconds these follow from the steps per second so far. To be called where
+        a checkpoint is written: a run that goes on from it then has the same plan.
+        """
+        config, progress = self.config, self.progress
+        schedule = config.schedule
+        end = schedule.env_steps
+        if schedule.seconds is not None and progress.online_from is not None:
+            left_s = max(schedule.seconds - progress.evaluation_s - self.wall_s, 0.0)
+            steps = round(self._steps_per_s() * left_s)
+            end = min(end, max(progress.env_steps + steps, progress.env_steps + self.env.num_envs))
+        if end != progress.planned_env_steps:
+            progress.planned_env_steps = end
+            self.batches.replan(planned_draws(config, end))
+
+    def _steps_per_s(self) -> float:
+        """Environment steps a second: with their updates, and the evaluations so far."""
+        progress, wall_s = self.progress, self.wall_s
+        if progress.online_from_s is None or progress.driving_from_s is None:
+            return FIRST_GUESS
+        made = progress.env_steps - (progress.online_from or 0)
+        if made >= self.config.record.every_updates:
+            return made / max(wall_s - progress.online_from_s, 1e-9)
+        # Online updates begin: the speed of driving alone, and of updates on the logs.
+        step_s = (wall_s - progress.driving_from_s) / max(progress.env_steps, 1)
+        update_s = self.config.schedule.updates_per_env_step * progress.offline_update_s
+        return 1.0 / max(step_s + update_s, 1e-9)
+
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
         keep(self.run.latest, self.progress.checkpointed_at, self.config.record.keep_checkpoints)
@@ -195,6 +231,9 @@ class Session(Stateful):
                 remedy="resume with the panel that the run began with, or start another run",
             )
         self.load_state_dict(state)
+        schedule = state["config"].get("schedule") if state.get("config") else None
+        if schedule is not None and schedule != msgspec.to_builtins(self.config.schedule):
+            self.plan()  # the budget was extended
         self.run.truncate(state["tables"])
         self._started = time.monotonic()
 
@@ -375,6 +414,7 @@ def open_session(
         session.restore()
     else:
         session.collector.reset(seed)
+        session.progress.planned_env_steps = planned_env_steps(config)
     if learner.device.type != "cpu":
         session.blocks = UpdateBlocks(
             config, learner, batches, session.imitation, session.log_terms

@@ -348,17 +348,23 @@ class FreshRing(Stateful):
 
         A stratum without such rows gives none.
         """
+        each = counts.tolist()
+        at, begin = rng.random(sum(each)), 0
         found: list[Ints] = [np.empty(0, np.int64)]
-        for stratum in np.flatnonzero(counts).tolist():
+        for stratum, count in enumerate(each):
+            begin += count
+            if not count:
+                continue
             members = self.by_stratum.members(stratum)
             if since is not None:
                 members = members[self.meta["env_step"][members] >= since]
             if len(members):
-                found.append(members[rng.integers(len(members), size=int(counts[stratum]))])
+                found.append(members[(at[begin - count : begin] * len(members)).astype(np.int64)])
         slots = np.concatenate(found)
-        np.add.at(self.draws, slots, 1)
-        if limit is not None and len(used_up := slots[self.draws[slots] >= limit]):
-            self.by_stratum.move(np.unique(used_up), NONE)
+        if limit is not None:
+            np.add.at(self.draws, slots, 1)
+            if (full := self.draws[slots] >= limit).any():
+                self.by_stratum.move(np.unique(slots[full]), NONE)
         return slots
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Ints:

@@ -131,6 +131,7 @@ class _SourceDraws(Stateful):
     got: F64  # shares of its strata now
     natural: Ints | F64  # what divides "natural" shares: rows, or how often strata occur
     dro: GroupDro | None = None
+    wanted: F64 | None = None  # the shares asked for, if they never change
 
 
 class ShareController(Stateful):
@@ -344,7 +345,11 @@ class ShareController(Stateful):
         """The shares (S,) of a source's rows that the mixture asks for now."""
         if source.dro is not None:
             return source.dro.shares
-        return wanted_shares(source.rules, source.natural, self.env_steps)
+        if self._moves:
+            return wanted_shares(source.rules, source.natural, self.env_steps)
+        if source.wanted is None:
+            source.wanted = wanted_shares(source.rules, source.natural)
+        return source.wanted
 
     def _beside_ring(self) -> bool:
         """Shares of an online batch, of logged rows and of fresh ones. True if they changed."""
@@ -404,6 +409,8 @@ class ShareController(Stateful):
         if source.dro is not None:
             every = [s.dro.shares for s in self.sources if s.dro is not None]
             return np.asarray(np.mean(every, axis=0))
+        if all(rule.share != "natural" for rule in source.rules):
+            return self._wanted(source)  # whatever the rows
         have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural
         return wanted_shares(source.rules, have, self.env_steps)
 

@@ -237,7 +237,7 @@ def test_an_audit_finds_a_panel_and_a_run_whose_weights_undo_a_quota(
     allow = "[correction]\npost = '{}'\nbelow_natural = 'allow'\n" + EQUAL
     for post, status in (("full", "fail"), ("none", "pass")):
         panel = panel_of(store_path, allow.format(post), tmp_path / post)
-        name = "effective_share"
+        name = "panel_effective_share"
         with open_place(store_path, beside={"panel": panel.path}) as connection:
             found = run_audits(
                 connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["panel"]
@@ -246,7 +246,7 @@ def test_an_audit_finds_a_panel_and_a_run_whose_weights_undo_a_quota(
         below = [line.name for line in panel.strata if below_natural(line)]
         assert {row["stratum"] for row in found[0].sample} == set(below)
 
-    run, name = tmp_path / "run", "drawn_effective_share"
+    run, name = tmp_path / "run", "effective_share"
     run.mkdir()
     (run / "config.json").write_text("{}")
     lines = [  # stratum, natural, drawn rows, effective share: twice, an interval each

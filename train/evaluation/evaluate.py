@@ -6,6 +6,8 @@ and checkpoint meets the same episodes and results can be compared episode by ep
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +20,8 @@ from restock.ingest.task.signals import Signals
 from restock.train.feed.fresh_log import values_entries
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
+
+_TIMED_STEPS = 8
 
 Stepper = Callable[[F32, Ints], Step]
 
@@ -74,6 +78,22 @@ def fixed_episodes(conditions: Sequence[str], episodes: int, first_seed: int) ->
         for index in range(episodes)
         for condition in conditions
     ]
+
+
+def evaluation_time_s(env: Twin, specs: Sequence[EpisodeSpec], time_limit_steps: int) -> float:
+    """Estimate how long driving these episodes takes: a few steps are made and timed.
+
+    Episodes are taken to last a third of the time limit.
+    """
+    env.set_episodes(specs)
+    env.reset(seed=0)
+    action = np.zeros(env.num_envs, np.int64)
+    env.step(action)
+    began = time.perf_counter()
+    for _ in range(_TIMED_STEPS):
+        env.step(action)
+    step_s = (time.perf_counter() - began) / _TIMED_STEPS
+    return step_s * math.ceil(len(specs) / env.num_envs) * time_limit_steps / 3
 
 
 def run_episodes(

@@ -64,6 +64,7 @@ TABLES: dict[str, pa.Schema] = {
         ("steps_since_sync", _I, "gradient steps since then"),
         ("logs_share", _F, "share of the rows drawn that are from logs"),
         ("ring_rows", _I, "number of fresh rows in the ring"),
+        ("planned_env_steps", _I, "environment steps that the shares of batches are planned for"),
         ("episodes", _I, "episodes finished in the interval, while exploring"),
         ("success", _F, "share of those that reached the goal without a bump; null: no goal"),
         ("return_mean", _F, "mean undiscounted return of those"),

@@ -1,19 +1,38 @@
 -- severity: error
--- needs: panel
--- advice: Its correction undoes its quota: set unit = "episode" or [correction] post = "density_ratio" in the mixture, or "none".
--- doc: Strata of the panel whose share of the gradient, after weights, is smaller than in the plain logs, although they are drawn at least as often; or whose own correction reduces it further.
-WITH of_source AS (
+-- needs: run.fed
+-- advice: Too few rows: ingest more of it, let the twin drive more of it (practice), lower its share, or raise max_replays_per_row. Undone by weights: change its correction in the mixture.
+-- doc: Strata of which the run's critic was fed less than half of their quota, over all its batches; and strata of the logs whose share of the gradient, after weights, was smaller than their share of the panel's rows, although they were drawn at least as often.
+WITH intervals AS (
+    SELECT *, sum(drawn_rows) OVER (PARTITION BY gradient_steps, phase) AS fed_rows
+    FROM run.fed
+), quotas AS (
     SELECT
-        name AS stratum,
+        stratum,
+        sum(natural_share * fed_rows) / sum(fed_rows) AS natural_share,
+        sum(wanted_share * fed_rows) / sum(fed_rows) AS wanted_share,
+        sum(drawn_rows) / sum(fed_rows) AS drawn_share,
+        arg_max(reason, short_share) AS reason
+    FROM intervals
+    GROUP BY stratum
+), drawn AS (
+    SELECT *, sum(drawn_rows) OVER (PARTITION BY source, gradient_steps) AS source_rows
+    FROM run.strata
+    WHERE source <> 'fresh'
+), weighted AS (
+    SELECT
+        stratum,
         source,
-        correction,
-        natural_share,
-        share / sum(share) OVER (PARTITION BY source) AS drawn_share,
-        effective_share / sum(effective_share) OVER (PARTITION BY source) AS effective_share
-    FROM panel.strata
+        last(available_share ORDER BY gradient_steps) AS natural_share,
+        sum(drawn_rows) / sum(sum(drawn_rows)) OVER (PARTITION BY source) AS drawn_share,
+        sum(effective_share * source_rows) / sum(sum(effective_share * source_rows)) OVER (PARTITION BY source) AS effective_share
+    FROM drawn
+    GROUP BY stratum, source
 )
-SELECT stratum, source, correction, natural_share, drawn_share, effective_share
-FROM of_source
-WHERE effective_share < (1 - $max_loss) * least(natural_share, drawn_share)
-    AND (correction <> 'none' OR drawn_share >= (1 - $max_loss) * natural_share)
-ORDER BY effective_share / natural_share
+SELECT stratum, 'batch' AS source, natural_share, wanted_share, drawn_share, NULL AS effective_share, reason
+FROM quotas
+WHERE drawn_share < $min_part * wanted_share
+UNION ALL
+SELECT stratum, source, natural_share, NULL, drawn_share, effective_share, 'weights undid what was drawn'
+FROM weighted
+WHERE drawn_share >= natural_share AND effective_share < (1 - $max_loss) * natural_share
+ORDER BY stratum, source

@@ -53,8 +53,9 @@ class TrainCommand:
     env_steps: int | None = None
     """Budget in environment steps (schedule.env_steps)."""
     seconds: float | None = None
-    """Stop after this training time, even if the step budget is not used up (schedule.seconds). At
-    least half of it is spent in the twin, however long the updates on the logs take."""
+    """Stop after this time, even if the step budget is not used up (schedule.seconds). It counts
+    everything but starting up: cloning, updates on the logs (at most half of it), driving and
+    evaluations, the last one too."""
     seed: int | None = None
     """Seed of networks, exploration, batches and episodes."""
     device: Literal["cpu", "cuda"] | None = None
@@ -68,8 +69,9 @@ class TrainCommand:
     """Print the outcome as JSON."""
 
     def run(self) -> int:
-        from restock.cli.output import print_json
+        from restock.cli.output import print_json, say
         from restock.errors import RestockError
+        from restock.train.describe import describe_run
         from restock.train.dqn.config import apply_overrides, parse_config
         from restock.train.prepare import prepare_new, prepare_resumed
 
@@ -102,6 +104,7 @@ class TrainCommand:
                 raise RestockError("no --out given", remedy="give --out RUN (or --resume RUN)")
             prepared = prepare_new(self.out, self.panel, self.config, overrides)
         if self.dry_run:
+            say(describe_run(prepared))
             print_json(prepared.document)
             return 0
         outcome, flushed = _train(prepared, self.flush_fresh)
@@ -237,13 +240,17 @@ def _print(
     from dataclasses import asdict
 
     from restock.cli.output import print_json, print_table, say
-    from restock.train.describe import no_update, unmoved
+    from restock.train.describe import fed_table, no_update, unmoved
+    from restock.train.run.fed_shares import fed_shares, shortfalls
     from restock.train.run.run import Run
 
-    practised = Run.open(prepared.path).table("practice").to_pylist() if outcome.env_steps else None
+    run = Run.open(prepared.path)
+    practised = run.table("practice").to_pylist() if outcome.env_steps else None
+    fed = fed_shares(run)
     for why in (
         no_update(outcome, prepared.config),
         None if practised is None else unmoved(practised, prepared.config),
+        *shortfalls(fed),
     ):
         if why is not None:
             say(f"warning: {why}")
@@ -254,7 +261,8 @@ def _print(
         for kept in (scores["best"], scores["last"]):
             if kept is not None and not kept["success"]:  # the task has no goal
                 kept["success_mean"] = None
-        print_json({"run": path, "panel": prepared.document["panel"], **scores, **fresh})
+        given = {"run": path, "panel": prepared.document["panel"], "fed": fed}
+        print_json({**given, **scores, **fresh})
         return
     rows = []
     for name, result in (("best (kept)", outcome.best), ("last", outcome.last)):
@@ -263,6 +271,8 @@ def _print(
             rows.append({"policy": name, **result.success, "mean": mean})
     if rows:  # else nothing drove
         print_table(rows, title="success on the fixed episodes, greedy")
+    if fed:
+        print_table(fed_table(fed), title="what the critic was fed: % of all rows")
     if flushed is not None:
         say(
             f"recording {flushed.recording_id}, {flushed.episodes:,} episodes of the twin with"
