@@ -189,9 +189,9 @@ class ShareController(Stateful):
         # Where no stratum has a quota, a ring is drawn from as it is.
         self._steers = mixture.adaptive is not None or any(share != "natural" for share in shares)
         self._work_out(mixture.shortfall)
+        self.planned_shares, self._wanted_offline = self.shares.copy(), self.wanted
         if fresh is not None and mixture.shortfall == "refuse":
             self._refuse_short()
-        self.planned_shares = self.shares.copy()
         if mixture.adaptive is not None:
             for source in self.sources:
                 floors = np.array([rule.floor for rule in source.rules])
@@ -437,34 +437,32 @@ class ShareController(Stateful):
         with the reason. It counts on the ring for every stratum that fresh rows can be in.
         """
         planned, size = self.planned, len(self.wanted)
-        names = [stratum.name for stratum in self.strata[:size]]
-        parts = [("offline", planned.offline)]
         online = planned.online if self.supply is not None else 0.0
-        step_now, wanted_now = self.env_steps, self.wanted
-        logs, fresh, wanted = np.zeros(size), np.zeros(size), np.zeros(size)
         total = max(planned.offline + online, 1e-12)
-        if parts[0][1]:
-            logs += planned.offline / total * np.bincount(self._of, self.shares)
-            wanted += planned.offline / total * self.wanted
+        logs = planned.offline / total * np.bincount(self._of, self.planned_shares)
+        wanted, fresh = planned.offline / total * self._wanted_offline, np.zeros(size)
+        now = self.env_steps
         moments = np.linspace(planned.begin_env_steps, planned.end_env_steps, _MOMENTS)
         for moment in moments if online else ():
             self.env_steps = float(moment)
-            of_logs, of_ring, asked = self._split(
-                np.full(size, np.inf), self._limits(from_start=True)
-            )
+            limits = self._limits(from_start=True)
+            of_logs, of_ring, asked = self._split(np.full(size, np.inf), limits)
+            by_stratum = np.bincount(self._of, of_logs)
             if not self._steers:  # the ring as it is: nothing is asked of it
-                of_ring = np.maximum(asked - np.bincount(self._of, of_logs), 0.0)
+                of_ring = np.maximum(asked - by_stratum, 0.0)
             part = online / total / _MOMENTS
-            logs += part * np.bincount(self._of, of_logs)
-            fresh += part * of_ring
-            wanted += part * asked
-        self.env_steps, self.wanted = step_now, wanted_now
+            logs, fresh, wanted = (
+                logs + part * by_stratum,
+                fresh + part * of_ring,
+                wanted + part * asked,
+            )
+        self.env_steps = now
         natural = self.natural
         short = np.maximum(wanted - logs - fresh, 0.0)
         short[short < 1e-6] = 0.0
         return [
             {
-                "stratum": names[i],
+                "stratum": self.names[i],
                 "natural_share": float(natural[i]),
                 "wanted_share": float(wanted[i]),
                 "logs_share": float(logs[i]),
@@ -503,7 +501,7 @@ class ShareController(Stateful):
                     f" {row['wanted_share'] - row['short_share']:.1%}: {row['reason']}"
                     for row in short
                 ),
-                remedy='lower the shares, raise max_replays_per_row, or set shortfall ='
+                remedy="lower the shares, raise max_replays_per_row, or set shortfall ="
                 ' "redistribute"',
             )
 

@@ -91,9 +91,7 @@ class HeldInterval:
     def fill(self, labels: EpisodeLabels) -> None:
         """Conditions that are known by now."""
         for part in (self.rows, self.open_rows):
-            labels.fill(
-                part["condition"], part["stratum"], part["episode"], part["episode_step"]
-            )
+            labels.fill(part["condition"], part["stratum"], part["episode"], part["episode_step"])
         for audit in self.audits:
             labels.fill(
                 audit["condition"], audit["of_stratum"], audit["key"], audit["episode_step"]

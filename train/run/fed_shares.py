@@ -22,7 +22,8 @@ def fed_shares(run: Run) -> list[dict[str, Any]]:
     sql = (files("restock.train.run") / "fed_shares.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
         connection.register("fed", run.table("fed"))
-        return connection.execute(sql).to_arrow_table().to_pylist()
+        found = connection.sql(sql)
+        return [dict(zip(found.columns, row, strict=True)) for row in found.fetchall()]
 
 
 def shortfalls(fed: list[dict[str, Any]]) -> list[str]:

@@ -39,8 +39,8 @@ class DemoCommand:
     Runs info, ingest, sql, audit, mix, train, eval and report on the recordings: about five minutes
     on two cores. Every stage shows its command, so that you can run it on your own recordings. The
     results compare the policy before and after fine-tuning with one that was fed uniformly, show
-    the shares of conditions before and after mixing, and follow one rare event from its message to
-    an update.
+    what the critic was fed of each condition, and follow one rare event from its message to an
+    update.
 
     Example: `restock demo --out build/demo`
     """
@@ -147,7 +147,7 @@ def tell(to: Settings, console: Console) -> None:
         )
         print_table(rows)
         console.print(story.trained(to))
-    show("Shares of conditions, before and after mixing", story.shelves(to.panel))
+    show("What the critic was fed", story.shelves(to.run))
     show("Failing before, arriving after: films", story.films(to))
     show("One rare event, from its message to an update", story.rare_event(to))
     show("What to try next", story.next_steps(to))

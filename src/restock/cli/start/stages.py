@@ -199,10 +199,10 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
         "Train: first on the panel, then online in the twin"
         if twin
         else "Train on the logs alone, without a twin",
-        f"About {to.seconds:.0f} s of double DQN. Half of each batch comes from the logs by "
-        "quotas; half is fresh, from missions that go wrong more often. The policy chooses by Q "
-        "among actions that the twin's operator finds plausible. Every row that the critic is fed "
-        "is recorded.",
+        f"About {to.seconds:.0f} s of double DQN. Each condition gets its quota of every batch: "
+        "half from the logs as far as its rows bear that, the rest fresh, from missions that go "
+        "wrong more often. The policy chooses by Q among actions that the twin's operator finds "
+        "plausible. Every row that the critic is fed is recorded.",
         [
             *("train", "--panel", str(to.panel), "--out", str(to.run)),
             *(("--seconds", f"{to.seconds:g}") if twin else ()),
@@ -223,9 +223,10 @@ def train_beside_uniform(to: Settings) -> Stage:
         fed,
         title="Train: first on the panel, then online in the twin; beside it one fed uniformly",
         why=f"Two trainings at once, about {to.seconds:.0f} s, with the same settings and seed. "
-        "Half of each batch comes from the logs: by quotas in the first, uniformly in the "
-        "other. Half is fresh, from missions that go wrong more often. The policy chooses by "
-        "Q among actions that the twin's operator finds plausible. Every row is recorded.",
+        "In the first, each condition gets its quota of every batch, from logs and fresh rows; "
+        "in the other, logs and fresh rows are drawn uniformly. Both practise the missions that go "
+        "wrong more often. The policy chooses by Q among actions that the twin's operator finds "
+        "plausible. Every row is recorded.",
         beside=(
             *("train", "--panel", str(to.uniform_panel), "--out", str(to.uniform)),
             *("--seconds", f"{to.seconds:g}", "--device", to.device),

@@ -33,8 +33,8 @@ a learner hardly sees them.
   5. A third one continues, too, but is fed uniformly, with the logs as they are.
   6. All drive the same missions as the robot's scripted planner.
 
-At the end you see the policies before and after, the shares of conditions
-before and after mixing, one rare event followed from the recording's message
+At the end you see the policies before and after, what the critic was fed of
+each condition, one rare event followed from the recording's message
 to the update that learned from it, and what to try with your own recordings."""
 
 _CELLS = 30  # of a bar of 100 %
@@ -113,21 +113,36 @@ def trained(to: Settings) -> str:
     return "\n".join(lines)
 
 
-def shelves(panel: Path) -> list[str]:
-    """A line a shelf: its share of the logs, its share of what is drawn, and both as a bar."""
-    from restock.replay.panel.panel import Panel
+def shelves(run: Path) -> list[str]:
+    """Return a line a stratum: its share of the logs, its quota, and what the critic was fed."""
+    from restock.train.run.fed_panel import run_panel
+    from restock.train.run.fed_shares import fed_shares, shortfalls
+    from restock.train.run.run import Run
 
-    strata = Panel.open(panel).strata
-    width = max(len(stratum.name) for stratum in strata)
-    lines = [f"{'stratum':<{width}}    rows  in the logs  in a batch"]
-    for stratum in strata:
-        natural, drawn = (round(_CELLS * s) for s in (stratum.natural_share, stratum.share))
+    trained = Run.open(run)
+    panel: Panel | None = run_panel(trained.document)
+    fed = fed_shares(trained)
+    if panel is None or not fed:
+        return []
+    logged = {stratum.name: stratum.natural_share for stratum in panel.strata}
+    width = max(len(row["stratum"]) for row in fed)
+    lines = [f"{'stratum':<{width}}  in the logs  wanted    fed  of it logged, fresh"]
+    for row in fed:
+        of_logs = logged.get(row["stratum"], 0.0)
+        natural, drawn = (round(_CELLS * s) for s in (of_logs, row["drawn_share"]))
         bar = "█" * min(natural, drawn) + "▒" * (drawn - natural) + "·" * (natural - drawn)
         lines.append(
-            f"{stratum.name:<{width}}  {stratum.rows:>6,}  {stratum.natural_share:>11.1%}"
-            f"  {stratum.share:>10.1%}  {bar}".rstrip()
+            f"{row['stratum']:<{width}}  {of_logs:>11.1%}  {row['wanted_share']:>6.1%}"
+            f"  {row['drawn_share']:>5.1%}  {row['logs_share']:>9.1%}, {row['fresh_share']:>5.1%}"
+            f"  {bar}".rstrip()
         )
-    return [*lines, "█ as in the logs   ▒ added by the quota   · removed by the quota"]
+    return [
+        *lines,
+        "█ as in the logs   ▒ added by quota   · less than in the logs",
+        f"In % of all {sum(row['drawn_rows'] for row in fed):,} rows that the critic was fed"
+        " (`FROM fed` of the run).",
+        *(f"warning: {line}" for line in shortfalls(fed)),
+    ]
 
 
 def films(to: Settings) -> list[str]:
@@ -183,6 +198,8 @@ def _chosen(run: Path) -> dict[str, Any] | None:
 def _told(trace: Trace, to: Settings) -> list[str]:
     """The chain, a line or two a link."""
     from restock.replay.panel.panel import Panel
+    from restock.train.run.fed_shares import fed_shares
+    from restock.train.run.run import Run
 
     assert trace.audit is not None
     audit, origin, lines = trace.audit, trace.origin, []
@@ -196,13 +213,14 @@ def _told(trace: Trace, to: Settings) -> list[str]:
     stratum = next(stratum for stratum in panel.strata if stratum.name == audit["stratum"])
     ended = ", and its episode ends here" if audit["discount"] == 0 else ""
     drawn, even = _draws(to.run, panel, audit["episode"])
+    fed = next(row for row in fed_shares(Run.open(to.run)) if row["stratum"] == audit["stratum"])
     target = audit["q"] - audit["td"]
     return [
         *lines,
         f"row        {audit['transition_id']}, driven by the {audit['behaviour_policy']}",
         f"           labelled {audit['condition']}; reward {audit['reward']:.2f}{ended}",
         f"stratum    {stratum.name}: {stratum.natural_share:.1%} of the logs,"
-        f" {stratum.share:.1%} of the draws from the logs",
+        f" {fed['drawn_share']:.1%} of the rows fed ({fed['logs_share']:.1%} logged)",
         f"           its episode's rows were drawn {drawn:,} times; with equal probability: "
         f"{even:,.0f}",
         f"update     {audit['gradient_step']:,}, row {audit['batch_row']} of its batch",

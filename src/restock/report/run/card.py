@@ -40,12 +40,17 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             "batch_size": replay.get("batch_size"),
             "logs_share": _drawn_share(facts, "logs"),
             "logs": _rule(mixture),
-            "fresh": "uniform over the ring" if _drawn_share(facts, "fresh") else None,
+            "fresh": _fresh_rule(facts, mixture),
             "n_step": {
                 "logs": panel.n_step if panel is not None else None,
                 "fresh": settings.get("loss", {}).get("n_step"),
             },
         },
+        "fed": _columns(
+            facts.fed,
+            *("stratum", "natural_share", "wanted_share", "drawn_share", "logs_share"),
+            *("fresh_share", "short_share", "reason", "drawn_rows"),
+        ),
         "ages": [_ages(facts.ages, *key) for key in _keys(facts.ages, "source", "unit")],
         "target": facts.config.get("target") or settings.get("target"),
         "conditions": _columns(
@@ -109,6 +114,20 @@ def replay_card(facts: Facts) -> dict[str, Any]:
 
 _TABLES = (
     (
+        "Quotas of the batch, and what filled them (shares of all rows fed)",
+        "fed",
+        {
+            "stratum": "stratum",
+            "natural_share": "natural",
+            "wanted_share": "wanted",
+            "drawn_share": "drawn",
+            "logs_share": "from logs",
+            "fresh_share": "fresh",
+            "short_share": "short",
+            "reason": "why short",
+        },
+    ),
+    (
         "Conditions in the sampled batches",
         "conditions",
         {
@@ -121,7 +140,7 @@ _TABLES = (
         },
     ),
     (
-        "Strata: intended and drawn",
+        "Strata by source (shares of the source's rows)",
         "strata",
         {
             "source": "source",
@@ -257,6 +276,17 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
     cap = mixture.get("max_replays_per_row")
     most = f", a row at most {cap:g} times" if cap else ""
     return f"quotas by stratum, within one {within}{most}"
+
+
+def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
+    """How the fresh part of a batch was drawn; None if there was none."""
+    if not _drawn_share(facts, "fresh"):
+        return None
+    rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
+    by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
+    if by_quota or (mixture or {}).get("adaptive"):
+        return "quotas by stratum, each of its rows alike"
+    return "uniform over the ring"
 
 
 def _drawn_share(facts: Facts, source: str) -> float | None:

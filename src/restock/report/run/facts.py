@@ -18,6 +18,7 @@ from restock.report.look.blocks import Rows, words
 from restock.report.look.queries import ask, rows_of, statements
 from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.fed_panel import run_panel
+from restock.train.run.fed_shares import fed_shares
 from restock.train.run.kept_evaluations import shown_evaluation
 from restock.train.run.measures import measures
 from restock.train.run.run import Run
@@ -42,6 +43,7 @@ class Facts:
     run: Path
     config: dict[str, Any]
     sampled: Rows  # per source and stratum: available, intended, drawn
+    fed: Rows = field(default_factory=list, kw_only=True)  # per stratum, of all rows fed
     conditions: Rows  # in the batches, whatever the strata are
     actions: Rows  # in the batches, and wanted, by source, stratum and condition
     ages: Rows
@@ -153,6 +155,7 @@ def gather(path: Path) -> Facts:
     facts.evaluation, facts.evaluation_on_ways = shown, ways
     facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)
+    facts.fed = fed_shares(run)
     facts.off_policy = _off_policy(run, facts.twin)
     facts.offline_start = [
         row for row in run.table("offline_start").to_pylist() if row["condition"] == "all"

@@ -73,7 +73,7 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
             "value": f"{replay.get('ring_capacity', 0):,}",
             "label": "capacity of the fresh ring, rows",
         },
-        {"value": _sampling(facts), "label": "of each online batch from logs, by quotas"},
+        {"value": _sampling(facts), "label": "of the rows fed from logs"},
         {"value": facts.target_rule, "label": "target rule"},
         {"value": f"{facts.trained['env_steps']:,}", "label": "environment steps"},
     ]
@@ -90,7 +90,8 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
 
 
 def _sampling(facts: Facts) -> str:
-    share = (facts.config.get("panel") or {}).get("logs_share")
-    if facts.panel is None:
+    if facts.panel is None and not facts.fed:
         return "0 %"
-    return "?" if share is None else f"{share:.0%}"
+    rows = sum(row["drawn_rows"] for row in facts.sampled)
+    logged = sum(row["drawn_rows"] for row in facts.sampled if row["source"] == "logs")
+    return f"{logged / rows:.0%}" if rows else "?"

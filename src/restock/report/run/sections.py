@@ -154,13 +154,13 @@ def sampled(facts: Facts) -> Section:
     return Section(
         "fed",
         "What was the critic fed?",
-        intro="The replay mix is the training distribution. Natural: the share in the logs. "
-        "Wanted: the share that the mixture asks for. Drawn: the share in the batches. After "
-        "weights: the share in the gradient.",
+        intro="The replay mix is the training distribution. A quota is a stratum's share of the "
+        "batch, whether its rows are logged or fresh. Wanted: the quota. Drawn: the share of all "
+        "rows fed. After weights: the share in the gradient.",
         callout=evaluation_bias(facts),
         figures=figures,
         two=True,
-        tables=[shares.table(facts)],
+        tables=[*([shares.fed_table(facts)] if facts.fed else []), shares.table(facts)],
     )
 
 

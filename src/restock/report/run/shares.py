@@ -1,4 +1,4 @@
-"""Shares of the logs' strata: natural, wanted, drawn, and what is left of them after weights."""
+"""What the critic was fed: quotas of the batch, the rows that filled them, and their weights."""
 
 from __future__ import annotations
 
@@ -20,55 +20,68 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.run.facts import Facts
+from restock.train.run.fed_shares import SHORT
 
 COLOURS = {
     "natural": "#cbd5e1",
     "wanted": "#94a3b8",
     "drawn": "#0f766e",
-    "after weights": "#d55e00",
 }
 
 
 def figure(facts: Facts) -> Figure | None:
-    """Four bars a stratum of the logs; None where no logged row was drawn."""
+    """Three bars a stratum; None for a run without a panel."""
     rows = bars(facts)
     if not rows:
         return None
-    title = "Logs: natural, wanted, drawn, and after weights"
+    title = "All rows fed: natural, wanted and drawn shares"
     return Figure(_drawn(rows), title, " ".join(remarks(facts)))
 
 
 def bars(facts: Facts) -> Rows:
-    """stratum, kind, share: natural and wanted as the panel has them, the others of the run."""
-    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
-    wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
+    """stratum, kind, share: of all rows that the critic was fed."""
     return [
-        {"stratum": words(row["stratum"]), "kind": kind, "share": value}
-        for row in facts.sampled
-        if row["source"] == "logs"
-        for kind, value in (
-            ("natural", natural.get(row["stratum"], row["available_share"])),
-            ("wanted", wanted.get(row["stratum"], row["quota_share"])),
-            ("drawn", row["drawn_share"]),
-            ("after weights", row["effective_share"]),
-        )
-        if value is not None
+        {"stratum": words(row["stratum"]), "kind": kind, "share": row[f"{kind}_share"]}
+        for row in facts.fed
+        for kind in COLOURS
     ]
+
+
+def fed_table(facts: Facts) -> Table:
+    """The same in numbers, with where the rows came from and what was short, and why."""
+    shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
+    return Table(
+        [
+            {
+                "stratum": words(row["stratum"]),
+                **{_TITLES.get(name, name): percent(row[f"{name}_share"]) for name in shares},
+                "rows drawn": count(row["drawn_rows"]),
+                "why short": row["reason"] or "",
+            }
+            for row in facts.fed
+        ],
+        {*(_TITLES.get(name, name) for name in shares), "rows drawn"},
+        caption="Shares are of all rows fed, over the whole run. Natural: what the same sources "
+        "would have given if drawn from uniformly.",
+    )
+
+
+_TITLES = {"logs": "from logs", "fresh": "fresh"}
 
 
 def remarks(facts: Facts) -> list[str]:
-    """Which strata lose by their weights, and what the short ones miss."""
-    by_stratum: dict[str, dict[str, float]] = {}
-    for row in bars(facts):
-        by_stratum.setdefault(row["stratum"], {})[row["kind"]] = row["share"]
-    lost = [
-        f"{name} ({share['natural']:.2%} of the rows, {share['drawn']:.2%} of the draws,"
-        f" {share['after weights']:.2%} of the gradient)"
-        for name, share in by_stratum.items()
-        if {"natural", "drawn", "after weights"} <= share.keys()
-        and share["drawn"] >= share["natural"]
-        and share["after weights"] < (1 - TOLERANCE) * share["natural"]
-    ]
+    """Which strata were short, which lose by their weights, and what rows are missing."""
+    natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
+    lost = []
+    for row in facts.sampled:
+        of_rows, weighted = natural.get(row["stratum"]), row["effective_share"]
+        if row["source"] == "fresh" or of_rows is None or weighted is None:
+            continue
+        if row["drawn_share"] >= of_rows and weighted < (1 - TOLERANCE) * of_rows:
+            lost.append(
+                f"{words(row['stratum'])} ({of_rows:.2%} of the rows, {row['drawn_share']:.2%} of"
+                f" the draws, {weighted:.2%} of the gradient)"
+            )
     short = [
         f"{words(stratum.name)} {stratum.missing_rows:,} rows"
         + (
@@ -79,18 +92,26 @@ def remarks(facts: Facts) -> list[str]:
         for stratum in facts.strata
         if stratum.missing_rows
     ]
-    texts = []
+    texts = [
+        f"{words(row['stratum'])} was short by {row['short_share']:.1%} of the rows fed, of"
+        f" {row['wanted_share']:.1%} wanted: {row['reason'] or 'too few rows'}."
+        for row in facts.fed
+        if row["short_share"] >= SHORT
+    ]
     if lost:
         texts.append(
             f"The share after weights is smaller than in the plain logs for {'; '.join(lost)}."
         )
     if short:
-        texts.append(f"Too few rows for the wanted shares; missing: {', '.join(short)}.")
+        texts.append(
+            "At the draws that `restock mix` planned, the logs alone have too few rows; missing:"
+            f" {', '.join(short)}."
+        )
     return texts
 
 
 def table(facts: Facts) -> Table:
-    """The same in numbers, of fresh rows too."""
+    """The rows of each source, by stratum, after weights too."""
     natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
     wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
     rows = []

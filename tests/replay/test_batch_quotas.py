@@ -1,0 +1,225 @@
+"""Quotas of the batch: logged rows as far as they bear it, fresh rows for the rest, or short."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from restock.errors import MixtureError
+from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.plan.strata import rules_of
+from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.share_controller import (
+    FreshSupply,
+    PlannedDraws,
+    SampledStratum,
+    ShareController,
+)
+
+QUOTAS = (
+    "max_replays_per_row = 400\n"
+    "[[strata]]\nname = 'nominal'\nshare = 0.4\n"
+    "[[strata]]\nname = 'slip'\nshare = 0.3\n"
+    "[[strata]]\nname = 'near'\nshare = 0.3\n"
+)
+NAMES = ("nominal", "slip", "near")
+ROWS = (7_628, 915, 559)  # as in the sample logs
+BATCH = 128
+PLENTY = np.full(3, 1e6)
+
+
+def controller(
+    env_steps: int,
+    *,
+    rows: tuple[int, ...] = ROWS,
+    text: str = QUOTAS,
+    known: tuple[bool, ...] = (True, True, True),
+    corrected: tuple[bool, ...] = (False, False, False),
+) -> ShareController:
+    """The shares of a run of so many environment steps, of the default schedule."""
+    mixture = parse_mixture(text)
+    strata = [
+        SampledStratum(name, "logs", rule, count, 9, corrected=weighed)
+        for name, rule, count, weighed in zip(
+            NAMES, rules_of(mixture, NAMES), rows, corrected, strict=True
+        )
+    ]
+    planned = PlannedDraws(2_000 * BATCH, 0.25 * (env_steps - 2_000) * BATCH, 2_000, env_steps)
+    return ShareController(mixture, strata, planned, fresh=FreshSupply(np.array(known)))
+
+
+def drive(
+    shares: ShareController, env_steps: int, stock: np.ndarray, batches: int = 400
+) -> np.ndarray:
+    """Rows fed by stratum and source (3, 2) over a run of which `batches` stand for all."""
+    fed = np.zeros((4, 2))
+    begin = shares.planned.begin_env_steps
+    each = shares.planned.online / batches
+    for number in range(batches):
+        shares.batches = 0  # each stands for many: shares are always due
+        shares.at(begin + (env_steps - begin) * number / batches, stock)
+        logged = shares.shares * shares.logs_share * each
+        shares.drawn = shares.drawn + np.round(logged).astype(np.int64)
+        fed[:3, 0] += logged
+        fed[:, 1] += shares.fresh_shares * each
+    return fed
+
+
+@pytest.mark.parametrize("env_steps", [48_000, 128_000, 200_000, 288_000, 1_800_000])
+def test_a_quota_holds_at_every_budget(env_steps: int) -> None:
+    """It was redistributed to nominal: from 288,000 steps on quotas were natural rates."""
+    shares = controller(env_steps)
+    np.testing.assert_allclose(shares.shares, [0.4, 0.3, 0.3])  # offline, whatever the budget
+    fed = drive(shares, env_steps, PLENTY)
+    np.testing.assert_allclose(fed[:3].sum(axis=1) / fed.sum(), [0.4, 0.3, 0.3], atol=0.002)
+    assert fed[3].sum() < 1e-6
+    assert (shares.drawn <= 400 * np.array(ROWS)).all()
+    (nominal, slip, near) = shares.forecast()
+    assert [row["short_share"] for row in (nominal, slip, near)] == [0, 0, 0]
+    whole = shares.planned.offline + shares.planned.online
+    assert near["logs_share"] * whole <= 400 * 559 * 1.001
+    assert near["logs_share"] + near["fresh_share"] == pytest.approx(0.3)
+
+
+def test_half_of_a_quota_is_logged_where_the_rows_bear_it() -> None:
+    shares = controller(20_000)
+    shares.at(2_000, PLENTY)
+    assert shares.logs_share == pytest.approx(0.5)
+    np.testing.assert_allclose(shares.fresh_shares, [0.2, 0.15, 0.15, 0], atol=1e-12)
+
+
+def test_logged_rows_fill_in_while_the_ring_is_empty() -> None:
+    shares = controller(20_000)
+    shares.at(2_000, np.zeros(3))
+    np.testing.assert_allclose(shares.shares * shares.logs_share, [0.4, 0.3, 0.3])
+    shares.batches = 0
+    shares.at(2_100, np.array([0.1, 0.05, 0.0]))  # stock in batches: 12 rows and 6
+    np.testing.assert_allclose(shares.fresh_shares, [0.1, 0.05, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(shares.shares * shares.logs_share, [0.3, 0.25, 0.3], atol=0.01)
+
+
+def test_what_neither_has_is_short_and_nominal_does_not_take_it() -> None:
+    shares = controller(1_800_000, known=(True, True, False))
+    fed = drive(shares, 1_800_000, PLENTY)
+    nominal, slip, near, anything = fed.sum(axis=1) / fed.sum()
+    assert (nominal, slip) == pytest.approx((0.4, 0.3), abs=0.002)
+    assert near < 0.005
+    assert anything == pytest.approx(0.3 - near, abs=0.002)  # rows of any kind, and named
+    row = shares.forecast()[2]
+    assert row["short_share"] == pytest.approx(0.3 - row["logs_share"])
+    assert row["reason"] == (
+        "its 559 logged rows give 400 draws each, and fresh rows of the twin cannot be told to be"
+        " in it"
+    )
+    with pytest.raises(MixtureError, match=r"near wants 30\.0% of the rows fed and gets 0\.4%"):
+        controller(1_800_000, known=(True, True, False), text="shortfall = 'refuse'\n" + QUOTAS)
+    controller(1_800_000, text="shortfall = 'refuse'\n" + QUOTAS)  # the ring fills it
+
+
+def test_no_shelf_has_a_stratum() -> None:
+    shares = controller(48_000, rows=(7_628, 915, 0), known=(True, True, False))
+    assert shares.forecast()[2]["reason"] == (
+        "the logs have no row of it, and fresh rows of the twin cannot be told to be in it"
+    )
+
+
+def test_fresh_rows_are_not_boosted_where_weights_would_take_it_away() -> None:
+    shares = controller(1_800_000, corrected=(False, False, True))
+    shares.at(2_000, PLENTY)
+    assert shares.fresh_shares[2] == 0
+    assert "importance weights" in str(shares.forecast()[2]["reason"])
+
+
+def test_without_quotas_the_ring_is_drawn_from_as_it_is() -> None:
+    shares = controller(48_000, text="[each_condition]\nshare = 'natural'\n")
+    shares.at(2_000, PLENTY)
+    np.testing.assert_array_equal(shares.fresh_shares, [0, 0, 0, 0.5])
+    assert shares.logs_share == 0.5
+    assert [row["short_share"] for row in shares.forecast()] == [0, 0, 0]
+
+
+@given(
+    st.tuples(*[st.integers(0, 5_000)] * 3).filter(lambda rows: rows[0] > 3_000),
+    st.lists(st.floats(0, 2), min_size=3, max_size=3),
+    st.integers(10_000, 3_000_000),
+    st.tuples(*[st.booleans()] * 3),
+)
+def test_no_stratum_gets_more_than_its_quota(
+    rows: tuple[int, int, int], stock: list[float], env_steps: int, known: tuple[bool, bool, bool]
+) -> None:
+    shares = controller(env_steps, rows=rows, known=known)
+    shares.at(2_000, np.array(stock))
+    logs, fresh = shares.shares * shares.logs_share, shares.fresh_shares
+    assert logs.sum() + fresh.sum() == pytest.approx(1)
+    assert (logs + fresh[:3] <= shares.wanted + 1e-9).all()
+    assert (fresh[:3] <= np.array(stock) + 1e-9).all()
+    assert (fresh[:3][~np.array(known)] == 0).all()
+    left = 400.0 * np.array(rows)
+    assert (logs * shares.planned.online <= left * 1.0001).all()
+
+
+def test_another_plan_changes_what_logged_rows_give() -> None:
+    shares = controller(288_000)
+    shares.at(2_000, PLENTY)
+    before = shares.logs_share
+    planned = shares.planned
+    half = PlannedDraws(planned.offline, planned.online / 2, 2_000, 145_000)
+    assert shares.replan(half)
+    assert shares.logs_share > before
+
+
+def ring_of(strata: list[int], rows: int = 40) -> FreshRing:
+    """A ring in which one ended episode's steps are in these strata, -1: in none."""
+    ring = FreshRing(rows, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
+    key = 0
+    for step in range(len(strata)):
+        (key,) = ring.append(
+            observation=np.zeros((1, 1)),
+            action=np.zeros(1),
+            reward=np.zeros(1),
+            terminated=np.array([step == len(strata) - 1]),
+            truncated=np.zeros(1, np.bool_),
+            next_observation=np.zeros((1, 1)),
+            env_step=step,
+            gradient_step=0,
+        )
+    ring.set_labels(int(key), np.zeros(len(strata), np.int64), np.array(strata))
+    return ring
+
+
+def test_a_ring_gives_rows_of_a_stratum_and_none_too_often() -> None:
+    ring, rng = ring_of([0, 0, 1, -1, 1]), np.random.default_rng(0)
+    assert ring.stratum_rows.tolist() == [2, 2]
+    drawn = np.concatenate([ring.draw(np.array([1, 0]), rng, limit=3) for _ in range(20)])
+    assert set(drawn.tolist()) == {0, 1}
+    assert np.bincount(drawn).max() == 3  # then the stratum gives none
+    assert ring.by_stratum.counts.tolist() == [0, 2]
+    assert ring.stratum_rows.tolist() == [2, 2]  # they are still there
+    assert set(ring.draw(np.array([0, 9]), rng).tolist()) == {2, 4}
+    assert set(ring.draw(np.array([0, 9]), rng, since=3).tolist()) == {4}
+
+
+def test_a_row_that_is_overwritten_leaves_its_stratum() -> None:
+    ring = ring_of([0, 0, 1, 1], rows=4)
+    ring.draw(np.array([5, 5]), np.random.default_rng(0))
+    state = ring.state_dict()
+    again = FreshRing(4, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
+    again.load_state_dict(state)
+    np.testing.assert_array_equal(again.draws, ring.draws)
+    for _ in range(2):
+        ring.append(
+            observation=np.zeros((1, 1)),
+            action=np.zeros(1),
+            reward=np.zeros(1),
+            terminated=np.zeros(1, np.bool_),
+            truncated=np.zeros(1, np.bool_),
+            next_observation=np.zeros((1, 1)),
+            env_step=9,
+            gradient_step=0,
+        )
+    assert ring.by_stratum.counts.tolist() == [0, 2]
+    assert ring.stratum.tolist() == [-1, -1, 1, 1]
+    assert ring.draws[:2].tolist() == [0, 0]
+    assert again.by_stratum.counts.tolist() == [2, 2]
