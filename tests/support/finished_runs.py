@@ -67,18 +67,21 @@ def make_run(
                     **clocks,
                     "source": "logs",
                     "stratum": stratum,
+                    "condition": stratum,
                     "episode": [f"a/{key}" for key in range(50)],
                     "drawn_rows": round(1000 * share),
                     "weight": 1000.0 * share,
                 },
             )
         count = fresh_episodes // 10
+        kinds = np.where(rng.random(count) < 0.3, "wheel_slip", "nominal")
         run.append_columns(
             "sampled_episodes",
             {
                 **clocks,
                 "source": "fresh",
-                "stratum": np.where(rng.random(count) < 0.3, "wheel_slip", "nominal"),
+                "stratum": kinds,
+                "condition": kinds,
                 "episode": (part * count + np.arange(count)).astype(str),
                 "drawn_rows": 50_000 // count,
                 "weight": 50_000.0 / count,

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from support.finished_runs import UPDATES, document, make_run
+from support.toy_run import config, run_to_end
+from support.toy_run import logs as toy_logs
 
 from restock.cli import main
 from restock.errors import RunError
 from restock.train.comparison.compare import compare
 from restock.train.comparison.diagnose import diagnose
-from restock.train.run.run import Run
+from restock.train.comparison.run_difference import diff_runs
+from restock.train.feed.logs import Coded, Logs
+from restock.train.run.run import FORMAT, Run
 from restock.train.study.page import as_markdown
 
 EXTRA = ("update_path",)
@@ -97,6 +105,54 @@ def test_another_feed_is_refused_unless_it_is_the_treatment(tmp_path, capsys) ->
     assert "share of logs/wheel_slip" in failed
     code, found = compared(capsys, first, second, "--treatment", "mixture")
     assert (code, found["verdict"]) == (0, "comparable")
+
+
+def logs_by(unit: str) -> Logs:
+    """Steps of 20 episodes, three of which slip; strata by the condition of steps, or of episodes:
+    that of a whole episode where a step of it slips."""
+    logs, episodes = toy_logs(), np.arange(200) // 10
+    slips = np.zeros(200, np.bool_)
+    slips[[3, 57, 58, 121]] = True
+    of_stratum = slips if unit == "step" else np.isin(episodes, episodes[slips])
+    return dataclasses.replace(
+        logs,
+        stratum_rows=[np.flatnonzero(~of_stratum), np.flatnonzero(of_stratum)],
+        shares=np.array([1 - of_stratum.mean(), of_stratum.mean()]),
+        condition=Coded.of(pa.chunked_array([np.where(slips, "wheel_slip", "nominal").tolist()])),
+        episode=Coded.of(pa.chunked_array([[f"a/{key}" for key in episodes]])),
+    )
+
+
+def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, capsys) -> None:
+    paths = [tmp_path / unit for unit in ("step", "episode")]
+    for seed, path in enumerate(paths):
+        run_to_end(path, config(schedule={"env_steps": 800}), logs=logs_by(path.name))
+        whole = document(seed, panel__id=path.name) | {"format": FORMAT}
+        (path / "config.json").write_text(json.dumps(whole), "utf-8")
+
+    def slipping(column: str) -> list[int]:
+        """Logged rows drawn of either run."""
+        counts = []
+        for path in paths:
+            fed = Run.open(path).table("sampled_episodes").to_pylist()
+            logged = (row for row in fed if row["source"] == "logs" and row[column] == "wheel_slip")
+            counts.append(sum(row["drawn_rows"] for row in logged))
+        return counts
+
+    by_step, by_episode = slipping("stratum")
+    assert by_episode > 7 * by_step  # of one name, and not the same
+    code, found = compared(capsys, *([str(path)] for path in paths), "--treatment", "mixture")
+    assert code == 0
+    (check,) = [c for c in found["checks"] if c["name"] == "share of logs/wheel_slip"]
+    drawn = slipping("condition")
+    assert check["value"] == pytest.approx(max(drawn) / min(drawn))
+    assert check["value"] < 1.25
+    (fed,) = [
+        row
+        for row in diff_runs(*paths)["fed"]
+        if (row["source"], row["condition"]) == ("logs", "wheel_slip")
+    ]
+    assert [fed["drawn_a"], fed["drawn_b"]] == drawn
 
 
 @pytest.mark.parametrize(
@@ -235,12 +291,17 @@ def test_an_invalid_arm_is_refused_with_a_remedy(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
     other = str(make_run(tmp_path / "o", document(9, config__target__tau=0.1)))
     young = str(Run.create(tmp_path / "young", document(1)).path)
+    older = shutil.copytree(first[1], tmp_path / "older")
+    fed = pq.read_table(older / "sampled_episodes.parquet").drop_columns("condition")
+    pq.write_table(fed, older / "sampled_episodes.parquet")
+    older = str(older)
     for words, said in (
         ([*first], "needs two runs, got 3"),
         (["--against", *first], "needs the runs of the first method, too"),
         ([first[0], other, "--against", first[1]], "differs from"),
         ([first[0], first[0], "--against", first[1]], "is given twice"),
-        ([first[0], young], "has no record of the episodes it sampled"),
+        ([first[0], young], "has no record of the episodes it sampled by condition"),
+        ([first[0], older], "has no record of the episodes it sampled by condition"),
         ([first[0], str(tmp_path)], "is not a run directory"),
     ):
         assert main(["compare", *words]) == 2

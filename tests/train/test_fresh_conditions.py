@@ -77,7 +77,7 @@ def test_a_condition_is_that_of_the_step_in_its_episode(live: Session) -> None:
     [
         ("strata", "stratum", "drawn_rows"),
         ("conditions", "condition", "drawn_rows"),
-        ("sampled_episodes", "stratum", "drawn_rows"),
+        ("sampled_episodes", "condition", "drawn_rows"),
         ("actions", "condition", "drawn_rows"),
     ],
 )

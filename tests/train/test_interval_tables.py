@@ -105,6 +105,21 @@ def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool
 
 
 @settings(max_examples=20)
+@given(st.integers(1, 80), st.integers(0, 99))
+def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> None:
+    of = source(rows, seed, greedy=False)
+    columns = interval_tables.sampled_episodes(of)
+    cells = zip(columns["episode"], columns["stratum"], columns["condition"], strict=True)
+    found = dict(zip(cells, columns["drawn_rows"].tolist(), strict=True))
+    counted: Counter[tuple[str, str, str]] = Counter(
+        (str(episode), STRATA[stratum], CONDITIONS[condition])
+        for episode, stratum, condition in zip(of.episode, of.stratum, of.condition, strict=True)
+    )
+    assert found == counted
+    assert columns["weight"].sum() == pytest.approx(of.rows["weight"].sum(), rel=1e-5)
+
+
+@settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
 def test_every_action_of_what_was_met_has_a_row_the_never_drawn_too(
     rows: int, seed: int, greedy: bool

@@ -29,7 +29,7 @@ def test_what_moved_is_shown_where_compare_refuses(
     found = json.loads(capsys.readouterr().out)
     settings = {row["setting"]: (row["first"], row["second"]) for row in found["settings"]}
     assert settings["config.network.dueling"] == (False, True)
-    fed = {(row["source"], row["stratum"]): row for row in found["fed"]}
+    fed = {(row["source"], row["condition"]): row for row in found["fed"]}
     slip = fed["logs", "wheel_slip"]
     assert (slip["share_a"], slip["share_b"]) == pytest.approx((0.15, 0.05))
     assert sum(row["share_a"] for row in found["fed"]) == pytest.approx(1)

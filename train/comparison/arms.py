@@ -108,9 +108,10 @@ class Arm:
         self.name = name
         self.runs = [Run.open(path) for path in paths]
         for run in self.runs:
-            if not run.table("sampled_episodes").num_rows:
+            fed = run.table("sampled_episodes")
+            if not fed.num_rows or fed["condition"].null_count:
                 raise RunError(
-                    "has no record of the episodes it sampled",
+                    "has no record of the episodes it sampled by condition",
                     where=str(run.path),
                     remedy="it has made no update yet, or was written by an older Restock: train "
                     "it again",
@@ -136,7 +137,7 @@ class Arm:
         }
 
     def fed(self) -> pa.Table:
-        """Draws by run, cell, tenth and episode."""
+        """Return draws by run, cell, tenth and episode."""
         import duckdb
 
         query = (
@@ -198,7 +199,7 @@ def same_run(first: Run, second: Run) -> bool:
 
 
 def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
-    """What two arms were fed, over the cells of both."""
+    """Return what two arms were fed, over the cells of both."""
     tables = first.fed(), second.fed()
     cells = sorted({name for table in tables for name in table["cell"].unique().to_pylist()})
     a, b = (_feed(table, cells) for table in tables)

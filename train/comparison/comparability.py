@@ -2,9 +2,10 @@
 
 A difference test asks the wrong question: at a million draws it rejects trifles, and it takes rows
 of one episode for independent ones. So two feeds are comparable only when the data show that they
-differ by *at most* a stated limit. What a mixture fixes (the shares of logged strata, in exact
-quotas) is compared as it is; what is random (which fresh episodes there were) is resampled by
-whole episodes. Total variation distance alone does not see a rare stratum, hence the ratios.
+differ by *at most* a stated limit. Shares are of conditions, which mean the same in both runs; a
+stratum is whatever its own run's mixture says. What a mixture fixes (the logged rows, by quotas and
+in turns) is compared as it is; what is random (which fresh episodes there were) is resampled by
+whole episodes. Total variation distance alone does not see a rare condition, hence the ratios.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ class ComparabilityLimits:
 
     distance: float = 0.02  # total variation between the mixes of the whole run
     tenth_distance: float = 0.05  # … of one tenth of it, which has a tenth of the episodes
-    share_ratio: float = 1.25  # of a stratum's shares
-    share_floor: float = 0.0005  # strata below this share in both are not asked for a ratio
+    share_ratio: float = 1.25  # of a condition's shares
+    share_floor: float = 0.0005  # conditions below this share in both are not asked for a ratio
     unlabelled: float = 0.5  # share of the fresh rows drawn before their episode had labels
-    episode_ratio: float = 1.5  # of the numbers of episodes that a stratum was drawn from
+    episode_ratio: float = 1.5  # of the numbers of episodes that a condition was drawn from
     confidence: float = 0.95
     resamples: int = 1000
 
 
 @dataclass(frozen=True)
 class Feed:
-    """What one arm's critics were fed: draws by cell (source/stratum), tenth of training, episode.
+    """What one arm's critics were fed: draws by cell (source/condition), tenth and episode.
 
     Rows are sums over the draws of one episode in one cell and tenth.
     """
@@ -213,7 +214,7 @@ def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, f
 def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator) -> F64:
     """Draws, then weights, by tenth and cell, (1 + R, 2, 10, C): as they were, then resampled.
 
-    An episode is resampled as a whole: in all tenths and cells that it was drawn in.
+    A fresh episode is resampled as a whole: in all tenths and cells that it was drawn in.
     """
     from scipy.sparse import csr_array
 

@@ -1,9 +1,9 @@
--- What one run's critic was fed, by episode, cell (source/stratum) and tenth of its training.
--- `fed` is the run's sampled_episodes.
+-- What one run's critic was fed, by episode, cell (source/condition) and tenth of its training. `fed`
+-- is the run's sampled_episodes. Strata have names of their mixture: those of two runs may differ.
 WITH drawn AS (
     SELECT *, max(gradient_steps) OVER () AS whole FROM fed
 )
-SELECT source || '/' || stratum AS cell,
+SELECT source || '/' || condition AS cell,
        least((gradient_steps * 10 - 1) // whole, 9)::BIGINT AS tenth,
        source,
        episode,

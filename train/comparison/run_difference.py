@@ -92,7 +92,7 @@ def _panels(a: Run, b: Run) -> dict[str, Any] | None:
 
 
 def _fed(a: Run, b: Run) -> Rows:
-    """One line a source and stratum: its share of all rows drawn, plain and after weights."""
+    """One line a source and condition: its share of all rows drawn, plain and after weights."""
     query = files("restock.train.comparison").joinpath("fed_shares.sql")
     with duckdb.connect() as connection:
         for side, run in (("a", a), ("b", b)):

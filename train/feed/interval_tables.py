@@ -254,11 +254,15 @@ def ages(unit: str, age: F64) -> Columns:
 
 def sampled_episodes(source: SourceRows) -> Columns:
     """Of `sampled_episodes`."""
-    sums = episode_sums(source.episode, source.stratum, source.rows["weight"], len(source.strata))
-    key = sums["episode"]
-    named = np.array(source.episodes, object)[key] if source.episodes else key.astype(str)
-    stratum = np.array(source.strata, object)[sums["stratum"]]
-    return {"source": source.name, **sums, "stratum": stratum, "episode": named}
+    sums = episode_sums(source.episode, source.pair, source.rows["weight"], source.pairs)
+    key, pair, size = sums["episode"], sums.pop("pair"), len(source.conditions)
+    return {
+        "source": source.name,
+        **sums,
+        "stratum": np.array(source.strata, object)[pair // size],
+        "condition": np.array(source.conditions, object)[pair % size],
+        "episode": np.array(source.episodes, object)[key] if source.episodes else key.astype(str),
+    }
 
 
 def policies(source: SourceRows) -> Columns:

@@ -165,17 +165,17 @@ def keep_rows(
 
 def episode_sums(
     episode: NDArray[np.int64],  # (n,) of each row
-    stratum: NDArray[np.int64],  # (n,)
+    pair: NDArray[np.int64],  # (n,) of stratum and condition
     weight: NDArray[np.float32],  # (n,)
-    strata: int,
+    pairs: int,
 ) -> dict[str, NDArray[Any]]:
-    """Rows summed by episode and stratum: columns episode, stratum, drawn_rows, weight.
+    """Rows summed by episode and pair: columns episode, pair, drawn_rows, weight.
 
     Rows of one episode are drawn together and are alike, so what a critic learnt from is only as
     certain as its episodes are many. `restock compare` resamples these.
     """
     first = int(episode.min(initial=0))
-    key = (episode.astype(np.int64) - first) * strata + stratum
+    key = (episode.astype(np.int64) - first) * pairs + pair
     if int(key.max(initial=0)) < _MOST_CELLS:
         drawn = np.bincount(key)
         cells = np.flatnonzero(drawn)
@@ -184,8 +184,8 @@ def episode_sums(
         cells, place, count = np.unique(key, return_inverse=True, return_counts=True)
         total = np.bincount(place, weight)
     return {
-        "episode": cells // strata + first,
-        "stratum": cells % strata,
+        "episode": cells // pairs + first,
+        "pair": cells % pairs,
         "drawn_rows": count,
         "weight": total,
     }

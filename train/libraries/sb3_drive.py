@@ -255,12 +255,13 @@ class _OnPolicyFeed(BaseCallback):
                 {
                     **clocks,
                     "source": "fresh",
-                    "stratum": stratum,
+                    "stratum": name,
+                    "condition": name,
                     "episode": str(key),
                     "drawn_rows": steps * self.epochs,
                     "weight": float(steps * self.epochs),
                 }
-                for stratum, key, steps in rows
+                for name, key, steps in rows
             ],
         )
 

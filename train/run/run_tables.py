@@ -184,10 +184,11 @@ TABLES: dict[str, pa.Schema] = {
         ("p99", _F, "99th percentile"),
     ),
     "sampled_episodes": _schema(
-        "one interval x source x stratum x episode: how often it was drawn",
+        "one interval x source x stratum x condition x episode: how often it was drawn",
         *_STEPS,
         ("source", _S, "logs | fresh"),
         ("stratum", _S, "stratum of that source"),
+        ("condition", _S, "condition of the rows, whatever the strata are"),
         ("episode", _S, "logs: episode_id; fresh: the key in the ring"),
         ("drawn_rows", _I, "number of rows drawn in the interval"),
         ("weight", _F, "sum of their importance weights"),

@@ -161,7 +161,7 @@ def _stratum(row: dict[str, Any]) -> dict[str, Any]:
 def _fed(row: dict[str, Any]) -> dict[str, Any]:
     return {
         "source": row["source"],
-        "stratum": row["stratum"],
+        "condition": row["condition"],
         **{f"drawn {side}": _percent(row[f"share_{side}"]) for side in "ab"},
         **{f"weighted {side}": _percent(row[f"effective_share_{side}"]) for side in "ab"},
         **{f"episodes {side}": row[f"episodes_{side}"] for side in "ab"},
