@@ -127,7 +127,8 @@ def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, 
     paths = [tmp_path / unit for unit in ("step", "episode")]
     for seed, path in enumerate(paths):
         run_to_end(path, config(schedule={"env_steps": 800}), logs=logs_by(path.name))
-        whole = document(seed, panel__id=path.name) | {"format": FORMAT}
+        shares = {"nominal": 0.98 - 0.13 * seed, "wheel_slip": 0.02 + 0.13 * seed}
+        whole = document(seed, panel__id=path.name, panel__strata=shares) | {"format": FORMAT}
         (path / "config.json").write_text(json.dumps(whole), "utf-8")
 
     def slipping(column: str) -> list[int]:
@@ -143,6 +144,7 @@ def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, 
     assert by_episode > 7 * by_step  # of one name, and not the same
     code, found = compared(capsys, *([str(path)] for path in paths), "--treatment", "mixture")
     assert code == 0
+    assert [difference["setting"] for difference in found["differences"]] == ["panel.id"]
     (check,) = [c for c in found["checks"] if c["name"] == "share of logs/wheel_slip"]
     drawn = slipping("condition")
     assert check["value"] == pytest.approx(max(drawn) / min(drawn))

@@ -254,10 +254,14 @@ def differences(first: Run, second: Run) -> list[Difference]:
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """What `config.json` says of a run, by dotted name."""
+    """Return what `config.json` says of a run, by dotted name.
+
+    Shares of strata are left out: `panel.id` stands for them, and two of one name are not the same.
+    """
     config = without_removed(run.document.get("config", {}))
     document = {**run.document, "config": config}
-    return dict(by_path({key: document[key] for key in document if key not in _NO_SETTING}))
+    settings = by_path({key: document[key] for key in document if key not in _NO_SETTING})
+    return {name: value for name, value in settings if not name.startswith("panel.strata.")}
 
 
 def kind_of(setting: str) -> Kind:
