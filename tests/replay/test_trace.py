@@ -87,7 +87,8 @@ def write_run(path: Path, panel: Panel) -> None:
             "condition",
             "behaviour_policy",
             "age_days",
-            "age_env_steps",
+            "age_gradient_steps",
+            "last_target_sync",
             "action",
             "reward",
         )

@@ -92,6 +92,8 @@ def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> No
     with Store(trained.store) as opened:
         conditions = dict(opened.sql("SELECT transition_id, condition FROM transitions").fetchall())
     for row in audit:
+        assert row["last_target_sync"] is None  # the library's, unknown to its buffer
+        assert 0 < row["age_gradient_steps"] <= row["gradient_step"]
         if row["source"] == "logs":
             at = place[row["transition_id"]]
             packed = np.array(panel.rows[at])

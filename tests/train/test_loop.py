@@ -377,6 +377,7 @@ def test_audit_rows_hold_what_the_row_was(undisturbed: Session) -> None:
             assert row["behaviour_policy"] in ("planner", "operator")
             stamp = shelf.stamp_ns[row["transition_id"] - 1000] / 86_400e9
             assert row["age_days"] == pytest.approx(10 - stamp)
+            assert row["age_gradient_steps"] == row["gradient_step"]  # since it could be drawn
         else:
             assert row["behaviour_policy"] == "dqn"
             assert row["age_env_steps"] >= 0

@@ -23,7 +23,7 @@ from restock.train.run.run_profile import profile_document
 
 FIELDS = (
     *("transition_id", "age_steps", "age_days", "condition"),
-    *("behavior_policy", "action", "reward", "target_sync_step"),
+    *("behavior_policy", "action", "reward", "target_sync_step", "gradient_step"),
 )
 
 
@@ -55,7 +55,37 @@ def test_every_sampled_row_is_a_record(run: Path) -> None:
         assert record.action == TASK.action_names[row["action"]]
         assert record.reward == row["reward"]
         assert record.target_sync_step == row["last_target_sync"]
-        assert (record.age_steps is None) == (row["source"] == "logs") != (record.age_days is None)
+        assert (record.gradient_step, record.age_steps) == (
+            row["gradient_step"],
+            row["age_gradient_steps"],
+        )
+        assert (record.age_days is None) == (row["source"] == "fresh")
+
+
+def test_one_clock_says_what_was_collected_before_the_last_sync(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hard = {"rule": "hard", "every": 30}
+    path = tmp_path / "hard"
+    run_to_end(path, config(schedule={"env_steps": 800}, target=hard))
+    before = "gradient_step - age_steps < target_sync_step"
+    query = f"SELECT source, {before} AS before, count(*) AS n FROM replay_audit GROUP BY ALL"
+    assert cli.main(["sql", str(path), query, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert {(row["source"], row["before"]) for row in found} == {
+        *(("logs", before) for before in (True, False)),  # until the first sync there was none
+        *(("fresh", before) for before in (True, False)),
+    }
+    for row in pq.read_table(path / "audit.parquet").to_pylist():
+        assert row["last_target_sync"] == (row["gradient_step"] - 1) // 30 * 30
+        if row["source"] == "fresh":  # the policy that acted is named by its updates
+            acted = row["gradient_step"] - row["age_gradient_steps"]
+            assert int(row["behaviour_version"]) == acted
+    records = replay_audit(path)
+    by_record = sum(
+        record.gradient_step - record.age_steps < record.target_sync_step for record in records
+    )
+    assert by_record == sum(row["n"] for row in found if row["before"])
 
 
 def test_fresh_rows_have_ids_of_their_own(run: Path) -> None:

@@ -123,13 +123,14 @@ class FeedRecord(Stateful):
         env_steps: int,
         batch: ReplayBatch,
         loss: Loss,
-        last_sync: int,
+        last_sync: int | None,
         *,
         tail: Tensor | None = None,
     ) -> None:
         """Keep the batch of gradient step `step` (from 1), and its audit rows if it is chosen.
 
         Inside the update loop: only what will not be there any more when the interval is closed.
+        `last_sync` is the update after which the target last moved; None: nobody tells.
         `tail` (B, 3) is the rows' action, reward and discount, where whoever learnt has them.
         """
         last = batch.rows if tail is None else tail
@@ -359,7 +360,7 @@ class FeedRecord(Stateful):
             ),
         )
 
-    def _audit(self, step: int, batch: ReplayBatch, last_sync: int) -> None:
+    def _audit(self, step: int, batch: ReplayBatch, last_sync: int | None) -> None:
         """Every row of the batch last kept: logged ones are written, fresh ones wait."""
         packed, logged = batch.rows.cpu().numpy(), batch.logged
         hashes, place = row_hashes(packed), np.arange(len(packed))
@@ -379,7 +380,7 @@ class FeedRecord(Stateful):
             }
 
         if logged and self.logs is not None and self._age_days is not None:
-            rows = logged_audit(self._logged.last, self.logs, self._age_days)
+            rows = logged_audit(self._logged.last, self.logs, self._age_days, step)
             self.run.append_columns("audit", whole(slice(logged), rows))
             if greedy is not None:
                 self._greedy.append(batch.log_rows, batch.log_stratum, greedy[:logged])

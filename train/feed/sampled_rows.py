@@ -196,8 +196,11 @@ def row_hashes(packed: NDArray[np.float32]) -> list[str]:
     return [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in packed]
 
 
-def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64]) -> Columns:
-    """Columns of the run's table `audit` for logged rows of one batch."""
+def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64], step: int) -> Columns:
+    """Return columns of the run's table `audit` for logged rows of the batch of update `step`.
+
+    They could be drawn since update 0: that is their age in updates.
+    """
     row = rows["row"]
     return {
         "source": "logs",
@@ -208,7 +211,7 @@ def logged_audit(rows: Arrays, logs: Logs, age_days: NDArray[np.float64]) -> Col
         "episode_step": None,
         "age_days": age_days[row],
         "age_env_steps": None,
-        "age_gradient_steps": None,
+        "age_gradient_steps": step,
         "stratum": [logs.strata[code] for code in rows["stratum"].tolist()],
         "condition": _names(logs.condition, row),
         "behaviour_policy": _names(logs.behaviour_policy, row),

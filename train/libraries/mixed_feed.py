@@ -258,7 +258,7 @@ class MixedFeed:
             td=torch.from_numpy(unknown if td is None else td),
             q=torch.from_numpy(unknown if q is None else q),
         )
-        self.record.batch(self.batches, self.env_steps, batch, loss, 0)
+        self.record.batch(self.batches, self.env_steps, batch, loss, last_sync=None)
         self._open += 1
         if self._open >= self.log_every:
             self._close_interval()

@@ -15,16 +15,20 @@ from restock.train.run.run import Run
 
 
 class ReplayAuditRecord(msgspec.Struct, frozen=True):
-    """One sampled transition, of a seeded sample of batches."""
+    """One sampled transition, of a seeded sample of batches.
+
+    It was collected before the last target sync if `gradient_step - age_steps < target_sync_step`.
+    """
 
     transition_id: int  # of a logged row as in the store; of a fresh row negative
-    age_steps: int | None  # of a fresh row: environment steps since it was collected
+    age_steps: int  # updates since it was collected; of a logged row since the run began
     age_days: float | None  # of a logged row: days before training began
     condition: str | None  # None: the episode of a fresh row had not ended with the run
     behavior_policy: str  # who acted
     action: str  # its name
     reward: float  # the n-step return
-    target_sync_step: int  # gradient step after which the target network had last moved
+    target_sync_step: int | None  # update after which the target last moved; None: not known
+    gradient_step: int  # update whose batch it was in
 
 
 class ReplayAudit(Sequence[ReplayAuditRecord]):

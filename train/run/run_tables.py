@@ -394,7 +394,12 @@ TABLES: dict[str, pa.Schema] = {
         ("episode_step", _I, "of a fresh row; of a logged one the store has it"),
         ("age_days", _F, "of a logged row, when training began (`created_ns` of config.json)"),
         ("age_env_steps", _I, "of a fresh row: environment steps since it was collected"),
-        ("age_gradient_steps", _I, "of a fresh row: updates since its action was chosen"),
+        (
+            "age_gradient_steps",
+            _I,
+            "of a fresh row: updates since its action was chosen; of a logged row, which could be "
+            "drawn from the start: updates since the run began, `gradient_step`",
+        ),
         ("stratum", _S, "stratum by which it was drawn"),
         (
             "condition",
@@ -412,7 +417,12 @@ TABLES: dict[str, pa.Schema] = {
         ("weight", _F, "importance weight"),
         ("q", _F, "Q(s, a) before the update"),
         ("td", _F, "Q(s, a) - target before the update"),
-        ("last_target_sync", _I, "gradient step after which the target network was last updated"),
+        (
+            "last_target_sync",
+            _I,
+            "gradient step after which the target network was last updated; null: in a run of "
+            "another library",
+        ),
         ("row_hash", _S, "checksum of the packed row, 16 hex digits; checked by `restock trace`"),
     ),
     "evaluations": _schema(
