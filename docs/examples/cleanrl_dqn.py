@@ -1,8 +1,12 @@
 """DQN in one file, in the style of CleanRL's `dqn.py`, on the native vector environment.
 
-    python docs/examples/cleanrl_dqn.py --steps 100000
+    python docs/examples/cleanrl_dqn.py --steps 200000
 
-Reference: V. Mnih et al., Human-level control through deep reinforcement learning (2015).
+The settings are the defaults of `restock train`; the comments name its keys (docs/train.md).
+Returns are of one step (`loss.n_step` is 3 there), and there is no teacher.
+
+References: V. Mnih et al., Human-level control through deep reinforcement learning (2015); H. van
+Hasselt et al., Deep Reinforcement Learning with Double Q-learning (2016).
 """
 
 import argparse
@@ -20,12 +24,14 @@ import restock  # noqa: F401 - registers restock/Warehouse-v0
 class QNetwork(nn.Module):
     def __init__(self, observation_size: int, actions: int) -> None:
         super().__init__()
-        self.network = nn.Sequential(
-            nn.Linear(observation_size, 120),
+        self.network = nn.Sequential(  # network.hidden, network.layer_norm
+            nn.Linear(observation_size, 256),
+            nn.LayerNorm(256),
             nn.ReLU(),
-            nn.Linear(120, 84),
+            nn.Linear(256, 256),
+            nn.LayerNorm(256),
             nn.ReLU(),
-            nn.Linear(84, actions),
+            nn.Linear(256, actions),
         )
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -37,14 +43,19 @@ def linear_schedule(start: float, end: float, duration: float, t: int) -> float:
 
 
 def main(
-    steps: int = 100_000,
-    num_envs: int = 16,
-    buffer_size: int = 100_000,
-    gamma: float = 0.99,
-    target_network_frequency: int = 500,
-    batch_size: int = 128,
-    learning_starts: int = 1000,
-    train_frequency: int = 4,
+    steps: int = 200_000,  # schedule.env_steps
+    num_envs: int = 32,  # env.num_envs
+    learning_rate: float = 1e-3,  # optimizer.learning_rate
+    buffer_size: int = 100_000,  # replay.ring_capacity
+    gamma: float = 0.99,  # loss.discount
+    tau: float = 0.005,  # target = {rule = "polyak", tau = 0.005}
+    batch_size: int = 128,  # replay.batch_size
+    start_e: float = 1.0,  # epsilon.start
+    end_e: float = 0.05,  # epsilon.end
+    exploration_steps: int = 20_000,  # epsilon.steps
+    learning_starts: int = 2000,  # schedule.warmup_env_steps
+    updates_per_env_step: float = 0.25,  # schedule.updates_per_env_step
+    huber_delta: float = 10.0,  # loss.huber_delta
     seed: int = 0,
 ) -> dict:
     rng = np.random.default_rng(seed)
@@ -58,7 +69,7 @@ def main(
     q_network = QNetwork(size, envs.single_action_space.n)
     target_network = QNetwork(size, envs.single_action_space.n)
     target_network.load_state_dict(q_network.state_dict())
-    optimizer = optim.Adam(q_network.parameters(), lr=2.5e-4)
+    optimizer = optim.Adam(q_network.parameters(), lr=learning_rate)
 
     buffer = {
         "obs": np.zeros((buffer_size, size), np.float32),
@@ -73,7 +84,7 @@ def main(
     obs, _ = envs.reset(seed=seed)
     for step in range(0, steps, num_envs):
         # ALGO LOGIC: epsilon-greedy actions
-        epsilon = linear_schedule(1.0, 0.05, 0.5 * steps, step)
+        epsilon = linear_schedule(start_e, end_e, exploration_steps, step)
         with torch.no_grad():
             actions = q_network(torch.as_tensor(obs)).argmax(dim=1).numpy()
         explore = rng.random(num_envs) < epsilon
@@ -100,20 +111,23 @@ def main(
 
         # ALGO LOGIC: training
         if step >= learning_starts:
-            for _ in range(max(1, num_envs // train_frequency)):
+            for _ in range(max(1, round(updates_per_env_step * num_envs))):
                 rows = rng.integers(min(filled, buffer_size), size=batch_size)
                 data = {name: torch.as_tensor(array[rows]) for name, array in buffer.items()}
                 with torch.no_grad():
-                    target_max = target_network(data["next_obs"]).amax(dim=1)
-                    td_target = data["reward"] + gamma * target_max * (1 - data["terminated"])
+                    best = q_network(data["next_obs"]).argmax(dim=1, keepdim=True)  # loss.double
+                    next_value = target_network(data["next_obs"]).gather(1, best)[:, 0]
+                    td_target = data["reward"] + gamma * next_value * (1 - data["terminated"])
                 old_value = q_network(data["obs"]).gather(1, data["action"][:, None])[:, 0]
-                loss = F.mse_loss(td_target, old_value)
+                loss = F.huber_loss(old_value, td_target, delta=huber_delta)
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
                 updates += 1
-                if updates % target_network_frequency == 0:
-                    target_network.load_state_dict(q_network.state_dict())
+                with torch.no_grad():
+                    pairs = zip(target_network.parameters(), q_network.parameters(), strict=True)
+                    for slow, fast in pairs:
+                        slow.lerp_(fast, tau)
     return {
         "env_steps": step + num_envs,
         "updates": updates,
@@ -126,5 +140,5 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, default=200_000)
     print(json.dumps(main(parser.parse_args().steps)))  # noqa: T201

@@ -1,13 +1,18 @@
 """Tianshou's collectors and DQN in the twin, unchanged; with --panel on logs and fresh rows.
 
-python docs/examples/tianshou_dqn.py --steps 100000
-python docs/examples/tianshou_dqn.py --panel panel/ --run runs/tianshou
+    python docs/examples/tianshou_dqn.py --steps 200000
+    python docs/examples/tianshou_dqn.py --panel panel/ --run runs/tianshou
+
+The settings are the defaults of `restock train`; the comments name its keys (docs/train.md). There
+is no warm-up and no teacher, and a hard target in place of Polyak averaging, as old in the mean:
+copied every 400 updates it is 200 old, which is 1 / tau.
 """
 
 import argparse
 import json
 
 import gymnasium as gym
+import torch
 from tianshou.algorithm import DQN
 from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
 from tianshou.algorithm.optim import AdamOptimizerFactory
@@ -21,8 +26,8 @@ from restock.train import MixtureVectorReplayBuffer
 
 
 def main(
-    steps: int = 100_000,
-    num_envs: int = 4,
+    steps: int = 200_000,
+    num_envs: int = 32,  # env.num_envs
     panel: str | None = None,
     run: str | None = None,
     seed: int = 0,
@@ -35,30 +40,45 @@ def main(
         model=Net(
             state_shape=observation_space.shape,
             action_shape=action_space.n,
-            hidden_sizes=[256, 256],
+            hidden_sizes=[256, 256],  # network.hidden
+            norm_layer=torch.nn.LayerNorm,  # network.layer_norm
         ),
         action_space=action_space,
-        eps_training=0.2,
     )
     algorithm = DQN(
-        policy=policy, optim=AdamOptimizerFactory(lr=3e-4), gamma=0.99, target_update_freq=500
+        policy=policy,
+        optim=AdamOptimizerFactory(lr=1e-3),  # optimizer.learning_rate
+        gamma=0.99,  # loss.discount
+        n_step_return_horizon=3,  # loss.n_step
+        is_double=True,  # loss.double
+        # loss.huber_delta; Tianshou does not use a panel's importance weights together with it
+        huber_loss_delta=10.0 if panel is None else None,
+        target_update_freq=400,  # target = {rule = "polyak", tau = 0.005}
     )
     if panel is None:
-        buffer = VectorReplayBuffer(100_000, num_envs)
+        buffer = VectorReplayBuffer(100_000, num_envs)  # replay.ring_capacity
     else:
         buffer = MixtureVectorReplayBuffer(100_000, num_envs, panel=panel, run=run, seed=seed)
     collector = Collector[CollectStats](algorithm, envs, buffer, exploration_noise=True)
     collector.reset()
+    first = 1.0 if panel is None else 0.2  # epsilon.start, without logs and with them
+
+    def explore(epoch: int, env_step: int) -> None:
+        done = min(env_step / 20_000, 1.0)  # epsilon.steps
+        policy.set_eps_training(first + done * (0.05 - first))  # epsilon.end
+
+    epochs = max(1, steps // 20_000)  # evaluation.every_env_steps
     result = algorithm.run_training(
         OffPolicyTrainerParams(
             training_collector=collector,
             test_collector=Collector[CollectStats](algorithm, tests),
             test_step_num_episodes=1,
-            max_epochs=max(1, steps // 10_000),
-            epoch_num_steps=min(steps, 10_000),
-            collection_step_num_env_steps=4 * num_envs,
-            update_step_num_gradient_steps_per_sample=0.25,
-            batch_size=128,
+            max_epochs=epochs,
+            epoch_num_steps=steps // epochs,
+            collection_step_num_env_steps=num_envs,  # then the updates that these are worth
+            update_step_num_gradient_steps_per_sample=0.25,  # schedule.updates_per_env_step
+            batch_size=128,  # replay.batch_size
+            training_fn=explore,
             show_progress=False,
             verbose=False,
         )
@@ -74,7 +94,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--panel")
     parser.add_argument("--run")
     given = parser.parse_args()

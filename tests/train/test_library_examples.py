@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ from support.stores import recording_transitions, write_store
 
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
+from restock.train.dqn.config import load_config
+from restock.train.libraries.library_arm import dqn_arguments, resolve
+from restock.train.twin.env.interface import AFTER_LOGS
 
 EXAMPLES = ROOT / "docs" / "examples"
 NEEDS = {
@@ -52,28 +56,86 @@ def test_every_example_is_run_and_explained() -> None:
     assert all(f"examples/{name}.py" in page for name in NEEDS)
 
 
+class Called(Exception):
+    """Raised in place of making a library's algorithm."""
+
+
+@pytest.mark.parametrize("name", ["sb3_dqn", "sb3_mixture"])
+def test_stable_baselines3_has_the_settings_of_the_default_recipe(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, given = example(name), {}
+
+    def algorithm(_: str, envs: int, **arguments: Any) -> None:
+        given.update(arguments, envs=envs)
+        raise Called
+
+    monkeypatch.setattr(module, "DQN", algorithm)
+    monkeypatch.setattr(module, "make_vec_env", lambda *_, n_envs, **__: n_envs)
+    with pytest.raises(Called):
+        module.main(*(["panel", "run"] if name == "sb3_mixture" else []))
+    config = resolve((), "sb3-dqn")
+    expected: dict[str, Any] = dqn_arguments(config) | {
+        "envs": config.env.num_envs,
+        "policy_kwargs": {"net_arch": list(config.network.hidden)},
+        "max_grad_norm": float("inf"),  # none, as in Restock
+    }
+    if name == "sb3_mixture":
+        expected["exploration_initial_eps"] = AFTER_LOGS
+        assert given["replay_buffer_kwargs"]["n_step"] == config.loss.n_step
+        own = inspect.signature(module.main).parameters["offline_updates"].default
+        assert own == config.schedule.offline_updates
+    else:
+        assert given["n_steps"] == config.loss.n_step
+    assert {key: given[key] for key in expected} == expected
+
+
+def test_the_single_file_dqn_has_the_settings_of_the_default_recipe() -> None:
+    own = inspect.signature(example("cleanrl_dqn").main).parameters
+    config = load_config(None)
+    expected = {
+        "steps": config.schedule.env_steps,
+        "num_envs": config.env.num_envs,
+        "learning_rate": config.optimizer.learning_rate,
+        "buffer_size": config.replay.ring_rows,
+        "gamma": config.loss.discount,
+        "tau": config.target.tau,
+        "batch_size": config.replay.batch_size,
+        "start_e": 1.0,
+        "end_e": config.epsilon.end,
+        "exploration_steps": config.epsilon.steps,
+        "learning_starts": config.schedule.warmup_env_steps,
+        "updates_per_env_step": config.schedule.updates_per_env_step,
+        "huber_delta": config.loss.huber_delta,
+        "seed": config.seed,
+    }
+    assert {name: parameter.default for name, parameter in own.items()} == expected
+
+
 @pytest.mark.long
 def test_stable_baselines3_dqn() -> None:
-    done = example("sb3_dqn").main(steps=320, num_envs=2)
+    done = example("sb3_dqn").main(steps=320, num_envs=4)
     assert done["env_steps"] == 320
-    assert done["updates"] >= 25
+    assert done["updates"] == (320 - 80) / 4  # from step 80 on
     assert isinstance(done["success"], bool)
 
 
 @pytest.mark.long
 def test_stable_baselines3_sac_on_the_continuous_face() -> None:
-    done = example("sb3_sac").main(steps=200, num_envs=2)
+    done = example("sb3_sac").main(steps=200, num_envs=4)
     assert done["env_steps"] == 200
-    assert done["updates"] >= 15
+    assert done["updates"] == (200 - 48) / 4  # from step 48 on
     speed, yaw_rate = done["command"]
     assert -0.4 <= speed <= 1.0
     assert -1.2 <= yaw_rate <= 1.2
 
 
 def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
-    done = example("sb3_mixture").main(str(panel), str(tmp_path / "run"), updates=20, steps=200)
-    assert done["env_steps"] >= 200
-    assert done["updates"] > 20
+    done = example("sb3_mixture").main(
+        str(panel), str(tmp_path / "run"), offline_updates=20, steps=200, num_envs=4
+    )
+    assert done["env_steps"] == 200
+    assert done["updates"] == 20 + (200 - 48) / 4
     assert (tmp_path / "run" / "strata.parquet").is_file()
 
 
@@ -81,16 +143,16 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("mixed", [True, False])
 def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) -> None:
     given = {"panel": str(panel), "run": str(tmp_path / "run")} if mixed else {}
-    done = example("tianshou_dqn").main(steps=96, num_envs=2, **given)
-    assert done["env_steps"] >= 96
-    assert done["update_steps"] >= 10
+    done = example("tianshou_dqn").main(steps=96, num_envs=4, **given)
+    assert done["env_steps"] == 96
+    assert done["update_steps"] == 96 / 4
     assert (tmp_path / "run" / "strata.parquet").is_file() == mixed
 
 
 @pytest.mark.long
 def test_a_single_file_dqn_on_the_native_vector_environment() -> None:
-    done = example("cleanrl_dqn").main(steps=2400, num_envs=8, target_network_frequency=50)
+    done = example("cleanrl_dqn").main(steps=2400, num_envs=8)
     assert done["env_steps"] == 2400
-    assert done["updates"] >= 400
+    assert done["updates"] == (2400 - 600) / 4
     assert done["episodes"] >= 8
     assert done["loss"] >= 0
