@@ -44,7 +44,7 @@ TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # of inputs that 
 DROVE = ("agent", "cloned", "planner")  # what came out, how the logs were driven, and a script
 BY_YEAR = (
     "SELECT robot, site, year(logged_time) AS year, count(*) AS rows,"
-    " count(DISTINCT episode_id) AS episodes, count(DISTINCT condition) AS conditions"
+    " count(DISTINCT episode_id) AS episodes, count(DISTINCT primary_condition) AS conditions"
     " FROM transitions GROUP BY ALL ORDER BY ALL"
 )
 Documents = Mapping[str, Any]  # stage of `restock start` -> what its verb printed
@@ -188,7 +188,7 @@ def rows_of(documents: Documents) -> dict[str, Any]:
         "recorded_min": round(sum(one["duration_s"] for one in good) / 60, 1),
         "rows": sum(one["transitions"] for one in good),
         "episodes": sum(one["episodes"] for one in good),
-        "conditions": {one["condition"]: one["rows"] for one in coverage if one["rows"]},
+        "conditions": {one["condition"]: one["rows_held"] for one in coverage if one["rows_held"]},
         "stood_in": dict(stood_in),
         "repeats": [one["path"] for one in good if one["repeats"]],
         "failed_audits": [

@@ -74,9 +74,11 @@ QUESTIONS = {
     "coverage": "FROM coverage",
     "coverage_by_condition": "FROM coverage_by_condition",
     "episodes": "SELECT ended, count(*), avg(success::INTEGER) FROM episodes GROUP BY ALL",
-    "one_column": "SELECT condition, avg(reward) FROM transitions GROUP BY ALL",
+    "one_column": "SELECT primary_condition, avg(reward) FROM transitions GROUP BY ALL",
     # Of one day, and of that day's files alone: what partitioning by day could save at most.
-    "one_day": f"SELECT condition, avg(reward) FROM transitions WHERE {ONE_DAY} GROUP BY ALL",
+    "one_day": (
+        f"SELECT primary_condition, avg(reward) FROM transitions WHERE {ONE_DAY} GROUP BY ALL"
+    ),
     "one_day_alone": "",
     "audit": "",
     "mix": "",

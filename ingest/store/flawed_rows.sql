@@ -13,7 +13,7 @@ FROM (
         OR reward IS NULL
         OR terminated IS NULL
         OR truncated IS NULL
-        OR condition IS NULL
+        OR primary_condition IS NULL
         OR conditions IS NULL
         OR behaviour_policy IS NULL
         OR stamp_ns IS NULL

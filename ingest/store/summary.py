@@ -24,7 +24,7 @@ from restock.ingest.store.repeated import distinctive, sketch
 from restock.ingest.task.schema import COLUMNS
 
 ENDS = b"restock.episode_ends"  # key in the rows' metadata
-VERSION = 3  # of summary.sql: a summary by another one is not used
+VERSION = 4  # of summary.sql: a summary by another one is not used
 # Of whole episodes that are looked at together: bounds memory. Each time costs 40 ms of planning.
 STRETCH_ROWS = 8192
 # Tables whose rows are made of one episode's each, by queries of their names, and their order.
@@ -69,27 +69,28 @@ TABLES = {  # of summary.sql, and `distinctive_rows`; each a column
         action=pa.int16(),
         zone=_TEXT,
         behaviour_policy=_TEXT,
-        rows=_COUNT,
+        rows_held=_COUNT,
+        primary_rows=_COUNT,
         rewards=_COUNT,
         reward_sum=_NUMBER,
         known_ends=_COUNT,
         terminated=_COUNT,
-        episodes=_COUNT,
+        episodes_held=_COUNT,
         successes=_COUNT,
         goal_episodes=_COUNT,
     ),
     "condition_episodes": _rows_of(
         condition=_TEXT,
-        episodes=_COUNT,
-        rows=_COUNT,
+        episodes_held=_COUNT,
+        rows_held=_COUNT,
         squared_rows=_COUNT,
         successes=_COUNT,
         goal_episodes=_COUNT,
         returns=_COUNT,
         return_sum=_NUMBER,
+        primary_rows=_COUNT,
+        primary_episodes=_COUNT,
     ),
-    "held_cells": _rows_of(condition=_TEXT, action=pa.int16(), rows=_COUNT),
-    "held_episodes": _rows_of(condition=_TEXT, episodes=_COUNT),
     "measured_signals": _rows_of(episode_id=_TEXT, signal=_TEXT, value=_NUMBER, steps=_COUNT),
     "flawed_rows": _rows_of(
         transition_id=_COUNT,
@@ -134,7 +135,7 @@ def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
     }
     with _database().cursor() as connection:  # with temporary tables of its own
         connection.register("recordings", manifest)
-        rows = _complete(rows)
+        rows = _complete(rows).rename_columns({"condition": "primary_condition"})  # as rows.sql
         tables |= _of_episodes(connection, rows, custom=_has_custom_signals(manifest))
         connection.register("transitions", rows.drop_columns(list(WIDE)))
         connection.execute(_definitions())

@@ -11,8 +11,8 @@ SELECT
     ) AS handover
 FROM (
     SELECT
-        episode_id, episode_index, step_index, stamp_ns, action, reward, terminated, truncated, condition,
-        conditions, behaviour_policy, zone, bumped, goal_source, clearance_m, progress_m
+        episode_id, episode_index, step_index, stamp_ns, action, reward, terminated, truncated,
+        primary_condition, conditions, behaviour_policy, zone, bumped, goal_source, clearance_m, progress_m
     FROM transitions
 )
 CROSS JOIN (
@@ -35,6 +35,15 @@ FROM steps
 GROUP BY episode_id
 ORDER BY min(step_index), episode_index;
 
+-- A line for each condition that holds in a step, or one, nominal, if none does.
+CREATE TEMP TABLE held AS
+SELECT *, unnest(conditions) AS condition
+FROM steps
+UNION ALL
+SELECT *, primary_condition
+FROM steps
+WHERE coalesce(len(conditions), 0) < 1;
+
 -- Episodes do not reach over recordings: numbers of distinct ones add up.
 CREATE TEMP TABLE cells AS
 SELECT
@@ -42,15 +51,16 @@ SELECT
     action,
     zone,
     behaviour_policy,
-    count(*) AS rows,
+    count(*) AS rows_held,
+    count(*) FILTER (condition = primary_condition) AS primary_rows,
     count(reward) AS rewards,
     coalesce(sum(CAST(reward AS DOUBLE)), 0) AS reward_sum,
     count(terminated) AS known_ends,
     count(*) FILTER (terminated) AS terminated,
-    count(DISTINCT episode_id) AS episodes,
+    count(DISTINCT episode_id) AS episodes_held,
     count(DISTINCT episode_id) FILTER (success) AS successes,
     count(DISTINCT episode_id) FILTER (success IS NOT NULL) AS goal_episodes
-FROM steps
+FROM held
 JOIN (SELECT episode_id, success FROM episode_rows) USING (episode_id)
 GROUP BY condition, action, zone, behaviour_policy
 ORDER BY ALL;
@@ -58,25 +68,20 @@ ORDER BY ALL;
 CREATE TEMP TABLE condition_episodes AS
 SELECT
     condition,
-    count(*) AS episodes,
-    CAST(sum(n) AS BIGINT) AS rows,
+    count(*) AS episodes_held,
+    CAST(sum(n) AS BIGINT) AS rows_held,
     CAST(sum(n * n) AS BIGINT) AS squared_rows,
     count(*) FILTER (success) AS successes,
     count(success) AS goal_episodes,
     count(return) AS returns,
-    coalesce(sum(return), 0) AS return_sum
-FROM (SELECT condition, episode_id, count(*) AS n FROM steps GROUP BY condition, episode_id)
+    coalesce(sum(return), 0) AS return_sum,
+    CAST(sum(primary_n) AS BIGINT) AS primary_rows,
+    count(*) FILTER (primary_n > 0) AS primary_episodes
+FROM (
+    SELECT condition, episode_id, count(*) AS n, count(*) FILTER (condition = primary_condition) AS primary_n
+    FROM held
+    GROUP BY condition, episode_id
+)
 JOIN (SELECT episode_id, success, return FROM episode_rows) USING (episode_id)
 GROUP BY condition
 ORDER BY ALL;
-
-CREATE TEMP TABLE held AS
-SELECT episode_id, unnest(conditions) AS condition, action FROM steps
-UNION ALL
-SELECT episode_id, condition, action FROM steps WHERE condition = 'nominal';
-
-CREATE TEMP TABLE held_cells AS
-SELECT condition, action, count(*) AS rows FROM held GROUP BY condition, action ORDER BY ALL;
-
-CREATE TEMP TABLE held_episodes AS
-SELECT condition, count(DISTINCT episode_id) AS episodes FROM held GROUP BY condition ORDER BY ALL;

@@ -193,9 +193,10 @@ def _of_query(
     # Episodes in the order they were driven, where the query says; else by their name.
     driven = ["recording_id", "episode_index"]
     order = [*(driven if set(driven) <= set(columns) else []), "episode_id", "step_index"]
-    wanted = dict.fromkeys(
-        (*REQUIRED, *(COMMAND if continuous else ()), *(c for c in CARRIED if c in columns))
-    )
+    carried = {name: name for name in CARRIED if name in columns}
+    if "primary_condition" in columns:
+        carried["condition"] = "primary_condition AS condition"
+    wanted = (*REQUIRED, *(COMMAND if continuous else ()), *carried.values())
     relation = run_query(
         connection,
         f"SELECT {', '.join(wanted)} FROM ({text}) ORDER BY {', '.join(order)}",

@@ -80,11 +80,11 @@ FULL JOIN numbered_b AS other USING (recording_id, start_ns, place);
 -- Rows of both, where one was written again: by id, else by recording and stamp.
 CREATE TEMP TABLE row_pairs AS
 WITH of_a AS (
-    SELECT transition_id, recording_id, stamp_ns, episode_id, condition, conditions
+    SELECT transition_id, recording_id, stamp_ns, episode_id, primary_condition AS condition, conditions
     FROM a.transitions
     WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
 ), of_b AS (
-    SELECT transition_id, recording_id, stamp_ns, episode_id, condition, conditions
+    SELECT transition_id, recording_id, stamp_ns, episode_id, primary_condition AS condition, conditions
     FROM b.transitions
     WHERE recording_id IN (SELECT recording_id FROM recording_pairs WHERE change = 'written again')
 ), by_id AS (

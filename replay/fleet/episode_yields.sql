@@ -44,7 +44,7 @@ CREATE OR REPLACE TEMP TABLE yield_cells AS
 SELECT
     number,
     -- All that hold, of which a cell names one.
-    coalesce(nullif(array_to_string(conditions, ','), ''), condition, '') AS condition,
+    coalesce(nullif(array_to_string(conditions, ','), ''), primary_condition, '') AS condition,
     coalesce(zone, '') AS zone,
     action,
     coalesce(robot, '') AS robot,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
@@ -46,6 +46,7 @@ class Gap:
     needed: float
     there: float
     found: F64  # (E,) of each episode of the store, in rows or episodes
+    action_name: str | None = None  # of the cell's action; None: it has none, or tasks differ
     thinnest: tuple[str, ...] = ()  # the zones that are furthest below their part of what is needed
 
     @property
@@ -100,6 +101,13 @@ def find_gaps(
     if min_rows:
         gaps += _of_cells(yields, store.conditions(), min_rows, by)
     gaps.sort(key=lambda gap: (gap.counted, -gap.missing, str(gap.cell)))
+    named = dict(
+        store.sql(
+            "SELECT action, any_value(name) FROM actions"
+            " GROUP BY ALL HAVING count(DISTINCT name) = 1"
+        ).fetchall()
+    )
+    gaps = [replace(gap, action_name=named.get(gap.cell.get("action"))) for gap in gaps]
     return yields, [gap for gap in gaps if gap.missing > 0]
 
 
@@ -151,7 +159,7 @@ def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
         needed = line.rows + line.missing_rows
         cell: dict[str, str | int] = {"stratum": line.name}
         thin = _thinnest(plan, code, needed)
-        gaps.append(Gap(asked_by, cell, "rows", needed, line.rows, found, thin))
+        gaps.append(Gap(asked_by, cell, "rows", needed, line.rows, found, thinnest=thin))
     return gaps
 
 
@@ -173,10 +181,9 @@ def _of_audits(
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(
-        "SELECT condition, rows_held, episodes_held, episodes, effective_episodes"
-        " FROM coverage_by_condition"
+        "SELECT condition, rows_held, episodes_held, effective_episodes FROM coverage_by_condition"
     ).fetchall()
-    for condition, rows, held_in, episodes, effective in lines:
+    for condition, rows, episodes, effective in lines:
         if rows is None:  # unknown of every recording: no drive of these robots brings any
             continue
         found = yields.rows_of({"condition": condition})
@@ -185,9 +192,9 @@ def _of_audits(
         cell: dict[str, str | int] = {"condition": condition}
         by = "audit rare_condition"
         gaps.append(Gap(by, cell, "rows", asked.get("min_rows", 0), rows, found))
-        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), held_in, met))
+        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), episodes, met))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
-        if effective and effective < least:  # 0 of one that names no row
+        if effective and effective < least:  # 0: it holds in no row
             # As many more as would do if they were as uneven as those that there are.
             needed = math.ceil(least * episodes / effective)
             by = "audit few_effective_episodes"
@@ -195,7 +202,7 @@ def _of_audits(
     least = limits["missing_cells"].get("min_rows", 0)
     install_named(connection, "cells_below")
     cells = connection.execute("FROM cells_below(?)", [least]).fetchall() if least else []
-    for condition, action, _, _, rows in cells:
+    for condition, action, *_, rows in cells:
         cell = {"condition": condition, "action": action}
         gaps.append(Gap("audit missing_cells", cell, "rows", least, rows, yields.rows_of(cell)))
     return gaps

@@ -29,7 +29,7 @@ from restock.replay.store.query import values
 from restock.replay.store.store import Store
 
 # Columns of `transitions` whose values' shares are compared, as far as both stores have them.
-SHARES_OF = ("condition", "zone", "behaviour_policy", "robot", "site", "shift")
+SHARES_OF = ("primary_condition", "zone", "behaviour_policy", "robot", "site", "shift")
 # Where and when, which shares of zones say.
 _NOT_COMPARED = ("stamp_ns", "pose_stamp_ns", "pose_x_m", "pose_y_m", "pose_yaw_rad")
 Rows = list[dict[str, Any]]

@@ -40,7 +40,7 @@ from restock.replay.store.store import Store, StoredProfile, corrected_versions,
 _NEEDED = (
     *("transition_id", "recording_id", "episode_id", "episode_index", "step_index"),
     *("observation", "action", "reward", "next_observation", "terminated", "truncated"),
-    *("condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
+    *("primary_condition", "conditions", "zone", "behaviour_policy", "behaviour_version"),
     *("action_probability", "stamp_ns", "pose_x_m", "pose_y_m", "task_hash"),
 )
 
@@ -97,7 +97,12 @@ def open_source(
         return
     with duckdb.connect() as connection:
         _register(connection, transitions)
-        connection.execute("CREATE VIEW transitions AS SELECT *, stamp_ns AS logged_ns FROM given")
+        # A store's Parquet and `transition_schema` say `condition`, its view `primary_condition`.
+        as_stored = "primary_condition" not in map(str.casefold, connection.table("given").columns)
+        renamed = "RENAME (condition AS primary_condition)" if as_stored else ""
+        connection.execute(
+            f"CREATE VIEW transitions AS SELECT * {renamed}, stamp_ns AS logged_ns FROM given"
+        )
         if conditions is None:
             conditions = _named_conditions(connection)
 
@@ -120,9 +125,12 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
         what = f"transitions must be a Store or a table, got {repr(given)[:80]}"
         raise ArgumentError(what, remedy=remedy) from error
     kinds = {name.casefold(): kind for name, kind in _kinds(connection.table("given")).items()}
+    if "condition" in kinds:
+        kinds.setdefault("primary_condition", kinds["condition"])
     if lacking := [name for name in _NEEDED if name not in kinds]:
         raise StoreError(f"it has no {', '.join(lacking)}", where=where, remedy=remedy)
     fit = _kinds(connection.from_arrow(transition_schema(1).empty_table()))
+    fit["primary_condition"] = fit["condition"]
     for name in _NEEDED:
         if kinds[name] != fit[name] and not kinds[name].endswith("null"):
             what = f"{name} must be {fit[name]}, not {kinds[name]}"

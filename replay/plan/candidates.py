@@ -23,6 +23,7 @@ from restock.replay.mixture.mixture import Mixture
 from restock.replay.plan.rows_in_order import RowsInOrder
 from restock.replay.plan.strata import ResolvedStratum
 from restock.replay.store.parquet_views import damage
+from restock.replay.store.query import hint
 
 META_COLUMNS = (
     *("transition_id", "recording_id", "episode_id", "step_index", "stamp_ns", "logged_ns"),
@@ -45,10 +46,9 @@ STORE_COLUMN = "mixture_store"
 def meta_columns(connection: duckdb.DuckDBPyConnection) -> str:
     """META_COLUMNS of the connection's `transitions`, for a SELECT."""
     has = connection.sql("FROM transitions LIMIT 0").columns
-    return ", ".join(
-        f"NULL::VARCHAR AS {name}" if name in LATER and name not in has else name
-        for name in META_COLUMNS
-    )
+    named = dict.fromkeys((name for name in LATER if name not in has), "NULL::VARCHAR")
+    named["condition"] = "primary_condition"
+    return ", ".join(f"{named[n]} AS {n}" if n in named else n for n in META_COLUMNS)
 
 
 def read_candidates(
@@ -100,7 +100,7 @@ def read_candidates(
             source = f"(SELECT * REPLACE ({_CERTAIN} AS conditions) FROM transitions)"
     query = (
         f"SELECT {meta_columns(connection)}, task_hash, episode_index, ({store})::TINYINT AS store,"
-        " coalesce(condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
+        " coalesce(primary_condition, '') <> '' AND conditions IS NOT NULL AS labelled,"
         f" {has_uncertain} AS uncertain, {tests} FROM {source}"
     )
     try:
@@ -146,6 +146,7 @@ def _blame(
             raise ConfigError(
                 f"its SQL does not run over `transitions`: {str(cause).splitlines()[0]}",
                 where=f"mixture, {place}",
+                remedy=hint(cause),
             ) from cause
 
 

@@ -107,7 +107,8 @@ def capacity_of_rows(transitions: pa.Table) -> Capacity:
     """The same of rows in memory: of a panel (`panel.meta`), which is what a run is fed."""
     macros = files("restock.replay.store").joinpath("capacity.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
-        connection.register("transitions", transitions.select(list(_COLUMNS)))
+        rows = transitions.select(list(_COLUMNS)).rename_columns({"condition": "primary_condition"})
+        connection.register("transitions", rows)
         connection.execute(macros)
         return recommend_capacity(connection)
 

@@ -4,7 +4,7 @@
 CREATE OR REPLACE MACRO capacity_curve() AS TABLE
 WITH ranked AS (
     SELECT
-        condition,
+        primary_condition AS condition,
         zone,
         action,
         episode_id,
@@ -45,7 +45,7 @@ ORDER BY capacity;
 CREATE OR REPLACE MACRO capacity_needed(cells_share, least_episodes) AS TABLE
 WITH ranked AS (
     SELECT
-        condition,
+        primary_condition AS condition,
         zone,
         action,
         episode_id,

@@ -26,6 +26,8 @@ from restock.words import between
 BEGIN = "<!-- columns: written by `python -m restock.replay.store.column_docs docs/sql.md` -->"
 END = "<!-- end of columns -->"
 
+HELD = "held_conditions"  # has every column of `transitions`, and `condition`
+
 # A name's ending -> its unit. Longer endings first.
 UNITS = (
     ("_mps2", "m/s²"),
@@ -55,7 +57,11 @@ def column_docs() -> dict[tuple[str, str], str]:
         for column, text in table.items()
         if column != "doc"
     }
-    meanings |= {("transitions", column.name): column.meaning for column in COLUMNS}
+    meanings |= {
+        ("transitions", column.name): column.meaning
+        for column in COLUMNS
+        if column.name != "condition"  # rows.sql has another name for it
+    }
     meanings |= {("recordings", column.name): column.meaning for column in RECORDING_COLUMNS}
     meanings |= {
         ("frames", column.name): column.meaning for column in FRAME_COLUMNS if column.name != "data"
@@ -74,6 +80,9 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
     for name, own_unit, meaning, topic, path in _custom(connection):
         docs["transitions", name] = meaning or f"{path} of {topic}"
         own_units["transitions", name] = own_unit
+    for view, column in [key for key in docs if key[0] == "transitions"]:
+        docs.setdefault((HELD, column), docs[view, column])
+        own_units[HELD, column] = own_units.get((view, column), "")
     columns = connection.sql(
         "SELECT table_name, column_name, data_type FROM duckdb_columns()"
         " WHERE NOT internal AND table_name NOT LIKE 'stored_%' ORDER BY table_name, column_index"
@@ -124,10 +133,11 @@ def markdown() -> str:
         rows = connection.sql("FROM columns").fetchall()
     parts = []
     for view, doc in view_docs().items():
-        parts.append(f"### {view}\n\n{doc[0].upper() + doc[1:]}.\n")
+        doc += ". It has the columns of `transitions`, and" if view == HELD else ""
+        parts.append(f"### {view}\n\n{doc[0].upper() + doc[1:]}{':' if view == HELD else '.'}\n")
         parts.append("| column | type | unit | meaning |\n| --- | --- | --- | --- |")
         for of_view, column, kind, of_unit, meaning in rows:
-            if of_view == view:
+            if of_view == view and (view != HELD or column == "condition"):
                 kind = "STRUCT(…)[]" if kind.startswith("STRUCT") else kind
                 kind = "FLOAT[D]" if column.endswith("observation") else kind
                 line = f"| {column} | {kind} | {of_unit} | {meaning} |"

@@ -1,12 +1,10 @@
--- The columns of `coverage_by_condition`, from `seen`, `by_episode` and `held` of each condition. Part of
--- two statements: the view that scans, and the one over summaries.
+-- The columns of `coverage_by_condition`, from `seen` and `by_episode` of each condition. Part of two
+-- statements: the view that scans, and the one over summaries.
 SELECT
     condition,
     timing,
-    coalesce(rows, least) AS rows,
-    coalesce(rows, least) / nullif(sum(rows) OVER (), 0) AS share,
-    coalesce(episodes, least) AS episodes,
     coalesce(rows_held, least) AS rows_held,
+    coalesce(rows_held, least) / nullif(sum(primary_rows) OVER (), 0) AS held_share,
     coalesce(episodes_held, least) AS episodes_held,
     coalesce(effective_episodes, least) AS effective_episodes,
     success_share,
@@ -16,11 +14,12 @@ SELECT
     coalesce(recordings, least) AS recordings,
     coalesce(actions, least) AS actions,
     coalesce(zones, least) AS zones,
-    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies
+    coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies,
+    coalesce(primary_rows, least) AS primary_rows,
+    coalesce(primary_rows, least) / nullif(sum(primary_rows) OVER (), 0) AS primary_share
 FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
-FULL JOIN held USING (condition)
 LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
     USING (condition)
-ORDER BY rows DESC, condition
+ORDER BY rows_held DESC, condition

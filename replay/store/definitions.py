@@ -54,7 +54,6 @@ HELD = (
     "conditions",
     "actions",
     "untold_conditions",
-    "held_conditions",
 )
 FEW_ROWS = 100_000  # of about 1 kB
 FEW_SUMMARISED_ROWS = 2_000_000  # of about 50 bytes

@@ -2,9 +2,9 @@
 
 -- Condition x action cells with fewer than `minimum` rows, empty ones included.
 CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
-SELECT condition, action, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
-FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
-CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
+FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
+CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
 LEFT JOIN (SELECT condition, action, count(*) AS rows FROM held_conditions GROUP BY ALL)
     USING (condition, action)
 ANTI JOIN untold_conditions USING (condition)
@@ -15,19 +15,19 @@ ORDER BY condition, action;
 CREATE OR REPLACE MACRO ages_at(moment) AS TABLE
 SELECT
     condition,
-    count(*) AS rows,
+    count(*) AS rows_held,
     (epoch_ns(moment) - max(logged_ns)) / 86400e9 AS age_min_days,
     (epoch_ns(moment) - quantile_disc(logged_ns, 0.5)) / 86400e9 AS age_median_days,
     (epoch_ns(moment) - min(logged_ns)) / 86400e9 AS age_max_days
-FROM transitions
+FROM held_conditions
 GROUP BY condition
-ORDER BY rows DESC, condition;
+ORDER BY rows_held DESC, condition;
 
 -- Rows whose observation and action are the same as another's after rounding.
 CREATE OR REPLACE MACRO near_duplicates(decimals) AS TABLE
 SELECT
     min(transition_id) AS transition_id,
-    any_value(condition) AS condition,
+    any_value(primary_condition) AS primary_condition,
     any_value(action) AS action,
     count(*) AS copies
 FROM transitions

@@ -233,7 +233,7 @@ def interruptible(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -
 
 def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
     """DuckDB's error as one worth reading: of the query, or of a file that it could not read."""
-    said = QueryError(_message(error), where=where, remedy=_hint(error))
+    said = QueryError(_message(error), where=where, remedy=hint(error))
     return damage(error, where=where) or said
 
 
@@ -244,7 +244,19 @@ def _message(error: duckdb.Error) -> str:
     return cause.partition(": ")[2] if of_python else text
 
 
-def _hint(error: duckdb.Error) -> str | None:
+# `WHERE condition = …` of `transitions`, which has none: a row can hold several.
+_NO_CONDITION = re.compile(r'(?:Referenced column|column named) "condition"')
+OF_CONDITIONS = (
+    "a row can hold several conditions: `FROM held_conditions WHERE condition = '…'` has every row"
+    " that holds it, as has `FROM transitions WHERE list_contains(conditions, '…')`;"
+    " `primary_condition` is the one of highest priority alone"
+)
+
+
+def hint(error: duckdb.Error) -> str | None:
+    """What to ask instead, if a name was not found."""
+    if isinstance(error, duckdb.BinderException) and _NO_CONDITION.search(str(error)):
+        return OF_CONDITIONS
     if isinstance(error, duckdb.CatalogException | duckdb.BinderException):
         return '`restock sql PATH "FROM columns"` lists every view and column'
     return None

@@ -1,11 +1,11 @@
 -- What each recording has of each cell, from the rows. Where manifests keep it (summaries.sql), nothing is
 -- scanned. Not in Spark's list of views.
 CREATE OR REPLACE VIEW recording_cells AS
-SELECT recording_id, condition, action, behaviour_policy, count(*) AS rows
+SELECT recording_id, primary_condition AS condition, action, behaviour_policy, count(*) AS rows
 FROM transitions
 GROUP BY ALL;
 
 CREATE OR REPLACE VIEW recording_conditions AS
-SELECT recording_id, condition, count(*) AS rows, count(DISTINCT episode_id) AS episodes
+SELECT recording_id, primary_condition AS condition, count(*) AS rows, count(DISTINCT episode_id) AS episodes
 FROM transitions
 GROUP BY ALL;

@@ -39,11 +39,14 @@ FROM (
 )
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 
--- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time.
+-- Stamps can be a simulator's, which begin at zero: logged_ns is the same moment by log time. What the
+-- Parquet calls `condition` is one label a row, by priority: a filter on it would leave out the rows that
+-- hold the condition beside one of higher priority, so here its name says what it is.
 CREATE OR REPLACE VIEW transitions AS
 SELECT
     stored.*
-    REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation),
+    REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation)
+    RENAME (condition AS primary_condition),
     stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns,
     make_timestamp(stamp_ns // 1000) AS stamp_time,
     make_timestamp((stamp_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_time,

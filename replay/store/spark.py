@@ -143,6 +143,7 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
         later = (sql for column, sql in _LATER[name].items() if column not in table.columns)
         kept = [column for column in table.columns if column not in SUMMARY_SCHEMA.names]
         table = table.selectExpr(*(kept if len(kept) < len(table.columns) else "*"), *later)
+        table = table.withColumnRenamed("condition", "primary_condition")  # as rows.sql does
         table.createOrReplaceTempView(f"stored_{name}")
     for statement in statements():
         session.sql(statement)

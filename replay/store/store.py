@@ -27,7 +27,7 @@ from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import RETENTION_HOURS
-from restock.ingest.task.conditions import Condition
+from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.interrupts import interrupts_raised
@@ -189,6 +189,11 @@ class Store:
         if not rows:
             return ()
         return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
+
+    def priority(self) -> list[str]:
+        """Names of the conditions, the highest priority first; nominal is the last."""
+        held = sorted(self.conditions(), key=lambda condition: (condition.priority, condition.name))
+        return [*(condition.name for condition in held), NOMINAL]
 
     def exposures(self) -> tuple[Condition, ...]:
         """The exposures listed beside them, of the newest ingest; an older store has none."""

@@ -43,19 +43,27 @@ CREATE OR REPLACE VIEW coverage AS
 SELECT
     cell.condition AS condition,
     cell.action AS action,
+    any_value(action_name) AS action_name,
     cell.zone AS zone,
     cell.behaviour_policy AS behaviour_policy,
-    CAST(sum(cell.rows) AS BIGINT) AS rows,
-    sum(cell.rows) / sum(sum(cell.rows)) OVER () AS share,
-    CAST(sum(cell.episodes) AS BIGINT) AS episodes,
+    CAST(sum(cell.rows_held) AS BIGINT) AS rows_held,
+    sum(cell.rows_held) / sum(sum(cell.primary_rows)) OVER () AS held_share,
+    CAST(sum(cell.episodes_held) AS BIGINT) AS episodes_held,
     sum(cell.reward_sum) / nullif(sum(cell.rewards), 0) AS reward_mean,
     sum(cell.terminated) / nullif(sum(cell.known_ends), 0) AS terminal_fraction,
-    sum(cell.successes) / nullif(sum(cell.goal_episodes), 0) AS success_share
+    sum(cell.successes) / nullif(sum(cell.goal_episodes), 0) AS success_share,
+    CAST(sum(cell.primary_rows) AS BIGINT) AS primary_rows,
+    sum(cell.primary_rows) / sum(sum(cell.primary_rows)) OVER () AS primary_share
 FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
 SEMI JOIN recordings USING (ingest_id)
+LEFT JOIN (
+    SELECT action, CASE WHEN count(DISTINCT name) = 1 THEN min(name) END AS action_name
+    FROM actions
+    GROUP BY action
+) AS named ON named.action = cell.action
 GROUP BY ALL
 UNION ALL
-SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
 FROM untold_conditions
 WHERE kind = 'outcome' AND condition NOT IN (
     SELECT cell.condition
@@ -68,40 +76,28 @@ CREATE OR REPLACE VIEW coverage_by_condition AS
 WITH seen AS (
     SELECT
         cell.condition AS condition,
-        CAST(sum(cell.rows) AS BIGINT) AS rows,
+        CAST(sum(cell.rows_held) AS BIGINT) AS rows_held,
         count(DISTINCT ingest_id) AS recordings,
         count(DISTINCT cell.action) AS actions,
         count(DISTINCT cell.zone) AS zones,
         list_sort(list(DISTINCT cell.behaviour_policy)) AS behaviour_policies,
         sum(cell.reward_sum) / nullif(sum(cell.rewards), 0) AS reward_mean,
-        sum(cell.terminated) / nullif(sum(cell.known_ends), 0) AS terminal_fraction
+        sum(cell.terminated) / nullif(sum(cell.known_ends), 0) AS terminal_fraction,
+        CAST(sum(cell.primary_rows) AS BIGINT) AS primary_rows
     FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
     SEMI JOIN recordings USING (ingest_id)
     GROUP BY ALL
 ), by_episode AS (
     SELECT
         part.condition AS condition,
-        CAST(sum(part.episodes) AS BIGINT) AS episodes,
-        CAST(sum(part.rows) AS DOUBLE) * sum(part.rows) / sum(part.squared_rows) AS effective_episodes,
+        CAST(sum(part.episodes_held) AS BIGINT) AS episodes_held,
+        CAST(sum(part.rows_held) AS DOUBLE) * sum(part.rows_held) / sum(part.squared_rows)
+            AS effective_episodes,
         sum(part.successes) / nullif(sum(part.goal_episodes), 0) AS success_share,
         sum(part.return_sum) / nullif(sum(part.returns), 0) AS return_mean
     FROM (SELECT ingest_id, unnest(condition_episodes) AS part FROM stored_summaries)
     SEMI JOIN recordings USING (ingest_id)
     GROUP BY ALL
-), held AS (
-    SELECT *
-    FROM (
-        SELECT cell.condition AS condition, CAST(sum(cell.rows) AS BIGINT) AS rows_held
-        FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
-        SEMI JOIN recordings USING (ingest_id)
-        GROUP BY ALL
-    )
-    FULL JOIN (
-        SELECT part.condition AS condition, CAST(sum(part.episodes) AS BIGINT) AS episodes_held
-        FROM (SELECT ingest_id, unnest(held_episodes) AS part FROM stored_summaries)
-        SEMI JOIN recordings USING (ingest_id)
-        GROUP BY ALL
-    ) USING (condition)
 )
 -- include: coverage_columns.sql
 ;
@@ -112,19 +108,21 @@ SELECT
     cell.condition AS condition,
     cell.action AS action,
     cell.behaviour_policy AS behaviour_policy,
-    CAST(sum(cell.rows) AS BIGINT) AS rows
+    CAST(sum(cell.primary_rows) AS BIGINT) AS rows
 FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
 JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id)
+WHERE cell.primary_rows > 0
 GROUP BY ALL;
 
 CREATE OR REPLACE VIEW recording_conditions AS
 SELECT
     recording_id,
     part.condition AS condition,
-    part.rows AS rows,
-    part.episodes AS episodes
+    part.primary_rows AS rows,
+    part.primary_episodes AS episodes
 FROM (SELECT ingest_id, unnest(condition_episodes) AS part FROM stored_summaries)
-JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
+JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id)
+WHERE part.primary_rows > 0;
 
 CREATE OR REPLACE VIEW measured_signals AS
 SELECT
@@ -170,12 +168,12 @@ JOIN (SELECT ingest_id, recording_id FROM recordings) USING (ingest_id);
 
 CREATE OR REPLACE MACRO cells_below(minimum) AS TABLE
 WITH held AS (
-    SELECT cell.condition AS condition, cell.action AS action, CAST(sum(cell.rows) AS BIGINT) AS rows
-    FROM (SELECT ingest_id, unnest(held_cells) AS cell FROM stored_summaries)
+    SELECT cell.condition AS condition, cell.action AS action, CAST(sum(cell.rows_held) AS BIGINT) AS rows
+    FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
     SEMI JOIN recordings USING (ingest_id)
     GROUP BY ALL
 )
-SELECT condition, action, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps, coalesce(rows, 0) AS rows
 FROM (
     SELECT condition FROM conditions
     UNION
@@ -183,7 +181,7 @@ FROM (
     FROM (SELECT ingest_id, unnest(cells) AS cell FROM stored_summaries)
     SEMI JOIN recordings USING (ingest_id)
 )
-CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
+CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
 LEFT JOIN held USING (condition, action)
 ANTI JOIN untold_conditions USING (condition)
 WHERE coalesce(rows, 0) < minimum
@@ -214,4 +212,4 @@ FROM episodes
 LEFT JOIN longest USING (episode_id);
 
 CREATE OR REPLACE VIEW missing_cells AS
-SELECT condition, action, speed_mps, yaw_rate_radps FROM cells_below(1);
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps FROM cells_below(1);

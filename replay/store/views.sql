@@ -138,14 +138,14 @@ FROM (
 JOIN (SELECT recording_id, robot, site, firmware, map, shift, tags FROM recordings)
     USING (recording_id);
 
--- A row is named by the first of its conditions; this has one line for each that holds.
+-- `transitions` with one line for each condition that holds in a row, or one line, nominal, if none does.
 CREATE OR REPLACE VIEW held_conditions AS
-SELECT transition_id, recording_id, episode_id, unnest(conditions) AS condition, action, zone, robot
+SELECT *, unnest(conditions) AS condition
 FROM transitions
 UNION ALL
-SELECT transition_id, recording_id, episode_id, condition, action, zone, robot
+SELECT *, primary_condition AS condition
 FROM transitions
-WHERE condition = 'nominal';
+WHERE coalesce(len(conditions), 0) < 1;
 
 -- Each cell of what was seen. Cells never seen are in missing_cells: GROUP BY cannot show them. A
 -- condition that no row tells has one line, of nulls.
@@ -153,22 +153,31 @@ CREATE OR REPLACE VIEW coverage AS
 SELECT
     condition,
     action,
+    any_value(action_name) AS action_name,
     zone,
     behaviour_policy,
-    count(*) AS rows,
-    count(*) / sum(count(*)) OVER () AS share,
-    count(DISTINCT episode_id) AS episodes,
+    count(*) AS rows_held,
+    count(*) / sum(count(*) FILTER (WHERE condition = primary_condition)) OVER () AS held_share,
+    count(DISTINCT episode_id) AS episodes_held,
     avg(reward) AS reward_mean,
     avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
     (count(DISTINCT episode_id) FILTER (WHERE success))
-        / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share
-FROM transitions
+        / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share,
+    count(*) FILTER (WHERE condition = primary_condition) AS primary_rows,
+    (count(*) FILTER (WHERE condition = primary_condition))
+        / sum(count(*) FILTER (WHERE condition = primary_condition)) OVER () AS primary_share
+FROM held_conditions
 JOIN (SELECT episode_id, success FROM episodes) USING (episode_id)
+LEFT JOIN (
+    SELECT action, CASE WHEN count(DISTINCT name) = 1 THEN min(name) END AS action_name
+    FROM actions
+    GROUP BY action
+) USING (action)
 GROUP BY condition, action, zone, behaviour_policy
 UNION ALL
-SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
+SELECT condition, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL
 FROM untold_conditions
-WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM transitions)
+WHERE kind = 'outcome' AND condition NOT IN (SELECT condition FROM held_conditions)
 ORDER BY condition, action, zone, behaviour_policy;
 
 -- One line a condition, those never seen included; one that no row tells has nulls.
@@ -176,28 +185,27 @@ CREATE OR REPLACE VIEW coverage_by_condition AS
 WITH seen AS (
     SELECT
         condition,
-        count(*) AS rows,
+        count(*) AS rows_held,
         count(DISTINCT recording_id) AS recordings,
         count(DISTINCT action) AS actions,
         count(DISTINCT zone) AS zones,
         list_sort(list(DISTINCT behaviour_policy)) AS behaviour_policies,
         avg(reward) AS reward_mean,
-        avg(CAST(terminated AS INTEGER)) AS terminal_fraction
-    FROM transitions
+        avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
+        count(*) FILTER (WHERE condition = primary_condition) AS primary_rows
+    FROM held_conditions
     GROUP BY condition
 ), by_episode AS (
     SELECT
         condition,
-        count(*) AS episodes,
+        count(*) AS episodes_held,
         sum(n) * sum(n) / sum(n * n) AS effective_episodes,
         avg(CAST(success AS INTEGER)) AS success_share,
         avg(return) AS return_mean
-    FROM (SELECT condition, episode_id, count(*) AS n FROM transitions GROUP BY condition, episode_id)
+    FROM (
+        SELECT condition, episode_id, count(*) AS n FROM held_conditions GROUP BY condition, episode_id
+    )
     JOIN episodes USING (episode_id)
-    GROUP BY condition
-), held AS (
-    SELECT condition, count(*) AS rows_held, count(DISTINCT episode_id) AS episodes_held
-    FROM held_conditions
     GROUP BY condition
 )
 -- include: coverage_columns.sql
@@ -211,7 +219,7 @@ SELECT
     count(*) / sum(count(*)) OVER () AS share,
     count(DISTINCT episode_id) AS episodes,
     count(DISTINCT recording_id) AS recordings,
-    list_sort(list(DISTINCT condition)) AS conditions,
+    list_sort(list_distinct(flatten(list(conditions)))) AS conditions,
     avg(reward) AS reward_mean,
     (count(DISTINCT episode_id) FILTER (WHERE success))
         / nullif(count(DISTINCT episode_id) FILTER (WHERE success IS NOT NULL), 0) AS success_share
@@ -242,9 +250,9 @@ ORDER BY perturbation, field;
 
 -- Condition x action cells without a single row in which that condition holds; cells_below(n) for those with fewer than n.
 CREATE OR REPLACE VIEW missing_cells AS
-SELECT condition, action, speed_mps, yaw_rate_radps
-FROM (SELECT DISTINCT condition FROM (SELECT condition FROM conditions UNION SELECT condition FROM transitions))
-CROSS JOIN (SELECT DISTINCT action, speed_mps, yaw_rate_radps FROM actions)
+SELECT condition, action, action_name, speed_mps, yaw_rate_radps
+FROM (SELECT condition FROM conditions UNION SELECT condition FROM held_conditions)
+CROSS JOIN (SELECT DISTINCT action, name AS action_name, speed_mps, yaw_rate_radps FROM actions)
 ANTI JOIN (SELECT DISTINCT condition, action FROM held_conditions) USING (condition, action)
 ANTI JOIN untold_conditions USING (condition)
 ORDER BY condition, action;
@@ -252,7 +260,7 @@ ORDER BY condition, action;
 CREATE OR REPLACE VIEW reward_mix AS
 SELECT
     condition,
-    count(*) AS rows,
+    count(*) AS rows_held,
     avg(reward) AS reward_mean,
     min(reward) AS reward_min,
     quantile_cont(reward, 0.5) AS reward_median,
@@ -261,23 +269,23 @@ SELECT
     avg(CAST(reward < -0.5 AS INTEGER)) AS penalty_share,
     avg(CAST(terminated AS INTEGER)) AS terminal_fraction,
     avg(CAST(truncated AS INTEGER)) AS truncated_fraction
-FROM transitions
+FROM held_conditions
 GROUP BY condition
-ORDER BY rows DESC, condition;
+ORDER BY rows_held DESC, condition;
 
 -- Calendar age today; ages_at(when) for another day.
 CREATE OR REPLACE VIEW ages AS
 SELECT
     condition,
-    count(*) AS rows,
+    count(*) AS rows_held,
     make_timestamp_ns(min(logged_ns)) AS oldest,
     make_timestamp_ns(max(logged_ns)) AS newest,
     (epoch_ns(now()) - max(logged_ns)) / 86400e9 AS age_min_days,
     (epoch_ns(now()) - quantile_disc(logged_ns, 0.5)) / 86400e9 AS age_median_days,
     (epoch_ns(now()) - min(logged_ns)) / 86400e9 AS age_max_days
-FROM transitions
+FROM held_conditions
 GROUP BY condition
-ORDER BY rows DESC, condition;
+ORDER BY rows_held DESC, condition;
 
 -- Which conditions hold at the same time: a row can have several, and one of them wins.
 CREATE OR REPLACE VIEW label_overlap AS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 
 
 def plural(number: int, noun: str) -> str:
@@ -13,6 +14,15 @@ def plural(number: int, noun: str) -> str:
 def counted(number: int, noun: str) -> str:
     """`1 gap`, `1,200 gaps`."""
     return f"{number:,} {plural(number, noun)}"
+
+
+def by_priority(conditions: Iterable[str]) -> str:
+    """How rows that hold several conditions are counted once; `conditions` come in that order."""
+    return (
+        "By priority, a row that holds several conditions counts once, for the first of "
+        + ", ".join(conditions)
+        + "."
+    )
 
 
 def quoted(path: object) -> str:

@@ -140,8 +140,13 @@ def test_a_store_has_a_page_of_what_it_holds(
     page, folder = tmp_path / "page.html", tmp_path / "figures"
     argv = ["coverage", str(store_path), "--out", str(page), "--figures", str(folder)]
     assert main(argv) == 0
-    assert "rows by condition" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "rows that hold each condition" in out
     found = read(page)
+    once = "a row that holds several conditions counts once, for the first of recovery,"
+    assert once in out
+    assert once in found.text
+    assert "rarest condition" not in found.text
     for title in (
         "What the store holds",
         "What to log next",
@@ -160,6 +165,20 @@ def test_a_store_has_a_page_of_what_it_holds(
     assert "give --out FILE, too" in capsys.readouterr().err
     assert main(["coverage", str(store_path), "--every", "hour"]) == 2
     assert "--every: applies only to the page" in capsys.readouterr().err
+
+
+def test_the_page_counts_rows_that_hold_a_condition_first(store_path: Path) -> None:
+    with Store(store_path) as store:
+        _, sections = coverage_of(store, missing())
+        slips = "SELECT count(*) FROM transitions WHERE"
+        ((held,),) = store.sql(f"{slips} list_contains(conditions, 'wheel_slip')").fetchall()
+        ((named,),) = store.sql(f"{slips} primary_condition = 'wheel_slip'").fetchall()
+    (table,) = sections["shelves"].tables
+    (slip,) = [row for row in table.rows if row["condition"] == "wheel slip"]
+    assert held > named
+    assert slip["rows"] == str(held)
+    assert slip["by priority"].startswith(f"{named} (")
+    assert list(slip)[:2] == ["condition", "rows"]
 
 
 CONTROL_PERIOD_S = 0.2
@@ -194,7 +213,10 @@ def test_hours_of_a_robot_are_its_rows_times_the_control_period(tmp_path: Path) 
     with Store(write_store(tmp_path / "store", tables, tags=tags)) as store:
         _, sections = coverage_of(store, missing())
         (table,) = sections["robots"].tables
-        of_robot = "SELECT robot, count(*), count(DISTINCT condition) FROM transitions GROUP BY ALL"
+        of_robot = (
+            "SELECT robot, count(*), count(DISTINCT primary_condition) FROM transitions"
+            " GROUP BY ALL"
+        )
         counted = store.sql(of_robot).fetchall()
     assert all(conditions > 1 for _, _, conditions in counted)
     expected = {robot: f"{rows * CONTROL_PERIOD_S / 3600:.2f}" for robot, rows, _ in counted}
@@ -210,7 +232,7 @@ def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: 
         for row in rows:
             if "condition" in row:
                 row["condition"] = own.get(row["condition"], row["condition"])
-    few = {"condition": "zz_aaa", "rows": 0, "rows_held": 7, "share": 0.0, "episodes": 0}
+    few = {"condition": "zz_aaa", "rows_held": 7, "primary_rows": 0, "primary_share": 0.0}
     facts["shelves"].append({**facts["shelves"][0], **few})
     page = coverage_page(facts, missing(NEVER_SEEN), "nothing to compare")
     assert "never seen: zz" not in page["headline"]  # it holds where a rarer one names the row

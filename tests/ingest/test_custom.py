@@ -311,7 +311,7 @@ def test_they_are_columns_of_the_table_with_units(store, capsys):
 def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, capsys):
     """Stored signals are enough: no recording is read, and the audit names the old labels."""
     by_hand = "SELECT count(*) AS n FROM transitions WHERE left_radps > {} AND battery_v > 20"
-    labelled = "SELECT count(*) AS n FROM transitions WHERE condition = 'fast_wheel'"
+    labelled = "SELECT count(*) AS n FROM transitions WHERE primary_condition = 'fast_wheel'"
     (before,), (five,) = ask(store, labelled, capsys), ask(store, by_hand.format(5), capsys)
     assert before == five
     assert before["n"] > 0

@@ -139,7 +139,8 @@ def test_a_store_lists_exposures_beside_its_conditions(store, profile):
         assert [one.name for one in opened.exposures()] == ["closing_traffic", "far_out"]
         assert "far_out" not in {one.name for one in opened.conditions()}
         held = opened.sql(
-            "SELECT DISTINCT pose_x_m > 2, exposures, condition FROM transitions ORDER BY ALL"
+            "SELECT DISTINCT pose_x_m > 2, exposures, primary_condition FROM transitions"
+            " ORDER BY ALL"
         ).fetchall()
         assert held == [(False, [], "nominal"), (True, ["far_out"], "nominal")]
         rows = {row[0]: row[1:] for row in opened.sql(
@@ -161,7 +162,7 @@ def test_changed_exposures_are_told_again_from_the_store(store, profile):
     assert main(["label", str(store), "--profile", str(profile)]) == 0
     with Store(store) as opened:
         assert opened.sql(
-            "SELECT min(pose_x_m) > 2.2, any_value(condition) FROM transitions"
+            "SELECT min(pose_x_m) > 2.2, any_value(primary_condition) FROM transitions"
             " WHERE len(exposures) > 0"
         ).fetchall() == [(True, "nominal")]
         assert "2.2" in opened.exposures()[-1].sql

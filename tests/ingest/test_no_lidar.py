@@ -174,7 +174,7 @@ def test_nothing_is_counted_of_what_no_row_tells(blind):
     path, _ = blind
     with Store(path) as store:
         held = dict(store.sql("SELECT condition, rows_held FROM coverage_by_condition").fetchall())
-        cells = store.sql("SELECT condition, action, rows FROM coverage").fetchall()
+        cells = store.sql("SELECT condition, action, rows_held FROM coverage").fetchall()
         missing = store.sql("SELECT DISTINCT condition FROM missing_cells").fetchall()
         met = dict(store.sql("SELECT exposure, rows FROM coverage_by_exposure").fetchall())
         findings = run_audits(store.connection, shipped_audits(), load_thresholds())

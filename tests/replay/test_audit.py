@@ -91,13 +91,16 @@ def rows_where(table: pa.Table, name: str, value: object) -> np.ndarray:
     return np.array([entry == value for entry in table[name].to_pylist()])
 
 
+def slipping(table: pa.Table) -> np.ndarray:
+    return np.array(["wheel_slip" in held for held in table["conditions"].to_pylist()])
+
+
 def no_slip(table: pa.Table, recordings: pa.Table) -> Tables:
-    never = ["wheel_slip" not in held for held in table["conditions"].to_pylist()]
-    return table.filter(pa.array(never)), recordings
+    return table.filter(pa.array(~slipping(table))), recordings
 
 
 def slip_of_one_episode(table: pa.Table, recordings: pa.Table) -> Tables:
-    slip = rows_where(table, "condition", "wheel_slip")
+    slip = slipping(table)
     one = table.filter(pa.array(slip))["episode_id"][0].as_py()
     return table.filter(pa.array(~slip | rows_where(table, "episode_id", one))), recordings
 
@@ -108,13 +111,13 @@ def never_back(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def never_slipped_in_the_twin(table: pa.Table, recordings: pa.Table) -> Tables:
-    slip = rows_where(table, "condition", "wheel_slip")
+    slip = slipping(table)
     return replaced(table, "perturbation", np.where(slip, None, "wet").tolist()), recordings
 
 
 def old_slip(table: pa.Table, recordings: pa.Table) -> Tables:
     stamps = table["stamp_ns"].to_numpy().copy()
-    stamps[rows_where(table, "condition", "wheel_slip")] -= 400 * 86400 * 10**9
+    stamps[slipping(table)] -= 400 * 86400 * 10**9
     return replaced(table, "stamp_ns", stamps), recordings
 
 
@@ -197,11 +200,7 @@ def uncertain_slip(table: pa.Table, recordings: pa.Table) -> Tables:
 
 def failures(table: pa.Table, recordings: pa.Table) -> Tables:
     # Episodes with a slip end in failure: cut instead of terminated.
-    failed = set(
-        table.filter(pa.array(rows_where(table, "condition", "wheel_slip")))[
-            "episode_id"
-        ].to_pylist()
-    )
+    failed = set(table.filter(pa.array(slipping(table)))["episode_id"].to_pylist())
     fails = np.array([episode in failed for episode in table["episode_id"].to_pylist()])
     over = table["terminated"].to_numpy()
     table = replaced(table, "terminated", over & ~fails)
@@ -345,8 +344,18 @@ def recorded_twice_at_once(table: pa.Table, recordings: pa.Table) -> Tables:
 
 PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("rare_condition", no_slip, 1, {"condition": "wheel_slip", "rows_held": 0}),
-    ("few_effective_episodes", slip_of_one_episode, 1, {"condition": "wheel_slip", "episodes": 1}),
-    ("missing_cells", never_back, 1, {"condition": "recovery", "action": 4, "rows": 0}),
+    (
+        "few_effective_episodes",
+        slip_of_one_episode,
+        1,
+        {"condition": "wheel_slip", "episodes_held": 1},
+    ),
+    (
+        "missing_cells",
+        never_back,
+        1,
+        {"condition": "recovery", "action_name": "back 0.4", "rows": 0},
+    ),
     ("thin_perturbation", never_slipped_in_the_twin, 1, {"condition": "wheel_slip", "rows": 0}),
     ("stale_data", old_slip, 1, {"condition": "wheel_slip"}),
     ("single_behaviour_policy", only_planner_slips, 1, {"condition": "wheel_slip"}),

@@ -39,7 +39,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 
 TESTS = Path(__file__).parent
-SLIP = "FROM transitions WHERE condition = 'wheel_slip'"
+SLIP = "FROM held_conditions WHERE condition = 'wheel_slip'"
 
 
 def of(path: Path, **arguments: Any) -> tuple[list[Trajectory], Counts]:

@@ -47,7 +47,8 @@ def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
     week = "CAST(date_trunc('week', {}) AS DATE) AS week"
     rows = fleet.sql(
         f"SELECT robot, {week.format('logged_time')}, condition, count(*),"
-        " count(DISTINCT episode_id) FROM transitions GROUP BY ALL"
+        " count(DISTINCT episode_id), countif(condition = primary_condition)"
+        " FROM held_conditions GROUP BY ALL"
     ).fetchall()
     events = fleet.sql(
         f"SELECT robot, {week.format('logged_onset_time')}, condition, count(*),"
@@ -57,14 +58,16 @@ def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
     happened = {row[:3]: row[3:] for row in events}
     for row in asked(fleet, "FROM coverage_by_week"):
         cell = row["robot"], row["week"], row["condition"]
-        driven = sum(count for other, (count, _) in seen.items() if other[:2] == cell[:2])
-        count, episodes = seen.get(cell, (0, 0))
+        driven = sum(once for other, (_, _, once) in seen.items() if other[:2] == cell[:2])
+        count, episodes, once = seen.get(cell, (0, 0, 0))
         began, not_recovered = happened.get(cell, (0, 0))
         hours = driven * 0.2 / 3600
         wanted = {
-            "rows": count,
-            "share": count / driven,
-            "episodes": episodes,
+            "rows_held": count,
+            "held_share": count / driven,
+            "episodes_held": episodes,
+            "primary_rows": once,
+            "primary_share": once / driven,
             "hours": hours,
             "events": began,
             "not_recovered": not_recovered,
@@ -75,21 +78,24 @@ def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
 
 
 def test_weeks_add_up_to_robots(fleet):
-    weeks = "sum(rows), sum(episodes), sum(goal_episodes), sum(successes), sum(events), sum(hours)"
+    weeks = (
+        "sum(rows_held), sum(episodes_held), sum(primary_rows), sum(goal_episodes), sum(successes),"
+        " sum(events), sum(hours)"
+    )
     totals = fleet.sql(
         f"SELECT robot, condition, {weeks}, count(*), min(week) FROM coverage_by_week"
         " GROUP BY ALL ORDER BY ALL"
     ).fetchall()
     robots = fleet.sql(
-        "SELECT robot, condition, rows, episodes, goal_episodes, successes, events, hours, weeks,"
-        " first_week FROM coverage_by_robot ORDER BY ALL"
+        "SELECT robot, condition, rows_held, episodes_held, primary_rows, goal_episodes, successes,"
+        " events, hours, weeks, first_week FROM coverage_by_robot ORDER BY ALL"
     ).fetchall()
     assert [row[:2] for row in robots] == [row[:2] for row in totals]
     for robot, total in zip(robots, totals, strict=True):
         assert robot[2:-1] == pytest.approx(total[2:-1])
         assert robot[-1] == total[-1]
     assert {robot: weeks for robot, *_, weeks, _ in robots} == {"a": 2, "b": 1, None: 1}
-    totals = "SELECT sum(share) AS share, any_value(hours) AS hours FROM coverage_by_robot"
+    totals = "SELECT sum(primary_share) AS share, any_value(hours) AS hours FROM coverage_by_robot"
     shares = asked(fleet, f"{totals} GROUP BY robot")
     assert [row["share"] for row in shares] == pytest.approx([1.0, 1.0, 1.0])
     assert sum(row["hours"] for row in shares) == pytest.approx(
@@ -102,9 +108,9 @@ def test_successes_are_of_episodes_in_which_the_condition_was_seen(fleet):
         (found,) = asked(
             fleet,
             "SELECT count(*) AS episodes, count(*) FILTER (success) AS successes FROM episodes"
-            " SEMI JOIN (FROM transitions WHERE robot = 'a'"
+            " SEMI JOIN (FROM held_conditions WHERE robot = 'a'"
             f" AND condition = '{row['condition']}') USING (episode_id)",
         )
-        assert found["episodes"] == row["episodes"] == row["goal_episodes"]
+        assert found["episodes"] == row["episodes_held"] == row["goal_episodes"]
         assert found["successes"] == row["successes"]
         assert row["success_share"] == pytest.approx(found["successes"] / found["episodes"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,9 @@ share = "natural"
 def test_a_stratum_lacks_what_its_share_would_draw_too_often(store: Path) -> None:
     with Store(store) as opened:
         yields, gaps = find_gaps(opened, parse_mixture(ASKING), name="mine", kinds=KINDS)
-        slips = opened.sql("SELECT count(*) FROM transitions WHERE condition = 'wheel_slip'")
+        slips = opened.sql(
+            "SELECT count(*) FROM transitions WHERE primary_condition = 'wheel_slip'"
+        )
         there = slips.fetchall()[0][0]
     (gap,) = gaps
     # Half of each batch is logs': .4 of 100 x 10 x .5 draws, at most two of a row.
@@ -152,11 +155,33 @@ def test_a_condition_that_names_no_row_where_it_holds_is_no_bug(tmp_path: Path) 
     with Store(write_store(tmp_path / "store", [rows])) as store:
         mixture, limits = parse_mixture(ASKING), {"few_effective_episodes": FEW}
         _, gaps = find_gaps(store, mixture, name="mine", kinds=KINDS, thresholds=limits)
-        query = "FROM coverage_by_condition SELECT rows, rows_held WHERE condition = 'wheel_slip'"
-        ((names, holds),) = store.sql(query).fetchall()
+        query = "SELECT primary_rows, rows_held FROM coverage_by_condition"
+        ((names, holds),) = store.sql(f"{query} WHERE condition = 'wheel_slip'").fetchall()
     assert names == 0 < holds
     by = {gap.asked_by for gap in gaps if "wheel_slip" in gap.cell.values()}
     assert by == {"mixture mine"}  # its stratum is empty
+
+
+def test_a_gap_names_its_action(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = recording_transitions(1)
+    turned = [
+        "wheel_slip" in held and action == 3
+        for held, action in zip(
+            rows["conditions"].to_pylist(), rows["action"].to_pylist(), strict=True
+        )
+    ]
+    path = write_store(tmp_path / "store", [rows.filter(pa.array([not one for one in turned]))])
+    assert main(["gaps", str(path), "--json"]) == 0
+    gaps = json.loads(capsys.readouterr().out)["gaps"]
+    cells = [one for one in gaps if one["asked_by"] == "audit missing_cells"]
+    (gap,) = [one for one in cells if (one["condition"], one["action"]) == ("wheel_slip", 3)]
+    assert (gap["action_name"], gap["cell"]) == ("turn left 1.2", "wheel_slip, turn left 1.2")
+    assert main(["gaps", str(path)]) == 0
+    assert "turn left 1.2" in capsys.readouterr().out
+    assert main(["coverage", str(path), "--out", str(tmp_path / "page.html")]) == 0
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert "wheel slip, turn left 1.2" in page
+    assert not re.search(r"action \d", page)
 
 
 def test_hours_of_logging_where_no_recording_knew_the_truth(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ def rows(store: Store, query: str) -> list[dict[str, object]]:
 def test_transitions_are_those_that_were_written(store: Store, transitions: pa.Table) -> None:
     read = store.sql("FROM transitions ORDER BY transition_id").to_arrow_table()
     expected = transitions.sort_by("transition_id")
+    expected = expected.rename_columns({"condition": "primary_condition"})
     added = ["logged_ns", "stamp_time", "logged_time", "pose_stamp_time", *NAMED, "tags"]
     assert read.column_names == [*expected.column_names, *added]
     for name in expected.column_names:
@@ -147,17 +149,17 @@ def test_without_a_goal_there_is_no_success(tmp_path: Path) -> None:
         assert store.sql("SELECT DISTINCT success_share FROM coverage").fetchall() == [(None,)]
 
 
-def test_coverage_counts_every_row_once(store: Store, transitions: pa.Table) -> None:
+def test_coverage_counts_every_row_once_by_priority(store: Store, transitions: pa.Table) -> None:
     found = rows(store, "FROM coverage")
-    assert sum(row["rows"] for row in found) == len(transitions)  # type: ignore[misc]
-    assert sum(row["share"] for row in found) == pytest.approx(1)  # type: ignore[misc]
+    assert sum(row["primary_rows"] for row in found) == len(transitions)  # type: ignore[misc]
+    assert sum(row["primary_share"] for row in found) == pytest.approx(1)  # type: ignore[misc]
     by_condition = rows(store, "FROM coverage_by_condition")
     expected = transitions["condition"].to_pylist()
-    assert {r["condition"]: r["rows"] for r in by_condition} == {
+    assert {r["condition"]: r["primary_rows"] for r in by_condition} == {
         name: expected.count(name) for name in set(expected)
     }
     for row in by_condition:
-        assert 1 <= row["effective_episodes"] <= row["episodes"]  # type: ignore[operator]
+        assert 1 <= row["effective_episodes"] <= row["episodes_held"]  # type: ignore[operator]
 
 
 def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> None:
@@ -170,7 +172,7 @@ def test_a_condition_never_seen_has_a_line_and_empty_cells(tmp_path: Path) -> No
     ]
     with Store(write_store(tmp_path / "s", [table.filter(pa.array(keep))])) as store:
         (slip,) = rows(store, "FROM coverage_by_condition WHERE condition = 'wheel_slip'")
-        assert (slip["rows"], slip["episodes"], slip["behaviour_policies"]) == (0, 0, [])
+        assert (slip["primary_rows"], slip["behaviour_policies"]) == (0, [])
         assert (slip["rows_held"], slip["episodes_held"]) == (0, 0)
         missing = {(row["condition"], row["action"]) for row in rows(store, "FROM missing_cells")}
         assert {("wheel_slip", action) for action in range(5)} | {("recovery", 2)} <= missing
@@ -187,8 +189,55 @@ def test_a_row_counts_for_every_condition_that_holds_in_it(
     assert {line["condition"]: line["rows_held"] for line in lines} == {
         line["condition"]: sum(line["condition"] in names for names in held) for line in lines
     }
-    assert any(line["rows_held"] > line["rows"] for line in lines)
-    assert sum(line["rows"] for line in lines) == len(held)
+    assert any(line["rows_held"] > line["primary_rows"] for line in lines)
+    assert sum(line["primary_rows"] for line in lines) == len(held)
+    rewards = transitions["reward"].to_pylist()
+    for line in lines:
+        name = line["condition"]
+        mine = [r for r, names in zip(rewards, held, strict=True) if name in names]
+        assert line["reward_mean"] == pytest.approx(sum(mine) / len(mine), abs=1e-6)
+        assert line["held_share"] == pytest.approx(len(mine) / len(held))
+        for question in (
+            f"FROM held_conditions WHERE condition = '{name}'",
+            f"FROM coverage SELECT * WHERE condition = '{name}'",
+            f"FROM reward_mix WHERE condition = '{name}'",
+            f"FROM ages WHERE condition = '{name}'",
+        ):
+            found = rows(store, question)
+            assert sum(row.get("rows_held", 1) for row in found) == len(mine), question
+
+
+def test_a_filter_by_condition_is_not_answered_with_a_part_of_the_rows(store: Store) -> None:
+    for text in (
+        "SELECT median(reward) FROM transitions WHERE condition = 'wheel_slip'",
+        "SELECT t.condition, count(*) FROM transitions AS t GROUP BY ALL",
+    ):
+        with pytest.raises(QueryError) as refused:
+            store.sql(text)
+        (question,) = re.findall(
+            r"`(FROM held_conditions WHERE condition = '…')`", str(refused.value)
+        )
+        assert store.sql(question.replace("…", "wheel_slip")).fetchall()
+        assert "`primary_condition`" in str(refused.value)
+
+
+def test_actions_of_coverage_have_their_names(store: Store) -> None:
+    for view in ("coverage", "cells_below(10000)"):
+        named = store.sql(f"SELECT DISTINCT action, action_name FROM {view} ORDER BY 1").fetchall()
+        assert dict(named).items() <= dict(enumerate(TASK.action_names)).items()
+        assert len(named) > 1
+
+
+def test_an_action_that_two_tasks_name_differently_has_no_name(tmp_path: Path) -> None:
+    other = Task(body=TASK.body, actions=(TASK.actions[0], *reversed(TASK.actions[1:])), sectors=4)
+    path = write_store(tmp_path / "s", [recording_transitions(1)])
+    second = recording_transitions(2, task=other)
+    write_deltalake(str(path / "recordings"), manifest(second, task=other), mode="append")
+    write_deltalake(str(path / "transitions"), second, mode="append")
+    with Store(path) as store:
+        assert store.sql(
+            "SELECT DISTINCT action_name FROM coverage WHERE action = 1"
+        ).fetchall() == [(None,)]
 
 
 def test_overlap_counts_pairs_both_ways(store: Store, transitions: pa.Table) -> None:
@@ -260,7 +309,7 @@ def test_queries_are_read_only(store: Store, tmp_path: Path) -> None:
         f"ATTACH '{tmp_path}/other.db'",
         f"EXPORT DATABASE '{tmp_path}/out'",
         "INSTALL httpfs",
-        f"COPY (PIVOT transitions ON condition) TO '{tmp_path}/out.csv'",
+        f"COPY (PIVOT transitions ON zone) TO '{tmp_path}/out.csv'",
         "DROP VIEW transitions",
         "DROP VIEW IF EXISTS drops; FROM drops",
         f"EXPLAIN ANALYZE COPY (SELECT 1) TO '{tmp_path}/out.csv'",
@@ -319,13 +368,17 @@ def test_tables_between_commas_are_not_crossed(store_path: Path, before: str) ->
 
 
 def test_a_pivot_takes_its_columns_from_the_data(store: Store) -> None:
-    found = store.sql("PIVOT (SELECT zone, condition FROM transitions) ON condition")
-    held = store.sql("SELECT DISTINCT condition FROM transitions ORDER BY ALL").fetchall()
+    found = store.sql(
+        "PIVOT (SELECT zone, primary_condition FROM transitions) ON primary_condition"
+    )
+    held = store.sql("SELECT DISTINCT primary_condition FROM transitions ORDER BY ALL").fetchall()
     assert found.columns == ["zone", *(name for (name,) in held)]
     total = store.sql(f"SELECT sum(nominal) FROM ({found.sql_query()})").fetchall()
     assert (
         total
-        == store.sql("SELECT count(*) FROM transitions WHERE condition = 'nominal'").fetchall()
+        == store.sql(
+            "SELECT count(*) FROM transitions WHERE primary_condition = 'nominal'"
+        ).fetchall()
     )
 
 

@@ -81,11 +81,11 @@ def test_times_with_a_zone_are_text_in_utc(
 def test_csv_has_a_header_even_without_rows(
     store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = out_of(capsys, str(store_path), "SELECT condition, rows FROM ages", "--csv")
+    text = out_of(capsys, str(store_path), "SELECT condition, rows_held FROM ages", "--csv")
     found = list(csv.DictReader(io.StringIO(text)))
     assert {row["condition"] for row in found} >= {"nominal", "wheel_slip"}
-    query = "SELECT condition, rows FROM ages WHERE false"
-    assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows\n"
+    query = "SELECT condition, rows_held FROM ages WHERE false"
+    assert out_of(capsys, str(store_path), query, "--csv") == "condition,rows_held\n"
 
 
 def test_a_table_is_for_people(store_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,9 @@ def test_audit_rows_lead_back_to_their_transitions(trained: TrainedBuffer) -> No
         assert all(np.isfinite(row["q"]) for row in audit)
     place = {int(t): i for i, t in enumerate(panel.meta["transition_id"].to_pylist())}
     with Store(trained.store) as opened:
-        conditions = dict(opened.sql("SELECT transition_id, condition FROM transitions").fetchall())
+        conditions = dict(
+            opened.sql("SELECT transition_id, primary_condition FROM transitions").fetchall()
+        )
     for row in audit:
         assert row["last_target_sync"] is None  # the library's, unknown to its buffer
         assert 0 < row["age_gradient_steps"] <= row["gradient_step"]

@@ -59,7 +59,9 @@ def event(tmp_path_factory: pytest.TempPathFactory) -> Event:
     folder = tmp_path_factory.mktemp("view")
     ingest(RECORDING, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     with Store(folder / "store") as store:
-        slips = "FROM transitions WHERE condition = 'wheel_slip' AND step_index > 12 ORDER BY ALL"
+        slips = (
+            "FROM held_conditions WHERE condition = 'wheel_slip' AND step_index > 12 ORDER BY ALL"
+        )
         row = store.sql(slips).to_arrow_table().slice(0, 1).to_pylist()[0]
         window = (
             f"FROM transitions WHERE stamp_ns BETWEEN {row['stamp_ns'] - 2 * 10**9}"

@@ -127,7 +127,7 @@ def test_segments_are_the_rows_of_the_store(known: Path) -> None:
         found = log_segments(logged_steps(store), 1.0, stride_s=3.0)
         first = found.transition_id[-1]
         rows = store.sql(
-            "SELECT pose_x_m, command_speed_mps, condition FROM transitions"
+            "SELECT pose_x_m, command_speed_mps, primary_condition FROM transitions"
             f" WHERE transition_id BETWEEN {first} AND {first + 5} ORDER BY transition_id"
         ).fetchall()
     assert found.signals["pose_x_m"][-1] == pytest.approx([row[0] for row in rows])

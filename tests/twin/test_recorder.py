@@ -50,7 +50,8 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
         ingest(tmp_path / name, load_profile("warehouse_amr"), store=StoreWriter(store))
         columns = "observation, action, reward, next_observation, terminated, truncated, stamp_ns"
         query = (
-            f"SELECT {columns}, condition, behaviour_policy FROM transitions ORDER BY step_index"
+            f"SELECT {columns}, primary_condition, behaviour_policy FROM transitions"
+            " ORDER BY step_index"
         )
         with Store(store) as opened:
             tables.append(opened.sql(query).to_arrow_table())

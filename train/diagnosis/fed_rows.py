@@ -165,10 +165,10 @@ def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
     counts = counted["rows"].to_numpy()
     kept = _some(counts, most)
     wanted = counted.select(["episode_id"]).take(pa.array(kept))
-    names = ", ".join(_COLUMNS)
+    named = ("primary_condition AS condition" if n == "condition" else n for n in _COLUMNS)
     with passed_in(store.connection, wanted=wanted):
         table = store.connection.sql(
-            f"SELECT {names} FROM transitions SEMI JOIN wanted USING (episode_id)"
+            f"SELECT {', '.join(named)} FROM transitions SEMI JOIN wanted USING (episode_id)"
             " WHERE task_hash = $task",
             params={"task": task_hash},
         ).to_arrow_table()

@@ -55,7 +55,7 @@ def fed_labels(store: Store, rows: FedRows) -> Iterator[Comparison]:
     fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
     with passed_in(store.connection, fed=fed):
         found = store.connection.sql(
-            "WITH labels AS (SELECT fed, coalesce(condition, '') AS stored"
+            "WITH labels AS (SELECT fed, coalesce(primary_condition, '') AS stored"
             " FROM fed JOIN transitions USING (transition_id) WHERE task_hash = ?)"
             " SELECT name, count(*) FILTER (fed <> stored), count(*)"
             " FROM (SELECT fed AS name, fed, stored FROM labels UNION ALL"

@@ -6,7 +6,7 @@ FROM (SELECT DISTINCT perturbation FROM transitions WHERE perturbation IS NOT NU
 CROSS JOIN (SELECT condition FROM conditions)
 LEFT JOIN (
     SELECT perturbation, condition, count(*) AS rows, count(DISTINCT episode_id) AS episodes
-    FROM transitions
+    FROM held_conditions
     WHERE perturbation IS NOT NULL
     GROUP BY perturbation, condition
 ) USING (perturbation, condition)

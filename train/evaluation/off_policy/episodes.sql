@@ -16,7 +16,7 @@ WITH whole AS (
            episode_so_far AS (episode ROWS BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW)
 ), named AS (  -- an episode is of the condition that most of its labelled rows have, of equals the first
     SELECT episode_id,
-           coalesce(mode(condition ORDER BY step_index) FILTER (condition <> 'nominal'), 'nominal') AS of_condition
+           coalesce(mode(primary_condition ORDER BY step_index) FILTER (primary_condition <> 'nominal'), 'nominal') AS of_condition
     FROM whole
     GROUP BY episode_id
 )

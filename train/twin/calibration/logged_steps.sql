@@ -4,7 +4,7 @@ SELECT
     recording_id,
     episode_id,
     step_index,
-    condition,
+    primary_condition AS condition,
     true_condition,
     conditions,
     action,

@@ -15,9 +15,10 @@ class CoverageCommand:
     """Show how much of each condition a store holds, where, when and by which driver, and what is
     missing.
 
-    Prints the rows, episodes and success of each condition. With --out, it writes one page: the
-    conditions, what to log next (as `restock gaps`), weeks, robots, the map, and which robots have
-    changed (as `restock drift`).
+    Prints the rows in which each condition holds, their episodes and success. A row can hold
+    several conditions and counts for each of them; `by priority` counts it once. With --out, it
+    writes one page: the conditions, what to log next (as `restock gaps`), weeks, robots, the map,
+    and which robots have changed (as `restock drift`).
 
         restock coverage store/
         restock coverage store/ --out coverage.html
@@ -47,6 +48,7 @@ class CoverageCommand:
         from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
+        from restock.words import by_priority
 
         if self.out is None:
             options, why = ("figures", "mixture", "every"), "applies only to the page"
@@ -56,6 +58,7 @@ class CoverageCommand:
             expect_file_place(self.figures / "figure.svg", "--figures")
         with Store(self.store, version=given_version(self.version)) as store:
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
+            order = store.priority()
             if self.out is not None:
                 with output.progress("page", 3) as advance:
                     page = self._write(store, self.out, advance)
@@ -63,7 +66,8 @@ class CoverageCommand:
         if self.json:
             output.print_json(rows)
         else:
-            output.print_table([_line(row) for row in rows], title="rows by condition")
+            output.print_table([_line(row) for row in rows], title="rows that hold each condition")
+            output.stdout().print(by_priority(order), markup=False, soft_wrap=True)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import ConfigError, RestockError
@@ -103,14 +107,15 @@ class CoverageCommand:
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:
-    share, success = row["share"], row["success_share"]
+    share, success = row["held_share"], row["success_share"]
     return {
         "condition": row["condition"],
-        "rows": "unknown" if row["rows"] is None else row["rows"],
+        "rows": "unknown" if row["rows_held"] is None else row["rows_held"],
         "share": "" if share is None else f"{share:.1%}",
-        "episodes": row["episodes"],
+        "episodes": row["episodes_held"],
         "success": "" if success is None else f"{success:.0%}",
         "zones": row["zones"],
         "recordings": row["recordings"],
         "who drove": ", ".join(str(name) for name in row["behaviour_policies"] or () if name),
+        "by priority": row["primary_rows"],
     }

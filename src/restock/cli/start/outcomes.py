@@ -99,12 +99,12 @@ def _some(lines: list[str], most: int = 3) -> list[str]:
 
 
 def coverage(document: Document) -> list[str]:
-    """Rows by condition."""
+    """Rows that hold each condition."""
     rows = document["rows"]
-    held = [f"{row['condition']} {row['rows']:,}" for row in rows if row["rows"]]
-    none = [row["condition"] for row in rows if row["rows"] == 0]
-    unknown = [row["condition"] for row in rows if row["rows"] is None]
-    lines = [f"rows: {', '.join(held)}"]
+    held = [f"{row['condition']} {row['rows_held']:,}" for row in rows if row["rows_held"]]
+    none = [row["condition"] for row in rows if row["rows_held"] == 0]
+    unknown = [row["condition"] for row in rows if row["rows_held"] is None]
+    lines = [f"rows that hold each condition: {', '.join(held)}"]
     lines += [f"no row of {', '.join(none)}"] if none else []
     return lines + ([f"unknown, as a signal is missing: {', '.join(unknown)}"] if unknown else [])
 

@@ -11,7 +11,7 @@ from restock.cli.start.settings import Settings, own_file
 from restock.cli.start.stage import Stage
 
 COVERAGE = (
-    "SELECT condition, rows, share, episodes, success_share, behaviour_policies"
+    "SELECT condition, rows_held, held_share, episodes_held, success_share, behaviour_policies"
     " FROM coverage_by_condition"
 )
 

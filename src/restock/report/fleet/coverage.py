@@ -29,7 +29,7 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.look.queries import ask, statements
-from restock.words import counted, plural
+from restock.words import by_priority, counted, plural
 
 MOST_DOTS = 1500
 MOST_CELLS_ACROSS = 90  # of the map
@@ -48,6 +48,7 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     bounds["cell_m"] = cell_m
     found["visited"] = ask(store.connection, sql["visited"], cell_m=cell_m)
     found["rare"] = ask(store.connection, sql["rare"], most=MOST_DOTS)
+    found["priority"] = [{"condition": name} for name in store.priority()]
     return found
 
 
@@ -65,10 +66,11 @@ def coverage_page(
     named = (row["condition"] for rows in ("shelves", "weeks", "rare") for row in found[rows])
     colours = charts.palette(set(named))
     in_words = {words(name): colour for name, colour in colours.items()}
+    once = by_priority(words(row["condition"]) for row in found["priority"])
     sections = [
-        _shelves(found["shelves"], in_words),
+        _shelves(found["shelves"], in_words, once),
         shopping_section(gaps),
-        _weeks(found["weeks"], in_words),
+        _weeks(found["weeks"], in_words, once),
         _robots(found["robots"]),
         _map(found, colours),
         _drift(drift),
@@ -113,7 +115,7 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     never = [words(row["condition"]) for row in shelves if row["rows_held"] == 0]
     if never:
         text += f"; never seen: {', '.join(never)}"
-    unknown = [words(row["condition"]) for row in shelves if row["rows"] is None]
+    unknown = [words(row["condition"]) for row in shelves if row["rows_held"] is None]
     if unknown:
         text += f"; unknown in every recording: {', '.join(unknown)}"
     plan = gaps["plan"]
@@ -125,37 +127,36 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
     return text.removeprefix("; ")
 
 
-def _shelves(rows: Rows, colours: dict[str, str]) -> Section:
-    unknown = [words(row["condition"]) for row in rows if row["rows"] is None]
-    rows = [row for row in rows if row["rows"] is not None]
+def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
+    unknown = [words(row["condition"]) for row in rows if row["rows_held"] is None]
+    rows = [row for row in rows if row["rows_held"] is not None]
     table = [
         {
             "condition": words(row["condition"]),
-            "rows": count(row["rows"]),
-            "share": percent(row["share"]),
-            "episodes": count(row["episodes"]),
+            "rows": count(row["rows_held"]),
+            "share": percent(row["held_share"]),
+            "episodes": count(row["episodes_held"]),
             "effective episodes": f"{row['effective_episodes']:.1f}",
-            "rows where it holds": count(row["rows_held"]),
             "success": "" if row["success_share"] is None else f"{row['success_share']:.0%}",
             "zones": count(row["zones"]),
             "recordings": count(row["recordings"]),
             "who drove": ", ".join(str(name) for name in row["behaviour_policies"] if name),
+            "by priority": f"{row['primary_rows']:,} ({percent(row['primary_share'])})",
         }
         for row in rows
     ]
     return Section(
         "shelves",
         "What the store holds",
-        intro="Each row is counted under its rarest condition; other conditions may hold in it, "
-        "too. Effective episodes: the number of equally long episodes with the same "
-        "information."
+        intro="Rows in which each condition holds: a row that holds several counts for each. "
+        f"{once} Effective episodes: the number of equally long episodes with the same information."
         + (
             f" Unknown in every row: {', '.join(unknown)}, as a signal that they need was not "
             "measured (see the view unknown_conditions)."
             if unknown
             else ""
         ),
-        figures=[Figure(_bars(rows, colours), "Rows of each condition (logarithmic)")]
+        figures=[Figure(_bars(rows, colours), "Rows in which each condition holds (logarithmic)")]
         if rows
         else [],
         two=True,
@@ -167,10 +168,10 @@ def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
     shown = [
         {
             "condition": words(row["condition"]),
-            "rows": row["rows"],
+            "rows": row["rows_held"],
             "from": PALE_ROWS,
-            "to": max(row["rows"], PALE_ROWS),
-            "text": f"{row['rows']:,}",
+            "to": max(row["rows_held"], PALE_ROWS),
+            "text": f"{row['rows_held']:,}",
         }
         for row in rows
     ]
@@ -198,14 +199,14 @@ def _bars(rows: Rows, colours: dict[str, str]) -> Drawing:
     return charts.draw(chart)
 
 
-def _weeks(rows: Rows, colours: dict[str, str]) -> Section | None:
+def _weeks(rows: Rows, colours: dict[str, str], once: str) -> Section | None:
     if not rows:
         return None
     shown = [
         {
             "week": "not known" if row["week"] is None else str(row["week"]),
             "condition": words(row["condition"]),
-            "rows": row["rows"],
+            "rows": row["primary_rows"],
         }
         for row in rows
     ]
@@ -227,7 +228,7 @@ def _weeks(rows: Rows, colours: dict[str, str]) -> Section | None:
     return Section(
         "weeks",
         "When was it logged?",
-        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}.",
+        intro=f"Rows by week of logging (Mondays), {counted(weeks, 'week')}. {once}",
         figures=[Figure(charts.draw(chart), "Rows by week")],
         two=True,
     )
@@ -249,10 +250,9 @@ def _robots(rows: Rows) -> Section | None:
             "robot": robot,
             "hours": f"{hours[robot]:.2f}",
             **{
-                name: f"{cells[robot, name]['rows']:,} ({percent(cells[robot, name]['share'])})"
-                if (robot, name) in cells
-                else "none"
+                name: f"{cell['rows_held']:,} ({percent(cell['held_share'])})" if cell else "none"
                 for name in names
+                for cell in [cells.get((robot, name))]
             },
         }
         for robot in robots
@@ -260,8 +260,8 @@ def _robots(rows: Rows) -> Section | None:
     return Section(
         "robots",
         "Which robot has seen which condition?",
-        intro="Rows of each condition, and their share of the robot's own. A condition that only "
-        "one robot has seen is learned only from that robot's hardware.",
+        intro="Rows in which each condition holds, and their share of the robot's own. "
+        "A condition that only one robot has seen is learned only from that robot's hardware.",
         tables=[Table(table, {"hours", *names})],
     )
 

@@ -1,23 +1,23 @@
 -- What the page of a store's coverage shows, one statement a fact.
 
 -- name: shelves
-SELECT condition, rows, share, episodes, rows_held, episodes_held, effective_episodes,
-       success_share, recordings, zones, behaviour_policies
+SELECT condition, rows_held, held_share, episodes_held, effective_episodes, success_share,
+       recordings, zones, behaviour_policies, primary_rows, primary_share
 FROM coverage_by_condition;
 
 -- name: weeks
--- A condition's part of a week's rows, over all robots.
-SELECT week, condition, CAST(sum(rows) AS BIGINT) AS rows
+-- A condition's part of a week's rows, over all robots: each row once, by priority.
+SELECT week, condition, CAST(sum(primary_rows) AS BIGINT) AS primary_rows
 FROM coverage_by_week
-WHERE rows > 0
+WHERE primary_rows > 0
 GROUP BY week, condition
 ORDER BY week, condition;
 
 -- name: robots
 -- Hours are the robot's, over all conditions: the same in each of its rows.
-SELECT coalesce(robot, 'untagged') AS robot, condition, rows, share, hours
+SELECT coalesce(robot, 'untagged') AS robot, condition, rows_held, held_share, hours
 FROM coverage_by_robot
-WHERE rows > 0
+WHERE rows_held > 0
 ORDER BY robot, condition;
 
 -- name: bounds
@@ -35,9 +35,9 @@ ORDER BY ALL;
 
 -- name: rare
 SELECT pose_x_m AS x_m, pose_y_m AS y_m, condition
-FROM transitions
+FROM held_conditions
 WHERE condition <> 'nominal' AND pose_x_m IS NOT NULL
-ORDER BY hash(transition_id)
+ORDER BY hash(transition_id), condition
 LIMIT $most;
 
 -- name: totals

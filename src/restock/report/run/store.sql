@@ -21,9 +21,9 @@ ORDER BY ALL;
 -- Where a rare condition was logged, as in `visited`; every one, up to $most drawn the same way each time.
 SELECT (pose_x_m - $x_m) * cos($yaw_rad) + (pose_y_m - $y_m) * sin($yaw_rad) AS x_m,
        (pose_y_m - $y_m) * cos($yaw_rad) - (pose_x_m - $x_m) * sin($yaw_rad) AS y_m,
-       condition
+       primary_condition AS condition
 FROM transitions
-WHERE condition <> 'nominal' AND list_contains($recordings, recording_id) AND pose_x_m IS NOT NULL
+WHERE primary_condition <> 'nominal' AND list_contains($recordings, recording_id) AND pose_x_m IS NOT NULL
 ORDER BY hash(transition_id)
 LIMIT $most;
 
