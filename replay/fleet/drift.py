@@ -5,6 +5,7 @@ The statistics are SQL (replay/store/drift.sql); here they run once, for a table
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from restock.errors import ConfigError, expect
 from restock.interrupts import interrupts_raised
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
+from restock.words import counted
 
 PERIODS = ("day", "week", "month", "year", "decade")
 OWN, OTHERS = "own reference", "other robots"
@@ -26,11 +28,46 @@ class Drift:
     version: int
     every: str  # day, week, …
     reference: int  # of these periods
+    least_episodes: int  # on each side of a comparison
     findings: Rows  # as of the view drift_findings: what changed, the largest first
     tests: Rows  # as of the view drift: every comparison
     periods: Rows  # robot, site, period, part, signal, recordings, episodes, p25, median, p75
     conditions: Rows  # robot, period, condition, driven_h, events, events_per_h
     notes: list[str]  # what could not be compared, and why
+
+    @property
+    def own(self) -> Rows:
+        """The comparisons of robots with their own references: only these find changes."""
+        return [row for row in self.tests if row["against"] == OWN]
+
+    @property
+    def tested(self) -> int:
+        """How many of them had enough data for a test."""
+        return sum(row["p"] is not None for row in self.own)
+
+    def without_findings(self) -> str:
+        """What it means that no change was found: how much was tested, or what a test needs."""
+        short = len(self.own) - self.tested
+        if self.tested:
+            undecided = sum(row["verdict"] == "undecided" for row in self.own)
+            aside = [f"{undecided:,} of them undecided"] if undecided else []
+            aside += [f"{counted(short, 'more comparison')} had too little data"] if short else []
+            return (
+                "No change that matters was found in "
+                f"{counted(self.tested, 'test')} against the robots' own references"
+                + (f" ({'; '.join(aside)})" if aside else "")
+            )
+        periods = Counter(robot for robot, _ in {(r["robot"], r["period"]) for r in self.periods})
+        if not periods:
+            why = "no episode has a signal to compare"
+        elif max(periods.values()) == 1:
+            why = f"every robot drove in one {self.every} only, so none has a reference"
+        else:
+            why = f"none of {counted(short, 'comparison')} has enough episodes on both sides"
+        return (
+            f"Nothing could be tested: {why}. A test needs a robot's first {self.every} and a later"
+            f" one, with at least {self.least_episodes} episodes in each"
+        )
 
     def document(self) -> dict[str, Any]:
         """As `restock drift --json` prints it."""
@@ -39,6 +76,7 @@ class Drift:
             "version": self.version,
             "every": self.every,
             "reference": self.reference,
+            "tested": self.tested,
             "findings": self.findings,
             "notes": self.notes,
             "tests": self.tests,
@@ -92,6 +130,7 @@ def measure_drift(
         store.version,
         every,
         reference,
+        least_episodes,
         findings,
         every_test,
         periods,

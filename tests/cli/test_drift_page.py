@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -70,9 +71,55 @@ def test_a_fleet_with_nothing_to_compare_says_so(
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
     assert "--tag robot=NAME" in out
-    assert "Too little to compare" in page.read_text("utf-8")
-    assert "too little to compare" in out
-    assert "no change that matters" not in out
+    said = "Nothing could be tested: every robot drove in one week only, so none has a reference."
+    for text in (page.read_text("utf-8"), out):
+        assert said in text
+        assert "at least 5 episodes in each" in text
+        assert "no change" not in text.lower()
+
+
+def test_alike_robots_without_a_reference_are_not_called_unchanged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robots = [SyntheticRobot("amr-1"), SyntheticRobot("amr-2")]
+    store = fleet_store(tmp_path / "store", robots, weeks=1, recordings=3)
+    assert cli.main(["drift", str(store), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert any(row["p"] is not None for row in document["tests"])  # of the robots, with each other
+    assert (document["tested"], document["findings"]) == (0, [])
+    page = tmp_path / "page.html"
+    assert cli.main(["coverage", str(store), "--out", str(page)]) == 0
+    assert "Nothing could be tested: every robot drove in one week" in page.read_text("utf-8")
+
+
+def test_too_few_episodes_in_every_week_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = fleet_store(
+        tmp_path / "store", [SyntheticRobot("amr-1")], weeks=2, recordings=1, episodes=2
+    )
+    assert cli.main(["drift", str(store)]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"Nothing could be tested: none of \d+ comparisons has enough episodes", out)
+
+
+def test_no_change_is_said_with_its_number_of_tests(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
+    page = tmp_path / "drift.html"
+    assert cli.main(["drift", str(store), "--out", str(page), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    own = [row for row in document["tests"] if row["against"] == "own reference"]
+    tests = sum(row["p"] is not None for row in own)
+    assert document["findings"] == []
+    assert document["tested"] == tests > 0
+    said = f"No change that matters was found in {tests} tests against the robots' own references"
+    text = Text()
+    text.feed(page.read_text("utf-8"))
+    assert said in text.text
+    assert cli.main(["drift", str(store)]) == 0
+    assert said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

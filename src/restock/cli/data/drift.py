@@ -98,7 +98,5 @@ def _show(drift: Drift) -> None:
     out.print()
     for row in drift.findings:
         out.print(visible(row["finding"]), markup=False, soft_wrap=True)
-    if all(row["p"] is None for row in drift.tests):
-        out.print("too little to compare: no robot has a reference and enough later episodes")
-    elif not drift.findings:
-        out.print("no change that matters was found in these logs")
+    if not drift.findings:
+        out.print(drift.without_findings(), markup=False, soft_wrap=True)

@@ -40,7 +40,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
     """Everything the page's template asks for."""
     robots = {row["robot"] for row in drift.periods}
     periods = {row["period"] for row in drift.periods}
-    own = [row for row in drift.tests if row["against"] == OWN]
+    own = drift.own
     sections = [
         findings_section(drift),
         _overview_section(drift, own),
@@ -60,7 +60,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
             for number, label in (
                 (len(robots), "robots"),
                 (len(periods), f"{plural(len(periods), drift.every)} with driving"),
-                (sum(row["p"] is not None for row in own), "tests against a robot's own reference"),
+                (drift.tested, "tests against a robot's own reference"),
                 (len(drift.findings), "changes: a signal of a robot"),
                 (
                     sum(row["verdict"] == "too few" for row in own),
@@ -89,11 +89,9 @@ def headline(drift: Drift) -> str:
             (row,) = hardware
             text += f", {signal_name(row)} {change_text(row)} since {row['since']}"
         return text
-    if all(row["p"] is None for row in drift.tests):
-        return "Too little to compare: no robot has a reference and enough later episodes"
     if drift.findings:
         return "No robot's hardware has changed enough to matter; how or where it drives has"
-    return "No change that matters was found in these logs"
+    return drift.without_findings()
 
 
 def findings_section(drift: Drift) -> Section:
