@@ -25,6 +25,7 @@ COLUMNS = {
     "condition": "VARCHAR",
     "zone": "VARCHAR",
     "action": "BIGINT",
+    "action_name": "VARCHAR",
     "robot": "VARCHAR",
     "counted": "VARCHAR",
     "needed": "BIGINT",

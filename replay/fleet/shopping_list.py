@@ -249,10 +249,11 @@ def _with_probability(
 
 
 def describe_cell(gap: Gap) -> str:
-    """`wheel_slip`, or `wheel_slip, action 3, aisle_2`."""
+    """`wheel_slip`, or `wheel_slip, turn left 1.2, aisle_2`."""
     cell = dict(gap.cell)
     words = [str(cell.pop(name)) for name in ("stratum", "condition") if name in cell]
-    words += [f"action {cell.pop('action')}"] if "action" in cell else []
+    if (action := cell.pop("action", None)) is not None:
+        words.append(gap.action_name or f"action {action}")
     return ", ".join([*words, *(str(value) for value in cell.values() if value != "")])
 
 
@@ -291,6 +292,7 @@ def _gap(one: FilledGap) -> dict[str, Any]:
         **{
             name: gap.cell.get(name) for name in ("stratum", "condition", "zone", "action", "robot")
         },
+        "action_name": gap.action_name,
         "counted": gap.counted,
         "needed": math.ceil(gap.needed),
         "there": round(gap.there),

@@ -1,7 +1,7 @@
 -- severity: warning
 -- advice: These rows do not tell what other actions lead to, so a policy cannot learn them: ingest drives that turn and stop, or check `actions` of the profile against the commands.
 -- doc: Recordings in which (almost) all rows have the same action.
-SELECT recording_id, source_file, action, rows, rows / of_recording AS share
+SELECT recording_id, source_file, action, name AS action_name, rows, rows / of_recording AS share
 FROM (
     SELECT
         recording_id,
@@ -11,6 +11,7 @@ FROM (
     FROM recording_cells
     GROUP BY recording_id, action
 )
-JOIN (SELECT recording_id, source_file FROM recordings) USING (recording_id)
+JOIN (SELECT recording_id, source_file, task_hash FROM recordings) USING (recording_id)
+LEFT JOIN (SELECT task_hash, action, name FROM actions) USING (task_hash, action)
 WHERE rows / of_recording >= $max_share AND of_recording >= $min_rows
 ORDER BY share DESC, recording_id

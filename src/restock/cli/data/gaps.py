@@ -190,12 +190,16 @@ def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
         groups.setdefault(key, []).append(gap)
     lines = []
     for (condition, zone, robot, asked_by), members in groups.items():
-        actions = [gap["action"] for gap in members if gap["action"] is not None]
+        actions = [
+            gap["action_name"] or f"action {gap['action']}"
+            for gap in members
+            if gap["action"] is not None
+        ]
         least = min(members, key=lambda gap: gap["at_least"])
         lines.append(
             {
                 "gap": ", ".join(str(part) for part in (condition, zone, robot) if part),
-                "actions": ", ".join(map(str, actions)),
+                "actions": ", ".join(actions),
                 "asked by": asked_by,
                 "to see one, with 95 %": f"at least {least['at_least']:,} more"
                 f" {plural(least['at_least'], 'episode')} of"
