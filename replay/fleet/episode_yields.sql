@@ -25,8 +25,9 @@ WITH held AS (
         recording_id,
         episode_id,
         any_value(episode_index) AS episode_index,
-        -- The last step takes as long as the others.
-        (max(stamp_ns) - min(stamp_ns)) / 3600e9 * count(*) / greatest(count(*) - 1, 1) AS hours,
+        min(stamp_ns) AS first_ns,
+        max(stamp_ns) AS last_ns,
+        count(*) AS rows,
         bool_or(true_condition IS NOT NULL) AS simulated
     FROM transitions
     GROUP BY recording_id, episode_id
@@ -34,7 +35,9 @@ WITH held AS (
 SELECT
     row_number() OVER (ORDER BY recording_id, episode_index) - 1 AS number,
     episode_id,
-    hours,
+    first_ns,
+    last_ns,
+    rows,
     simulated,
     coalesce(kind, 'nominal') AS kind
 FROM measured

@@ -23,7 +23,7 @@ from restock.errors import ConfigError, expect
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.interrupts import interrupts_raised
-from restock.replay.fleet.yields import CELL, Yields, by_episode, read_yields
+from restock.replay.fleet.yields import CELL, Yields, in_order, read_yields
 from restock.replay.mixture.mixture import CorrectionRule, EvaluationSplit, Mixture
 from restock.replay.panel.build import open_source
 from restock.replay.plan.plan import LOGS, PanelPlan, plan_panel
@@ -45,7 +45,8 @@ class Gap:
     counted: Counted
     needed: float
     there: float
-    found: F64  # (E,) of each episode of the store, in rows or episodes
+    # (E,) of each episode of the store, in rows or episodes; NaN where the mixture admits none.
+    found: F64
     action_name: str | None = None  # of the cell's action; None: it has none, or tasks differ
     thinnest: tuple[str, ...] = ()  # the zones that are furthest below their part of what is needed
 
@@ -142,9 +143,10 @@ def uncorrected(mixture: Mixture) -> Mixture:
 
 
 def _without_split(store: Store, mixture: Mixture) -> Mixture:
-    """The mixture, which keeps nothing from a store of one recording or one episode."""
-    by = "recording_id" if mixture.evaluation_split.by == "recording" else "episode_id"
-    several = store.sql(f"SELECT count(DISTINCT {by}) > 1 FROM transitions").fetchall()[0][0]
+    """The mixture, which keeps no recording from a store of one."""
+    if mixture.evaluation_split.by != "recording":
+        return mixture
+    several = store.sql("SELECT count(DISTINCT recording_id) > 1 FROM transitions").fetchall()[0][0]
     none = EvaluationSplit(by="none")
     return mixture if several else msgspec.structs.replace(mixture, evaluation_split=none)
 
@@ -152,10 +154,11 @@ def _without_split(store: Store, mixture: Mixture) -> Mixture:
 def _of_strata(plan: PanelPlan, yields: Yields, asked_by: str) -> list[Gap]:
     """Strata whose rows do not bear the share that the mixture wants for them."""
     gaps = []
+    names = plan.rows["episode_id"].combine_chunks().dictionary
     for code, line in enumerate(plan.strata):
         if not line.missing_rows or line.source != LOGS:
             continue
-        found = by_episode(yields, plan.rows["episode_id"], plan.stratum == code)
+        found = in_order(yields, names, plan.found[line.name])
         needed = line.rows + line.missing_rows
         cell: dict[str, str | int] = {"stratum": line.name}
         thin = _thinnest(plan, code, needed)

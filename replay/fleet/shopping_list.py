@@ -15,14 +15,14 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.replay.fleet.forecast import (
+from restock.replay.fleet.gaps import Gap
+from restock.replay.fleet.yields import Unit, Yields
+from restock.replay.plan.forecast import (
     Forecast,
     forecast,
     missions_to_see_one,
     probability_to_close,
 )
-from restock.replay.fleet.gaps import Gap
-from restock.replay.fleet.yields import Unit, Yields
 
 HOUR_STEPS = 60  # of an hour that is planned
 _PART = 0.1  # of a gap that an order fills at least, to be named as for it
@@ -110,13 +110,13 @@ def shopping_list(
     kinds: list[str | None] = [None] if unit == "hours" else [*sorted(set(yields.kind))]
     supplies = list(dict.fromkeys(s for gap in gaps for s in _supplies(gap, kinds)))
     table: dict[tuple[int, Supply], Forecast] = {}
-    for number, supply in enumerate(supplies):
+    for supply in supplies:
         at = yields.members(supply.kind, supply.zone)
         amount = yields.amount(unit, supply.zone)[at]
         for index, gap in enumerate(gaps):
             if _may_fill(supply, gap):
                 # The same draws for every gap: gaps that are alike come out alike.
-                draws = np.random.default_rng([seed, number])
+                draws = np.random.default_rng(seed)
                 table[index, supply] = forecast(gap.found[at], amount, gap.missing, rng=draws)
     filled = [
         _filled(gap, {s: table[index, s] for s in _supplies(gap, kinds)}, confidence)

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from restock.arrays import F64, Bools, Ints
+from restock.replay.plan.forecast import episode_hours
 
 MIN_STEPS = 3  # a label of a step or two may be a mistake
 CELL = ("condition", "zone", "action", "robot")
@@ -97,22 +98,18 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
     table = connection.sql("FROM yield_episodes ORDER BY number").to_arrow_table()
     return Yields(
         table["episode_id"].to_pylist(),
-        np.asarray(table["hours"].to_numpy(), np.float64),
+        episode_hours(*(table[name].to_numpy() for name in ("first_ns", "last_ns", "rows"))),
         table["kind"].to_pylist(),
         bool(pc.any(table["simulated"]).as_py()),
         connection.sql("FROM yield_cells ORDER BY ALL").to_arrow_table(),
     )
 
 
-def by_episode(yields: Yields, episode: pa.ChunkedArray, counted: Bools) -> F64:
-    """(E,) how many of some rows, by the text of their episode (N,), each episode has."""
-    place = {name: index for index, name in enumerate(yields.episode_id)}
-    column = episode.combine_chunks()
-    if not pa.types.is_dictionary(column.type):
-        column = column.dictionary_encode()
-    of_code = np.array([place.get(name, -1) for name in column.dictionary.to_pylist()], np.int64)
-    number = of_code[column.indices.to_numpy()][counted]
-    return np.bincount(number[number >= 0], minlength=len(yields)).astype(np.float64)
+def in_order(yields: Yields, names: pa.Array, found: F64) -> F64:
+    """What was found in the episodes of these ids, as `yields` has them (E,), or NaN."""
+    place = {name: index for index, name in enumerate(names.to_pylist())}
+    padded = np.append(found, np.nan)
+    return padded[[place.get(name, -1) for name in yields.episode_id]]
 
 
-__all__ = ["CELL", "Unit", "Yields", "by_episode", "read_yields"]
+__all__ = ["CELL", "Unit", "Yields", "in_order", "read_yields"]

@@ -36,6 +36,8 @@ STRATA = {
     "replays_per_row": "DOUBLE",
     "missing_rows": "BIGINT",
     "missing_hours": "DOUBLE",
+    "missing_hours_low": "DOUBLE",
+    "missing_hours_high": "DOUBLE",
     "correction": "VARCHAR",
     "timing": "VARCHAR",
     "note": "VARCHAR",

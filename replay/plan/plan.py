@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Bools, Ints
+from restock.arrays import F32, F64, Bools, Codes, Ints
 from restock.errors import MixtureError, StoreError
 from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.replay.mixture.mixture import Mixture, nanoseconds
@@ -43,6 +43,7 @@ from restock.replay.plan.exclusions import (
     repeats_of,
     split_for_evaluation,
 )
+from restock.replay.plan.forecast import episode_hours
 from restock.replay.plan.source_plan import SourcePlan, SourceRows, plan_source
 from restock.replay.plan.stores import PinnedStore
 from restock.replay.plan.strata import (
@@ -75,6 +76,7 @@ class PanelPlan:
     split_by: str  # what it is of: as `EvaluationSplit.by`, or what was done instead
     split_note: str  # for people, where that is not whole episodes
     strata: tuple[Stratum, ...]
+    found: dict[str, F64]  # of each that lacks rows: its rows in each episode of the dictionary
     logs_share: float  # of a batch, all stores together; the mean over a schedule
     logs_share_wanted: float  # the same, had all strata rows enough
     left_out: dict[str, int]  # rows not in the panel, by reason
@@ -240,10 +242,12 @@ def _sources(
     store, episode = table["store"].to_numpy(), codes(table, "episode_id")
     recording, stamp_ns = codes(table, "recording_id"), table["stamp_ns"].to_numpy()
     logged = np.isin(recording, np.unique(recording[logged]))
+    names = table["episode_id"].combine_chunks().dictionary
+    hours = _hours(episode, stamp_ns, len(names))
     sources = []
     for number, (name, part) in enumerate(mixture.sources.parts.items()):
         admitted = (stratum != NO_STRATUM) & (store == number)
-        seen = logged & (store == number)
+        seen = np.bincount(episode[logged & (store == number)], minlength=len(hours)) > 0
         at = np.flatnonzero(admitted & ~beyond_cap)
         sources.append(
             SourceRows(
@@ -254,22 +258,20 @@ def _sources(
                 stratum[at],
                 state_code[at],
                 episode[at],
-                hours_of(recording[seen], stamp_ns[seen]),
+                np.where(seen, hours, np.nan),
                 np.bincount(stratum[admitted], minlength=size),
             )
         )
     return sources
 
 
-def hours_of(recording: Ints, stamp_ns: Ints) -> float:
-    """Hours of logging that rows (n,) are of: from first to last, of every recording."""
-    if not len(recording):
-        return 0.0
-    first = np.full(int(recording.max()) + 1, np.iinfo(np.int64).max)
-    last = np.full(len(first), np.iinfo(np.int64).min)
-    np.minimum.at(first, recording, stamp_ns)
-    np.maximum.at(last, recording, stamp_ns)
-    return float((last - first)[last >= first].sum() / 3.6e12)
+def _hours(episode: Codes, stamp_ns: Ints, episodes: int) -> F64:
+    """How long each episode (E,) is, by the codes and the stamps of its rows (N,)."""
+    rows = np.bincount(episode, minlength=episodes)
+    first, last = np.full(episodes, np.iinfo(np.int64).max), np.zeros(episodes, np.int64)
+    np.minimum.at(first, episode, stamp_ns)
+    np.maximum.at(last, episode, stamp_ns)
+    return np.where(rows > 0, episode_hours(first, last, rows), np.nan)
 
 
 def _joined(
@@ -294,6 +296,7 @@ def _joined(
     filled = np.array([s.part * p.drawn for s, p in zip(given, worked_out, strict=True)])
     part_of_logs = filled / filled.sum()
     lines: list[Stratum] = []
+    found: dict[str, F64] = {}
     never = 0
     for number, (source, plan) in enumerate(zip(given, worked_out, strict=True)):
         at = source.at[plan.kept]
@@ -309,10 +312,12 @@ def _joined(
             )
             column[at] = plan.outcome[:, index] if plan.outcome is not None else 0
         of_logs = float(part_of_logs[number])
+        prefix = "" if source.name == LOGS else f"{source.name}/"
+        found |= {f"{prefix}{name}": rows for name, rows in plan.found.items()}
         lines += [
             msgspec.structs.replace(
                 line,
-                name=line.name if source.name == LOGS else f"{source.name}/{line.name}",
+                name=f"{prefix}{line.name}",
                 wanted_share=line.wanted_share * of_logs,
                 share=line.share * of_logs,
                 effective_share=line.effective_share * of_logs,
@@ -336,6 +341,7 @@ def _joined(
         split_by=split.by,
         split_note=split.note,
         strata=tuple(lines),
+        found=found,
         logs_share=float(filled.sum()),
         logs_share_wanted=sum(source.part for source in given),
         left_out=left_out,

@@ -24,6 +24,7 @@ from restock.replay.mixture.shares import (
     wanted_shares,
 )
 from restock.replay.plan.exclusions import scramble
+from restock.replay.plan.forecast import Forecast, forecast
 from restock.replay.plan.strata import ResolvedStratum, Stratum
 from restock.replay.plan.weights import (
     RatioFit,
@@ -50,7 +51,7 @@ class SourceRows:
     code: NDArray[np.int16]  # stratum
     state_code: NDArray[np.int16]  # the one their state alone would put them in
     episode: Codes
-    hours: float  # of logging that its store is of
+    hours: F64  # (E,) of each episode; NaN where it is none of this source's logging
     admitted: Ints  # (S,) rows of each stratum, those beyond a cap too
 
 
@@ -64,6 +65,7 @@ class SourcePlan:
     outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
     fit: RatioFit | None
     lines: list[Stratum]
+    found: dict[str, F64]  # of strata that lack rows: their rows in each episode (E,), or NaN
 
     @property
     def drawn(self) -> float:
@@ -120,6 +122,13 @@ def plan_source(
     missing = missing_rows(mixture, rules, rows, episodes, shares.wanted, draws)
     missing[[rule.name in untold for rule in rules]] = 0  # no drive of such robots brings any
     occurs = rows / max(rows.sum(), 1) if natural is None else natural
+    found: dict[str, F64] = {}
+    driving: dict[str, Forecast] = {}
+    for i in np.flatnonzero(missing).tolist():
+        name, hours = rules[i].name, source.hours
+        counts = np.bincount(source.episode[source.code == i], minlength=len(hours))
+        found[name] = np.where(np.isnan(hours), np.nan, counts)
+        driving[name] = forecast(found[name], hours, missing[i], rng=np.random.default_rng(0))
     lines = [
         Stratum(
             name=stratum.name,
@@ -139,13 +148,21 @@ def plan_source(
             effective_share=float(after[i]),
             note=shares.notes[i],
             missing_rows=int(missing[i]),
-            missing_hours=float(missing[i] * source.hours / rows[i]) if rows[i] else None,
+            **_hours(driving.get(stratum.name)),
         )
         for i, stratum in enumerate(strata)
     ]
     if mixture.correction.below_natural == "refuse":
         _refuse_below_natural(lines)
-    return SourcePlan(shares, kept, weight, outcome, fit, lines)
+    return SourcePlan(shares, kept, weight, outcome, fit, lines, found)
+
+
+def _hours(driving: Forecast | None) -> dict[str, float]:
+    """How much driving a stratum lacks; nothing where none is known to bring any."""
+    if driving is None or not driving.known:
+        return {}
+    ends = {"missing_hours": 0.5, "missing_hours_low": 0.025, "missing_hours_high": 0.975}
+    return {name: driving.quantile(share) for name, share in ends.items()}
 
 
 def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> None:

@@ -25,6 +25,11 @@ def by_priority(conditions: Iterable[str]) -> str:
     )
 
 
+def figure(value: float) -> str:
+    """A measured number in three figures: `1,204`, `12.2`, `0.741`."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
 def quoted(path: object) -> str:
     """A path as it is typed into a shell, in a command that a message suggests."""
     return shlex.quote(str(path))

@@ -16,14 +16,15 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.replay.fleet.forecast import forecast, missions_to_see_one, probability_to_close
 from restock.replay.fleet.gaps import Gap, find_gaps
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_toml, read_missions
 from restock.replay.fleet.shopping_list import shopping_list
 from restock.replay.fleet.yields import Yields
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.plan.forecast import forecast, missions_to_see_one, probability_to_close
 from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
+from restock.words import figure
 
 KINDS = ("nominal", "wheel_slip", "blocked_aisle")
 
@@ -196,6 +197,68 @@ def test_hours_of_logging_where_no_recording_knew_the_truth(tmp_path: Path) -> N
     rate = gaps[0].there / yields.hours.sum()
     assert found.gaps[0].forecast is not None
     assert found.gaps[0].forecast.rate == pytest.approx(rate)
+
+
+ROBOT = f"recording_id = '{1:016x}'"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        f'where = "{ROBOT}"\n',
+        "prefer = 'priority'\nevaluation_split = { by = 'time' }\n",
+        "each_condition = { unit = 'episode', share = 'equal' }\n",
+        "each_condition = { share = 'equal', min_rows = 1_000 }\n",  # of which none is drawn
+    ],
+)
+def test_mix_and_gaps_say_the_same_hours_for_the_same_rows(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = str(write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2, 3)]))
+    mixture = f"max_replays_per_row = 40\nshortfall = 'shrink'\n{text}"
+    if "each_condition" not in text:
+        mixture += "[each_condition]\nshare = 'equal'\n"
+    if "min_rows" in text:
+        mixture += "[[strata]]\nname = 'nominal'\nshare = 0.5\n"
+    (tmp_path / "mine.toml").write_text(mixture)
+    chosen = ("--mixture", str(tmp_path / "mine.toml"))
+    assert main(["mix", store, *chosen, "--dry-run", "--json"]) == 0
+    mixed = json.loads(capsys.readouterr().out)["strata"]
+    assert main(["gaps", store, *chosen, "--unit", "hours", "--no-audits", "--json"]) == 0
+    gaps = {gap["stratum"]: gap for gap in json.loads(capsys.readouterr().out)["gaps"]}
+    short = [line for line in mixed if line["missing_rows"]]
+    assert short
+    assert {line["stratum"] for line in short} == set(gaps)
+    for line in short:
+        gap = gaps[line["stratum"]]
+        assert (line["rows"], line["missing_rows"]) == (gap["there"], gap["missing"])
+        ends = [line[f"missing_hours{end}"] for end in ("", "_low", "_high")]
+        assert ends == [gap[f"amount{end}"] for end in ("", "_low", "_high")]
+        assert gap["rate_low"] <= gap["missing"] / ends[0] <= gap["rate_high"]
+    # On a terminal, too, and each says what its number assumes.
+    assert main(["mix", store, *chosen, "--dry-run"]) == 0
+    mixed_text = capsys.readouterr().out
+    assert main(["gaps", store, *chosen, "--unit", "hours", "--no-audits"]) == 0
+    gaps_text = capsys.readouterr().out
+    gap = gaps[short[0]["stratum"]]
+    amount, low, high = (figure(gap[f"amount{end}"]) for end in ("", "_low", "_high"))
+    assert f"would fill it: {amount} h of driving ({low} to {high})\n" in mixed_text
+    assert f" {amount} ({low} to " in gaps_text
+    assert "hours: of driving as in these logs, with nothing chosen" in mixed_text
+    assert "hours: of driving as logged so far, until one gap is closed: median" in gaps_text
+    assert "each gap is then closed with a probability of 80% or more" in gaps_text
+
+
+def test_planned_missions_are_said_to_be_another_question_than_hours_of_any_driving(
+    store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.toml").write_text(ASKING)
+    chosen = (str(store), "--mixture", str(tmp_path / "mine.toml"))
+    assert main(["gaps", *chosen, "--no-audits"]) == 0
+    text = capsys.readouterr().out
+    assert "missions: of the kind that is best, until one gap is closed: median" in text
+    assert "`restock mix` counts hours of driving as logged, nothing chosen" in text
 
 
 def test_the_plan_is_the_least_that_fills_every_gap() -> None:

@@ -9,8 +9,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from restock.words import plural
+from restock.words import figure, plural
 
+_MEANING = {
+    "hours": "hours: of driving as logged so far, until one gap is closed: median (95 %); as in"
+    " `restock mix`",
+    "missions": "missions: of the kind that is best, until one gap is closed: median (95 %)."
+    " `restock mix` counts hours of driving as logged, nothing chosen: --unit hours",
+}
 SHOWN = 15  # lines of a table on a terminal; --json has all
 
 
@@ -25,7 +31,7 @@ class GapsCommand:
     A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
     rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
     also cells of condition x zone x action (x robot). Each gap is printed with the rate seen so
-    far, and the number of missions (or hours of logging) needed at that rate, with its 95 %
+    far, and the number of missions (or hours of driving) needed at that rate, with its 95 %
     interval. The plan is the least number of missions that fills all gaps. It can be written as a
     file for `restock record --missions`, and for training (env.missions).
     """
@@ -45,7 +51,7 @@ class GapsCommand:
     by: str = "condition,zone,action,robot"
     """The columns that define a cell for --min-rows."""
     unit: Literal["missions", "hours"] | None = None
-    """Count in missions or in hours of logging. Default: missions if a simulator made the
+    """Count in missions or in hours of driving. Default: missions if a simulator made the
     recordings, hours if robots did."""
     confidence: float = 0.8
     """The probability with which the planned missions close each gap."""
@@ -127,6 +133,7 @@ def _print(answer: dict[str, Any]) -> None:
         _table(
             f"{name}: what is missing, at the rates of its {answer['episodes']:,} episodes",
             [_line(gap, unit) for gap in known],
+            note=_MEANING[unit],
         )
     if unknown:
         _table("never seen: no rate is known", _unknown(unknown, unit))
@@ -135,22 +142,25 @@ def _print(answer: dict[str, Any]) -> None:
         with_ = {n: any(order[n] for order in plan["orders"]) for n in ("zone", "robot")}
         _table("what to log next", [_order(order, unit, with_) for order in plan["orders"]])
         output.stdout().print(
-            f"{_number(plan['total'])} {unit} in all (95 %: {_number(plan['total_low'])} to"
-            f" {_number(plan['total_high'])})"
-            + (f", {plan['hours']:,.2f} hours" if unit == "missions" else "")
-            + f": enough for each gap with {answer['confidence']:.0%}"
+            f"{figure(plan['total'])} {unit} in all (95 %: {figure(plan['total_low'])} to"
+            f" {figure(plan['total_high'])})"
+            + (f", {figure(plan['hours'])} hours" if unit == "missions" else "")
+            + f": each gap is then closed with a probability of {answer['confidence']:.0%} or more,"
+            " not with that of 50% as by the table above"
         )
     if "missions_file" in answer:
         output.stdout().print(f"-> {answer['missions_file']}", markup=False)
 
 
-def _table(title: str, rows: list[dict[str, Any]]) -> None:
+def _table(title: str, rows: list[dict[str, Any]], note: str = "") -> None:
     from restock.cli import output
 
     shown = rows[:SHOWN] if sys.stdout.isatty() else rows
     output.print_table(shown, title=title)
     if len(shown) < len(rows):
         output.stdout().print(f"… {len(rows) - len(shown):,} more: --json has all")
+    if note:
+        output.stdout().print(note, markup=False, soft_wrap=not sys.stdout.isatty())
     output.stdout().print()
 
 
@@ -174,12 +184,8 @@ def _line(gap: dict[str, Any], unit: str) -> dict[str, Any]:
 
 
 def _interval(gap: dict[str, Any], name: str) -> str:
-    value, low, high = (_number(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
+    value, low, high = (figure(gap[key]) for key in (name, f"{name}_low", f"{name}_high"))
     return f"{value} ({low} to {high})"
-
-
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ import msgspec
 import tyro
 
 from restock.errors import MixtureError
+from restock.words import counted, figure
 
 if TYPE_CHECKING:
     from restock.replay.plan.plan import PanelPlan
@@ -29,9 +30,10 @@ class MixCommand:
     """Make a pinned replay panel: the transitions that a run samples, and their shares.
 
     Applies a mixture to a store and packs the chosen transitions into one memory-mapped file. The
-    plan shows for each stratum its share of the rows (natural), the wanted share and the drawn
-    share, the share after importance weights, how often each of its rows will be replayed, and how
-    many rows and hours of logging are missing. Importance weights that give a stratum a smaller
+    plan shows for each stratum its share of the store's rows (natural), the share of a batch that
+    is wanted, its share of the logged rows drawn and of their gradient after importance weights,
+    how often each of its rows will be replayed, and how many rows and hours of driving are
+    missing. Importance weights that give a stratum a smaller
     share than it has in the logs are refused. A panel never changes; its id is a hash of store
     version, mixture, task and rows.
     """
@@ -117,7 +119,7 @@ class MixCommand:
         wide = output.table_width() >= _WIDE
         output.print_table(
             _table(document["strata"], wide=wide),
-            title=f"{self.mixture}: the logs' part of a batch",
+            title=self.mixture,
         )
         for line in _summary(document):
             output.stdout().print(line, markup=False, soft_wrap=not sys.stdout.isatty())
@@ -185,7 +187,7 @@ def _line(stratum: Stratum) -> dict[str, Any]:
 
 
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
-    """As many columns as fit; shares in percent."""
+    """As many columns as fit; shares in percent, each named with what it is of."""
     rows = []
     missing = any(line["missing_rows"] for line in strata)
     for line in strata:
@@ -193,10 +195,10 @@ def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
         if wide:
             row["episodes"] = line["episodes"]
         row |= {
-            "%\nnatural": _percent(line["natural_share"]),
-            "%\nwanted": _percent(line["wanted_share"]),
-            "%\ndrawn": _percent(line["share"]),
-            "% after\nweights": _percent(line["effective_share"]),
+            "natural: %\nof rows": _percent(line["natural_share"]),
+            "wanted: %\nof a batch": _percent(line["wanted_share"]),
+            "drawn: % of\nlogged rows": _percent(line["share"]),
+            "% of their\ngradient": _percent(line["effective_share"]),
             "replays\na row": line["replays_per_row"],
         }
         if missing:
@@ -216,34 +218,32 @@ def _percent(share: float) -> float:
 
 
 def _missing(line: dict[str, Any]) -> str:
-    """What would fill a stratum, in rows and in hours of logging."""
+    """What would fill a stratum, in rows and in hours of driving."""
     if not line["missing_rows"]:
         return ""
-    text = f"; {line['missing_rows']:,} more rows would fill it"
+    text = f"; {counted(line['missing_rows'], 'more row')} would fill it"
     if line["missing_hours"] is None:
         return f"{text}, and none of these logs went to it"
-    hours = line["missing_hours"]
-    took = f"{hours:,.1f} h" if hours >= 1 else f"{60 * hours:,.1f} min"
-    return f"{text}: about {took} of logging at the rate of these logs"
+    ends = ("missing_hours", "missing_hours_low", "missing_hours_high")
+    hours, low, high = (figure(line[name]) for name in ends)
+    return f"{text}: {hours} h of driving ({low} to {high})"
 
 
 def _summary(document: dict[str, Any]) -> list[str]:
-    # Where the logs get less of a batch than is wanted, a short stratum may be more of them.
-    given, wanted = document["logs_share"], document["logs_share_wanted"]
-    fewer = given < wanted - 1e-9
-    if not fewer:
-        given = wanted = 1.0
+    strata = document["strata"]
     lines = [
-        f"{line['stratum']}: {line['note']} ({line['wanted_share'] * wanted:.1%}"
-        f"{' of a batch' if fewer else ''} wanted, {line['share'] * given:.1%} drawn)"
-        f"{_missing(line)}"
-        for line in document["strata"]
-        if line["note"]
+        f"{line['stratum']}: {line['note']}{_missing(line)}" for line in strata if line["note"]
     ]
-    if fewer:
+    if any(line["missing_hours"] is not None for line in strata):
         lines.append(
-            f"the logs get {document['logs_share']:.1%} of a batch, not "
-            f"{document['logs_share_wanted']:.1%}: they do not have enough rows"
+            "hours: of driving as in these logs, with nothing chosen for a stratum, until its rows"
+            " are there: median (95 %); `restock gaps` plans what to log"
+        )
+    if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
+        lines.append(
+            f"logged rows fill {document['logs_share']:.1%} of a batch, not"
+            f" {document['logs_share_wanted']:.1%} ([sources]): there are not enough; the shares"
+            " drawn are of those that fill it"
         )
     for fit in document["density_ratios"]:
         lines.append(

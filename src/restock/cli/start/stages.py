@@ -110,7 +110,7 @@ def mix(to: Settings) -> Stage:
         "A replay panel that keeps the rare conditions in stock",
         "Each stratum holds the whole episodes that met its condition. Its natural, wanted and "
         "drawn shares and the share after weights are shown side by side, and missing data is "
-        "given in rows and hours of logging. The result is a pinned panel with an id.",
+        "given in rows and hours of driving. The result is a pinned panel with an id.",
         ["mix", str(to.store), "--mixture", to.mixture, "--out", str(to.panel)],
         reads=to.mixture_file,
         writes=(to.panel,),

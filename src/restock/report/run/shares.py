@@ -87,7 +87,7 @@ def remarks(facts: Facts) -> list[str]:
         + (
             ""
             if stratum.missing_hours is None
-            else f" ({span(3600 * stratum.missing_hours)} of logging)"
+            else f" ({span(3600 * stratum.missing_hours)} of driving as logged)"
         )
         for stratum in facts.strata
         if stratum.missing_rows

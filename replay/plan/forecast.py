@@ -9,6 +9,7 @@ theory. A kind of mission that never yielded a row has no rate: only a bound.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +40,12 @@ class Forecast:
         return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
 
 
+def episode_hours(first_ns: Ints, last_ns: Ints, rows: Ints) -> F64:
+    """Hours that episodes (E,) took: the last step takes as long as the others."""
+    steps = np.maximum(rows - 1, 1)
+    return np.asarray((last_ns - first_ns) / 3.6e12 * rows / steps, np.float64)
+
+
 def forecast(
     found: F64,
     amount: F64,
@@ -49,24 +56,22 @@ def forecast(
 ) -> Forecast:
     """From what E episodes yielded (E,), each of so many missions or hours (E,).
 
-    Episodes of no length (of one step, say) count as none.
+    Episodes of no length (of one step, say) count as none, and so do those without a yield (NaN).
     """
-    used = amount > 0
+    used = (amount > 0) & ~np.isnan(found)
     found, amount = found[used], amount[used]
     episodes, seen = len(found), int((found > 0).sum())
     nan = float("nan")
     if not seen:
         return Forecast(episodes, 0, 0.0 if episodes else nan, nan, nan, np.zeros(0))
     rate = float(found.sum() / amount.sum())
-    found, amount, weights = _weighted(found, amount, rng, replicates)
-    rates = (weights @ found) / np.maximum(weights @ amount, 1e-300)
+    amount = np.append(amount, amount.mean())
+    rates, draws = np.zeros(replicates), np.zeros(replicates)
+    found = np.append(found, 0.0)
+    for index, weights in enumerate(_replicates(episodes, rng, replicates)):
+        each = float(weights @ found) / max(float(weights @ amount), 1e-300)
+        rates[index], draws[index] = each, _needed(found, amount, weights, each, missing, rng)
     low, high = np.quantile(rates, [0.025, 0.975])
-    draws = np.array(
-        [
-            _needed(found, amount, one, float(each), missing, rng)
-            for one, each in zip(weights, rates, strict=True)
-        ]
-    )
     return Forecast(episodes, seen, rate, float(low), float(high), draws)
 
 
@@ -109,32 +114,29 @@ def probability_to_close(
 ) -> float:
     """That planned missions yield what is missing: `parts` are (yields (E,), missions) each."""
     total = np.zeros(replicates)
-    for found, missions in parts:
+    for sample, missions in parts:
+        found = sample[~np.isnan(sample)]
         if not len(found) or not missions or not found.any():
             continue
-        found, _, weights = _weighted(found, np.ones(len(found)), rng, replicates)
-        mean = weights @ found
-        if missions > _SIMULATED:
-            spread = np.sqrt(np.maximum(weights @ found**2 - mean**2, 0.0))
-            total += missions * mean + spread * math.sqrt(missions) * rng.normal(size=replicates)
-            continue
-        total += [found[_drawn(one, missions, rng)].sum() for one in weights]
+        found = np.append(found, 0.0)
+        for index, weights in enumerate(_replicates(len(found) - 1, rng, replicates)):
+            if missions > _SIMULATED:
+                mean = float(weights @ found)
+                spread = math.sqrt(max(float(weights @ found**2) - mean**2, 0.0))
+                chance = spread * math.sqrt(missions) * float(rng.normal())
+                total[index] += missions * mean + chance
+            else:
+                total[index] += found[_drawn(weights, missions, rng)].sum()
     return float((total >= missing).mean())
 
 
-def _weighted(
-    found: F64, amount: F64, rng: np.random.Generator, replicates: int
-) -> tuple[F64, F64, F64]:
-    """The episodes, with their weights (R, E + 1) in each replicate.
+def _replicates(episodes: int, rng: np.random.Generator, count: int) -> Iterator[F64]:
+    """Yield the weights of E episodes and one more, (E + 1,), in each replicate.
 
     One more, of half a weight, yields nothing: what every one of a few episodes did is not certain.
     """
-    prior = np.append(np.ones(len(found)), 0.5)
-    return (
-        np.append(found, 0.0),
-        np.append(amount, amount.mean()),
-        np.asarray(rng.dirichlet(prior, replicates), np.float64),
-    )
+    prior = np.append(np.ones(episodes), 0.5)
+    return (rng.dirichlet(prior) for _ in range(count))
 
 
 def _drawn(weights: F64, size: int, rng: np.random.Generator) -> Ints:
