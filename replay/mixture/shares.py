@@ -33,32 +33,33 @@ def plan_shares(
     env_steps: float = 0,
     natural: F64 | None = None,
     unknown: Mapping[str, str] | None = None,
+    lacking: Mapping[str, str] | None = None,
 ) -> SharePlan:
     """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
 
     `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule,
     `natural` (S,) the shares that the rows stand for, where that is not their own. `unknown` are
-    strata that no row could be in, and why.
+    strata that no row could be in, and why; `lacking` others with too few rows, and what to change.
 
     Raises:
         MixtureError: shares that cannot sum to 1, or a shortfall where the mixture refuses one.
     """
     wanted = wanted_shares(rules, rows if natural is None else natural, env_steps)
     limit = row_limits(mixture, rules, rows, episodes, draws)
-    untold = unknown or {}
+    untold, too_few = unknown or {}, lacking or {}
     caps = np.array([rule.cap for rule in rules])
 
     def complaints() -> str:
-        return "; ".join(
-            f"{rule.name} wants {wanted[i]:.1%}, "
-            + (
-                f"and is unknown in every row: {why}"
-                if (why := untold.get(rule.name))
-                else f"its {rows[i]} rows in {episodes[i]} episodes allow {limit[i]:.1%}"
-            )
-            for i, rule in enumerate(rules)
-            if wanted[i] > limit[i] + 1e-12
-        )
+        lines = []
+        for i, rule in enumerate(rules):
+            why = f"its {rows[i]:,} rows in {episodes[i]:,} episodes allow {limit[i]:.2%}"
+            if rule.name in untold:
+                why = f"and is unknown in every row: {untold[rule.name]}"
+            elif rule.name in too_few:
+                why = f"and {too_few[rule.name]}"
+            if wanted[i] > limit[i] + 1e-12:
+                lines.append(f"{rule.name} wants {wanted[i]:.1%}, {why}")
+        return "\n  ".join(lines)
 
     shares = within_limits(wanted, limit, caps, mixture.shortfall, complaints)
     notes = [
@@ -85,13 +86,13 @@ def within_limits(
         return SharePlan(wanted, wanted, 1.0, ("",) * len(wanted))
     if shortfall == "refuse":
         raise MixtureError(
-            f"not enough rows: {complaints()}",
+            f"not enough rows:\n  {complaints()}",
             remedy='lower the shares, raise max_replays_per_row, or set shortfall = "redistribute"',
         )
     if granted.sum() <= 0:
         raise MixtureError(
-            "no stratum has rows that can be drawn",
-            remedy="`restock audit` shows what the store holds; lower min_rows or the conditions",
+            f"no stratum has rows that can be drawn:\n  {complaints()}",
+            remedy="`restock sql STORE 'FROM coverage_by_condition'` shows what the store holds",
         )
     notes = np.where(short, "short of rows", "")
     if shortfall == "shrink":
@@ -150,10 +151,11 @@ def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: flo
     low = np.array([rule.floor for rule in rules]) * flexible
     high = np.where(flexible, [rule.cap for rule in rules], 0.0)
     if low.sum() > rest + 1e-9 or high.sum() < rest - 1e-9:
+        names = ", ".join(rules[i].name for i in np.flatnonzero(flexible).tolist())
         raise MixtureError(
-            f"the strata's floors sum to {low.sum():g} and their caps to {high.sum():g}, which"
+            f"the floors of {names} sum to {low.sum():g} and their caps to {high.sum():g}, which"
             f" leave no way to share out {rest:g}",
-            remedy="lower a floor, or raise a cap",
+            remedy="lower a floor or a given share, or raise a cap",
         )
     return given + rest_within(base, low, high, max(rest, 0.0))
 

@@ -57,6 +57,7 @@ from restock.replay.plan.strata import (
     resolve_strata,
 )
 from restock.replay.plan.transition_ids import Places, stretches
+from restock.replay.plan.unfilled import taken_by_others
 from restock.replay.plan.weights import RatioFit
 
 LOGS = "logs"  # the name of the first store's part
@@ -155,6 +156,8 @@ def plan_panel(
             out.reasons[f"of {other.name!r}, in a store before it too"] = other.repeated_rows
     if mixture.prefer == "rarest":
         stratum, state_code = _dealt(table, strata, member, stratum, state_code, ~out.gone)
+    warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
+    taken = taken_by_others(table, strata, member, stratum, out.admitted)
     del member
     beyond_cap = leave_out_of_strata(table, mixture, strata, stratum, out)
     if out.gone.all():
@@ -164,7 +167,6 @@ def plan_panel(
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))
-    warnings: tuple[str, ...] = (split.warning,) if split.warning else ()
     if others:
         met = episodes_met(connection, mixture, conditions)
         names = [named.name for named in strata]
@@ -172,9 +174,11 @@ def plan_panel(
     occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)
     worked_out = [
-        plan_source(connection, mixture, strata, source, natural, unknown)
+        plan_source(connection, mixture, strata, source, natural, unknown, taken)
         for source, natural in zip(given, occurs, strict=True)
     ]
+    for source, plan in zip(given, worked_out, strict=True):
+        warnings += tuple(f"{_prefix(source)}{text}" for text in plan.warnings)
     return _joined(
         mixture,
         strata,
@@ -312,7 +316,7 @@ def _joined(
             )
             column[at] = plan.outcome[:, index] if plan.outcome is not None else 0
         of_logs = float(part_of_logs[number])
-        prefix = "" if source.name == LOGS else f"{source.name}/"
+        prefix = _prefix(source)
         found |= {f"{prefix}{name}": rows for name, rows in plan.found.items()}
         lines += [
             msgspec.structs.replace(
@@ -353,6 +357,11 @@ def _joined(
         ratios=tuple(plan.fit for plan in worked_out if plan.fit is not None),
         warnings=warnings,
     )
+
+
+def _prefix(source: SourceRows) -> str:
+    """What stands before the names of a source's strata."""
+    return "" if source.name == LOGS else f"{source.name}/"
 
 
 def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:

@@ -26,6 +26,7 @@ from restock.replay.mixture.shares import (
 from restock.replay.plan.exclusions import scramble
 from restock.replay.plan.forecast import Forecast, forecast
 from restock.replay.plan.strata import ResolvedStratum, Stratum
+from restock.replay.plan.unfilled import too_few
 from restock.replay.plan.weights import (
     RatioFit,
     RatioRows,
@@ -65,6 +66,7 @@ class SourcePlan:
     outcome: F32 | None  # (kept, S) P(stratum | state, action), where one is estimated
     fit: RatioFit | None
     lines: list[Stratum]
+    warnings: tuple[str, ...]  # of strata without the rows for any of their share
     found: dict[str, F64]  # of strata that lack rows: their rows in each episode (E,), or NaN
 
     @property
@@ -80,11 +82,12 @@ def plan_source(
     source: SourceRows,
     natural: F64 | None = None,
     unknown: Mapping[str, str] | None = None,
+    taken: Mapping[str, str] | None = None,
 ) -> SourcePlan:
     """Shares, weights and lines of one source.
 
     `natural` (S,) are the shares that its rows stand for, where that is not their own; `unknown`
-    the conditions that none of them tells, and why.
+    the conditions that none of them tells, and why; `taken` the strata that another one empties.
 
     Raises:
         MixtureError: too few rows, bounds of [adaptive] that no shares keep, or weights that take a
@@ -102,8 +105,23 @@ def plan_source(
         for rule, count in zip(rules, rows, strict=True)
         if not count and rule.where is None and (why := (unknown or {}).get(rule.name))
     }
+    lacking = {
+        rule.name: too_few(rule, *has) for rule, *has in zip(rules, rows, episodes, strict=True)
+    }
+    lacking = {name: why for name, why in (lacking | dict(taken or {})).items() if why}
     shares = plan_shares(
-        mixture, rules, rows, episodes, draws=draws, natural=natural, unknown=untold
+        mixture,
+        rules,
+        rows,
+        episodes,
+        draws=draws,
+        natural=natural,
+        unknown=untold,
+        lacking=lacking,
+    )
+    wanted = (rule.name for rule, share in zip(rules, shares.wanted, strict=True) if share > 0)
+    warnings = tuple(
+        f"{name} {lacking[name]}" for name in wanted if name in lacking and name not in untold
     )
     _refuse_later_shares(rules, rows if natural is None else natural)
     if mixture.adaptive is not None:  # as a run would refuse it
@@ -154,7 +172,7 @@ def plan_source(
     ]
     if mixture.correction.below_natural == "refuse":
         _refuse_below_natural(lines)
-    return SourcePlan(shares, kept, weight, outcome, fit, lines, found)
+    return SourcePlan(shares, kept, weight, outcome, fit, lines, warnings, found)
 
 
 def _hours(driving: Forecast | None) -> dict[str, float]:

@@ -143,7 +143,8 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             f"stratum {rule.name!r} is not a condition or exposure of this store, and has no "
             "`where`",
             where="mixture",
-            remedy=f"the store knows {', '.join([NOMINAL, *sorted(known)])}",
+            remedy=f"name one of {', '.join([NOMINAL, *sorted(known)])}; or give it a `where`; or"
+            " add it to the profile and run `restock label`",
         )
     if rule.unit == "episode":
         # Chosen by what the whole episode met, not by what came of this step.

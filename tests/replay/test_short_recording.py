@@ -45,17 +45,23 @@ def test_every_shipped_mixture_packs_one_episode(name: str, tmp_path: Path, caps
     assert found["leakage"]["status"] == "pass"
 
 
-def test_what_is_short_is_told_as_shares_of_the_batch_that_logs_get_less_of(
+def test_wanted_is_a_share_of_a_batch_in_the_table_and_nowhere_another_one(
     tmp_path: Path, capsys
 ) -> None:
-    """Of few rows a stratum may be short, and yet more of them than was wanted."""
+    """Of few rows a stratum may be short, and yet more of the logged rows than was wanted."""
     store = write_store(tmp_path / "store", [drive(50)], task=TASK)
     assert cli.main(["mix", str(store), "--dry-run"]) == 0
     said = capsys.readouterr().out
-    assert re.search(r"logs get \d\.\d% of a batch, not 50\.0%", said)
-    short = re.findall(r"short of rows \((.*)% of a batch wanted, (.*)% drawn\)", said)
+    fill = r"logged rows fill \d\.\d% of a batch, not 50\.0% \(\[sources\]\): there are not enough"
+    assert re.search(fill, said)
+    (header,) = (line for line in said.splitlines() if "wanted: %" in line)
+    assert re.search(r"natural: % +wanted: % +drawn: % of +% of their", header)
+    assert re.search(r"stratum .* of rows +of a batch +logged rows +gradient", said)
+    (nominal,) = (line.split() for line in said.splitlines() if line.startswith(" nominal "))
+    assert nominal[4] == "40"
+    short = [line for line in said.splitlines() if ": short of rows" in line]
     assert len(short) >= 4
-    assert all(float(drawn) < float(wanted) <= 20 for wanted, drawn in short)
+    assert not any("%" in line for line in short)
 
 
 def test_an_episode_too_short_to_split_is_learnt_from_whole(tmp_path: Path, capsys) -> None:

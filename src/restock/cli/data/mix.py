@@ -223,7 +223,7 @@ def _missing(line: dict[str, Any]) -> str:
         return ""
     text = f"; {counted(line['missing_rows'], 'more row')} would fill it"
     if line["missing_hours"] is None:
-        return f"{text}, and none of these logs went to it"
+        return f"{text}, and these logs have none: no rate is known"
     ends = ("missing_hours", "missing_hours_low", "missing_hours_high")
     hours, low, high = (figure(line[name]) for name in ends)
     return f"{text}: {hours} h of driving ({low} to {high})"

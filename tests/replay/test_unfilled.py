@@ -1,0 +1,178 @@
+"""Strata that want a share and have nearly no rows: each is named, with what gives it some."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.paths import ROOT
+from support.profile_texts import WAREHOUSE
+from support.stores import recording_transitions, write_store
+
+from restock.cli import main
+
+# In all 14 episodes of these logs the wheels lose .25 m/s within a step, in one of them .4.
+BRAKING = """
+[[condition]]
+name = "hard_braking"
+timing = "pre"
+priority = 60
+sql = "wheel_speed_mps - lag(wheel_speed_mps) OVER episode < -{}"
+"""
+NOMINAL = '[[strata]]\nname = "nominal"\nunit = "episode"\nshare = 0.4\n'
+EACH = '[each_condition]\nunit = "episode"\nshare = "equal"\n'
+LISTED = '[[strata]]\nname = "{}"\nunit = "{}"\nshare = "equal"\n'
+
+
+@pytest.fixture(scope="module")
+def braking(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real recording, labelled by a profile that calls every stop hard braking."""
+    folder = tmp_path_factory.mktemp("braking")
+    (folder / "amr.toml").write_text(WAREHOUSE + BRAKING.format(0.25))
+    log, store = str(ROOT / "sample_logs" / "amr_tuesday"), str(folder / "store")
+    profile = str(folder / "amr.toml")
+    assert main(["ingest", log, "--store", store, "--profile", profile]) in (0, 3)
+    return folder
+
+
+class Mix:
+    """`restock mix --dry-run` of a mixture's text."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self.capsys = folder, capsys
+
+    def __call__(self, store: Path, text: str) -> tuple[dict[str, dict[str, Any]], list[str]]:
+        assert self.run(store, text, "--json") == 0
+        plan = json.loads(self.capsys.readouterr().out)
+        return {line["stratum"]: line for line in plan["strata"]}, plan["warnings"]
+
+    def refused(self, store: Path, text: str) -> str:
+        assert self.run(store, text) == 2
+        return self.capsys.readouterr().err
+
+    def run(self, store: Path, text: str, *options: str) -> int:
+        (self.folder / "mine.toml").write_text(text)
+        self.capsys.readouterr()
+        chosen = ("--mixture", str(self.folder / "mine.toml"), "--dry-run")
+        return main(["mix", str(store), *chosen, *options])
+
+
+@pytest.fixture
+def mix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Mix:
+    return Mix(tmp_path, capsys)
+
+
+def test_a_condition_that_every_episode_meets_is_named_with_what_fills_nominal(
+    braking: Path, tmp_path: Path, mix: Mix
+) -> None:
+    store = braking / "store"
+    strata, (warning,) = mix(store, NOMINAL + EACH)
+    assert strata["nominal"]["rows"] == 0
+    said = "nominal has 0 of 14 episodes, since hard_braking is met in 14 of them: "
+    assert warning.startswith(said)
+    assert mix.run(store, NOMINAL + EACH) == 0
+    assert f"warning: {said}" in mix.capsys.readouterr().err
+    # It does not hide behind a refusal.
+    refused = mix.refused(store, 'shortfall = "refuse"\n' + NOMINAL + EACH)
+    assert "nominal wants 40.0%, and has 0 of 14 episodes, since hard_braking is met in" in refused
+
+    # Each remedy that it gives fills the shelf.
+    steps = re.search(r"min_steps = (\d+) \(half of its episodes have (\d+) such steps", warning)
+    assert steps is not None
+    others = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
+    remedies = {
+        'unit = "step"': LISTED.format("hard_braking", "step") + EACH,
+        "min_steps": f"{LISTED.format('hard_braking', 'episode')}min_steps = {steps[1]}\n{EACH}",
+        "list the other conditions": "".join(LISTED.format(name, "episode") for name in others),
+    }
+    for name, rest in remedies.items():
+        assert name in warning
+        strata, warnings = mix(store, NOMINAL + rest)
+        assert strata["nominal"]["rows"] > 100, name
+        assert not [text for text in warnings if text.startswith("nominal")]
+    assert "raise its threshold in the profile and run `restock label`" in warning
+    raised, again = tmp_path / "raised.toml", tmp_path / "again"
+    shutil.copytree(store, again)
+    raised.write_text(WAREHOUSE + BRAKING.format(0.4))
+    assert main(["label", str(again), "--profile", str(raised)]) == 0
+    strata, warnings = mix(again, NOMINAL + EACH)
+    assert strata["nominal"]["rows"] > 100
+    assert not [text for text in warnings if text.startswith("nominal")]
+
+
+def test_a_stratum_that_another_one_goes_before_is_told_its_priority(
+    tmp_path: Path, mix: Mix
+) -> None:
+    store = write_store(tmp_path / "store", [recording_transitions(n) for n in (1, 2)])
+    before = '[[strata]]\nname = "moving"\nwhere = "step_index > 1"\npriority = 5\nshare = 0.5\n'
+    each = '[each_condition]\nshare = "equal"\ncorrection = "none"\n[correction]\npost = "none"\n'
+    strata, warnings = mix(store, before + each)
+    (slips,) = (text for text in warnings if text.startswith("wheel_slip has "))
+    had = int(re.findall(r"wheel_slip has (\d+) of \d+ rows, since moving is met in \d+", slips)[0])
+    assert slips.endswith(": give wheel_slip priority = 4, which is before moving")
+    own = '[[strata]]\nname = "wheel_slip"\nshare = "equal"\npriority = 4\n'
+    filled, warnings = mix(store, before + own + each)
+    assert filled["wheel_slip"]["rows"] > 5 * max(had, strata["wheel_slip"]["rows"])
+    assert not [text for text in warnings if text.startswith("wheel_slip")]
+
+
+def test_nothing_is_said_of_strata_with_what_they_want(store_path: Path, mix: Mix) -> None:
+    assert mix(store_path, "[each_condition]\nshare = 'natural'\n")[1] == []
+    assert mix(store_path, "[each_condition]\nshare = 'equal'\n")[1] == []
+    # Without a wanted share an empty stratum is no mistake.
+    never = '[[strata]]\nname = "never"\nwhere = "false"\nshare = {}\n[each_condition]\n'
+    assert mix(store_path, never.format(0.0))[1] == []
+    assert mix(store_path, never.format('"natural"'))[1] == []
+
+
+def test_a_quota_for_what_the_logs_lack_is_named_with_what_to_change(
+    braking: Path, mix: Mix
+) -> None:
+    store = braking / "store"
+    where = "where = \"NOT list_contains(conditions, 'wheel_slip')\"\n"
+    strata, warnings = mix(store, where + "[each_condition]\nshare = 'equal'\n")
+    assert strata["wheel_slip"]["rows"] == 0
+    assert (
+        "wheel_slip has no row that may be drawn: record some (see `restock gaps`), or leave it"
+        " out of the strata" in warnings
+    )
+    assert strata["wheel_slip"]["missing_hours"] is None
+    own = '[[strata]]\nname = "wet_floor"\nwhere = "zone = \'nowhere\'"\nshare = 0.2\n'
+    assert any(
+        text.startswith("wet_floor has no row") and text.endswith("or change its `where`")
+        for text in mix(store, own + EACH)[1]
+    )
+    unknown = mix.refused(store, own.replace("where = \"zone = 'nowhere'\"\n", "") + EACH)
+    assert "stratum 'wet_floor' is not a condition or exposure of this store" in unknown
+    assert "name one of nominal, " in unknown
+    assert "or give it a `where`; or add it to the profile and run `restock label`" in unknown
+
+
+def test_quotas_that_no_shelf_can_fill_are_each_named(store_path: Path, mix: Mix) -> None:
+    least = "[each_condition]\nshare = 'equal'\nmin_rows = 100_000\nmin_episodes = 500\n"
+    names = ("nominal", "recovery", "near_collision", "wheel_slip", "blocked_aisle")
+    for shortfall in ("redistribute", "shrink", "refuse"):
+        refused = mix.refused(store_path, f"shortfall = '{shortfall}'\n{least}")
+        for name in names:
+            found = re.search(
+                rf"^  {name} wants 20.0%, and has [\d,]+ rows in \d+ episodes, too few for its"
+                r" min_rows = 100,000 and min_episodes = 500: lower that, or record more$",
+                refused,
+                re.MULTILINE,
+            )
+            assert found, (shortfall, name, refused)
+    limit = "shortfall = 'refuse'\nmax_replays_per_row = 3\n[each_condition]\nshare = 'equal'\n"
+    refused = mix.refused(store_path, limit)
+    for name in names:
+        assert re.search(rf"^  {name} wants 20.0%, its .* rows in \d+ episodes allow 0.\d\d%$",
+                         refused, re.MULTILINE)  # fmt: skip
+    assert "lower the shares, raise max_replays_per_row" in refused
+    floors = "[[strata]]\nname = 'nominal'\nshare = 0.9\n[each_condition]\nfloor = 0.1\n"
+    assert (
+        "the floors of recovery, near_collision, wheel_slip, blocked_aisle sum to 0.4"
+        in mix.refused(store_path, floors)
+    )
