@@ -40,6 +40,7 @@ class Collecting:
     """The warehouse with short episodes, driven at random, and what went into the ring."""
 
     folder: Path
+    n_step: int = 1
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     steps: int = 0
 
@@ -57,6 +58,7 @@ class Collecting:
             ENVS,
             task.observation_size,
             discount=0.9,
+            n_step=self.n_step,
             conditions=ring_conditions(self.profile.conditions),
         )
         self.collector = Collector(self.env, self.ring, self.profile.conditions, task, None)
@@ -128,6 +130,41 @@ def test_a_flushed_run_is_a_recording_like_any_other(
     assert [row["step_index"] for row in last] == [LONGEST - 1] * 2 * ENVS
     stamps = np.array([row["stamp_ns"] for row in rows])
     assert (np.diff(stamps) > 0).all()
+
+
+def test_returns_of_a_truncated_episode_of_the_twin_bootstrap_at_its_last_step(
+    tmp_path: Path,
+) -> None:
+    """The ring's rows of three steps against the single steps that the twin returned."""
+    made = Collecting(tmp_path / "run", n_step=3)
+    step_of: dict[tuple[int, int], tuple[Any, ...]] = {}
+    for number in range(2 * LONGEST):
+        before, action = made.collector.observation.copy(), made.rng.integers(0, 9, ENVS)
+        returned = made.collector.start(action, np.ones(ENVS, np.float32))
+        after, reward, terminated, truncated, info = returned
+        assert not terminated.any()
+        assert truncated.all() == truncated.any() == (number % LONGEST == LONGEST - 1)
+        after = info["final_obs"] if truncated.any() else after  # not the next episode's first
+        for env in range(ENVS):
+            step_of[env, number] = before[env], action[env], reward[env], after[env].copy()
+        made.collector.finish(env_steps=number * ENVS, gradient_steps=0, acting_step=0)
+    ring, columns = made.ring, made.ring.columns
+    assert len(ring) == len(step_of)
+    slot_of = {
+        packed[columns["observation"]].tobytes(): slot
+        for slot, packed in enumerate(ring.rows[: len(ring)])
+    }
+    for (env, number), (observation, action, *_) in step_of.items():
+        horizon = min(3, LONGEST - number % LONGEST)
+        span = [step_of[env, number + ahead] for ahead in range(horizon)]
+        slot = slot_of[observation.tobytes()]
+        packed = ring.rows[slot]
+        total = sum(0.9**ahead * step[2] for ahead, step in enumerate(span))
+        assert packed[columns["reward"]][0] == pytest.approx(total, abs=1e-5)
+        assert packed[columns["discount"]][0] == pytest.approx(0.9**horizon, rel=1e-6)
+        assert packed[columns["action"]][0] == action
+        np.testing.assert_array_equal(packed[columns["next_observation"]], span[-1][3])
+        assert ring.meta["horizon"][slot] == horizon
 
 
 def test_rows_are_those_that_ingest_makes_of_the_same_steps(tmp_path: Path) -> None:
