@@ -8,7 +8,7 @@ from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.replay.panel.panel import Panel
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig
-from restock.train.feed.cloned_rows import cloned
+from restock.train.feed.imitation import cloned
 from restock.train.feed.practice import MOVING
 from restock.train.loop import TrainResult, time_left
 from restock.train.prepare import Prepared, rows_by_policy

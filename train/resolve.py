@@ -10,7 +10,7 @@ from restock.ingest.task.task import Mirror, Task
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
-from restock.train.feed.cloned_rows import cloned
+from restock.train.feed.imitation import cloned
 from restock.train.missions import mission_orders
 from restock.train.twin.env.interface import AFTER_LOGS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation

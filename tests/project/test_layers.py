@@ -66,7 +66,7 @@ MAY_IMPORT = {
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel replay/ring"
-        " replay/sampling ingest/task"
+        " replay/plan replay/sampling ingest/task"
     ),
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (

@@ -22,7 +22,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.describe import describe_run
 from restock.train.dqn.config import TeacherConfig
-from restock.train.feed.cloned_rows import cloned, of_policies, of_successes
+from restock.train.feed.imitation import cloned, of_policies, of_successes
 from restock.train.feed.logs import Coded
 from restock.train.prepare import prepare_new
 

@@ -72,9 +72,13 @@ def test_a_run_says_what_it_was_made_from(trained: Path, panel: Path) -> None:
     assert document["target"] == {"rule": "polyak", "tau": 0.005, "effective_lag_updates": 200.0}
     assert document["seeds"]["run"] == 0
     assert set(document["versions"]) >= {"restock", "torch", "mujoco", "python"}
-    # The mixture is worked out for this run's own draws: half of a batch is from logs.
-    assert document["panel"]["logs_share"] == 0.5
-    assert sum(document["panel"]["strata"].values()) == pytest.approx(1)
+    # What fills the quotas is worked out for this run's own draws: half of a batch is from logs,
+    # and all of it offline.
+    forecast, planned = document["panel"]["forecast"], document["panel"]["planned_draws"]
+    assert sum(row["wanted_share"] for row in forecast) == pytest.approx(1)
+    logged = sum(row["logs_share"] for row in forecast)
+    whole = planned["offline"] + planned["online"]
+    assert logged == pytest.approx((planned["offline"] + planned["online"] / 2) / whole)
     assert document["config"]["epsilon"]["start"] == 0.2  # it has learnt to drive offline
 
 
@@ -87,7 +91,7 @@ def test_offline_then_online_batches_are_half_from_the_panel(trained: Path) -> N
     assert {row["behaviour_policy"] for row in audit} >= {"planner", "dqn"}
 
 
-def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_path: Path) -> None:
+def test_a_run_says_what_fills_its_quotas(panel: Path, tmp_path: Path) -> None:
     task = load_profile("warehouse_amr").task
     text = "max_replays_per_row = 4\n[each_condition]\nshare = 'natural'\n"
     rows = recording_transitions(1, episodes=40, task=task)
@@ -95,14 +99,15 @@ def test_a_run_says_why_logs_get_less_than_the_mixture_wants(panel: Path, tmp_pa
     settings = [word for word in TINY if word != "--set"]
     longer = [*settings, "schedule.env_steps=9000"]
     said = describe_run(prepare_new(tmp_path / "a", few.path, None, longer))
-    share = (len(few) * 4 - 30 * 32) / (8900 * 0.25 * 32)
-    assert f"{share:.1%} of each batch (the mixture wants 50%" in said
-    assert "a row may be drawn 4 times" in said
-    said = describe_run(prepare_new(tmp_path / "a", panel, None, settings))
-    assert "50% of each batch;" in said
+    draws = 30 * 32 + 8900 * 0.25 * 32
+    nominal = next(stratum for stratum in few.strata if stratum.name == "nominal")
+    share = len(few) * 4 / draws * nominal.natural_share
+    assert f"{draws:,.0f} rows in 9,000 environment steps that the critic is fed: nominal" in said
+    assert f"({share:.1%} logged" in said
     untwinned = [*settings, "env.twin=false"]
     alone = describe_run(prepare_new(tmp_path / "a", panel, None, untwinned))
-    assert "all of each batch;" in alone
+    assert "logged)" in alone
+    assert "fresh" not in alone
     assert "in the twin" not in alone
 
 
