@@ -135,9 +135,11 @@ def nothing_to_do(session: Session) -> str | None:
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
     """Why a run has learnt nothing, or nothing in the twin; None where it has."""
+    if outcome.online_updates:
+        return None
     if not outcome.gradient_steps:
         learnt = "as random as at the beginning"
-    elif outcome.env_steps and outcome.gradient_steps <= config.schedule.offline_updates:
+    elif outcome.env_steps:
         learnt = f"that of the {outcome.gradient_steps:,} updates on the logs alone"
     else:
         return None

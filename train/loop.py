@@ -60,6 +60,7 @@ class TrainResult:
 
     env_steps: int
     gradient_steps: int
+    online_updates: int  # of the gradient steps, those made while it drove in the twin
     wall_s: float
     best: Score | None
     last: Score | None
@@ -206,6 +207,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
     return TrainResult(
         progress.env_steps,
         learner.gradient_steps,
+        progress.online_updates,
         session.wall_s,
         session.best,
         session.last,

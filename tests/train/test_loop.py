@@ -458,8 +458,16 @@ def test_a_run_whose_updates_were_all_on_the_logs_says_so(tmp_path: Path) -> Non
     said = no_update(outcome, settings)
     assert said is not None
     assert said.startswith("no update was made in 40 environment steps, so the policy is that of")
-    assert no_update(dataclasses.replace(outcome, gradient_steps=6), settings) is None
     assert no_update(dataclasses.replace(outcome, env_steps=0), settings) is None
+
+
+def test_updates_in_the_twin_count_however_many_on_the_logs_were_asked_for(tmp_path: Path) -> None:
+    settings = config(schedule={"env_steps": 600, "offline_updates": 10_000})
+    live = session(tmp_path / "a", settings, logs=None)
+    outcome = train(live)
+    live.close()
+    assert 0 < outcome.online_updates == outcome.gradient_steps < 10_000
+    assert no_update(outcome, settings) is None
 
 
 def test_a_run_whose_budget_is_used_up_says_so_when_it_is_resumed(
