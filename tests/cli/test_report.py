@@ -678,9 +678,9 @@ def test_shares_after_weights_count_intervals_by_what_was_drawn_in_them(tmp_path
 
 
 def test_the_kept_evaluation_is_the_best_and_not_the_last(run: Path) -> None:
-    kept = gather(run).kept
+    kept = gather(run).policy
     assert kept is not None
-    assert (kept["env_steps"], kept["success"]) == (2000, 1.0)
+    assert (kept.chosen, kept.env_steps, kept.gradient_steps) == ("best", 2000, 500)
 
 
 def test_the_evaluation_bias_is_named(run: Path) -> None:

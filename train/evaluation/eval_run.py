@@ -1,4 +1,4 @@
-"""Evaluating a finished run: its kept policy beside scripted ones, on the same episodes.
+"""Evaluating a run: its policy beside scripted ones, on the same episodes.
 
 Every policy drives the same seeded episodes, clean and under each perturbation; blocked aisles are
 split by how much of the aisle is blocked. Seeds differ from those that training drew its
@@ -47,14 +47,14 @@ def evaluate(
     layouts: str | None = None,
     limiter: str | None = None,
 ) -> list[dict[str, Any]]:
-    """Drive a run's kept policy and its references through the same episodes, as `restock eval`.
+    """Drive a run's policy and its references through the same episodes, as `restock eval`.
 
     Returns a row per policy, perturbation and condition: success, return, bumps per km,
     closest approach to people and time lost against the planner, with 95 % intervals over episodes.
     The episodes are kept in the run's `eval/episodes.parquet`.
 
     Args:
-        policies: agent (the run's best), planner, operator, random, cloned (the way the logs were
+        policies: agent (the run's own), planner, operator, random, cloned (the way the logs were
             driven), `cloned:DRIVER`, `onnx:FILE` or `run:DIRECTORY`.
         perturbations: none, friction, latency, payload, wheels, sensors, or a TOML file.
         episodes: of each kind, or by kind: `{"nominal": 1000, "wheel_slip": 300}`.
@@ -63,7 +63,7 @@ def evaluate(
             it in front, as `limited:NAME`.
 
     Raises:
-        RunError: no such run, or it kept no policy yet.
+        RunError: no such run, or it has no policy yet.
         ConfigError: no such policy or perturbation, or no floor with room for any episode.
     """
     plan = plan_evaluation(
@@ -153,6 +153,7 @@ def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
 
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
     """One row an episode."""
+    origins = {name: origin.env_steps for name, origin in plan.origins.items()}
     rows = [
         {
             "policy": policy,
@@ -164,6 +165,7 @@ def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str
             "stopped_s": result.stopped_s,
             "failure": result.failure,
             "version": versions[policy],
+            "trained_env_steps": origins.get(policy.removeprefix(LIMITED)),
             "layouts": plan.floors,
         }
         for (policy, perturbation), episodes in results.items()

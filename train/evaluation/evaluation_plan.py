@@ -15,7 +15,7 @@ from restock.toml import read_toml, typed
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.evaluation.cloned import CLONED, cloned_panel, is_cloned, load_cloned
 from restock.train.evaluation.logged_ways import EVERY, HELD_OUT, LoggedMissions, logged_missions
-from restock.train.evaluation.policies import load_agent, load_policy
+from restock.train.evaluation.policies import GreedyPolicy, load_agent, load_policy
 from restock.train.evaluation.references import (
     FIRST_SEED,
     REFERENCES,
@@ -24,6 +24,7 @@ from restock.train.evaluation.references import (
 )
 from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_evaluations import WAYS
+from restock.train.run.kept_policy import PolicyOrigin
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
@@ -61,6 +62,7 @@ class EvaluationPlan:
     limits: Limits | None = None  # every policy once more, with this limiter in front
     left_out: dict[str, list[str]] = field(default_factory=dict)  # kinds -> floors without room
     missions: LoggedMissions | None = None  # None: drawn on the floor, by their seeds
+    loaded: dict[str, Policy] = field(default_factory=dict)  # those of runs and files, by name
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -106,6 +108,12 @@ class EvaluationPlan:
         ]
 
     @property
+    def origins(self) -> dict[str, PolicyOrigin]:
+        """From which step of training the run's own policy is, and that of each other run."""
+        own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
+        return {name: origin for name, origin in own.items() if origin is not None}
+
+    @property
     def total(self) -> int:
         """Episodes to drive."""
         episodes = len(self.specs)
@@ -131,7 +139,7 @@ def plan_evaluation(
     profile, or a TOML file with one.
 
     Raises:
-        RunError: no such run, or it kept no policy yet.
+        RunError: no such run, or it has no policy yet.
         ConfigError: a policy or perturbation that does not exist, floors without room for any
             kind of episode, no episodes, or a seed that generators do not take.
     """
@@ -162,7 +170,7 @@ def plan_evaluation(
         if is_cloned(name):
             cloned_panel(run, name)
         elif name == "agent" or _is_path("policies", name):
-            make_policy(name, plan)  # refused before anything is driven
+            plan.loaded[name] = make_policy(name, plan)  # refused before anything is driven
     return plan
 
 
@@ -229,7 +237,9 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """The run's kept policy, a scripted one, or one that is named."""
+    """The run's policy, a scripted one, or one that is named."""
+    if name in plan.loaded:
+        return plan.loaded[name]
     if name == "agent":
         return load_agent(plan.run)
     if is_cloned(name):
@@ -301,6 +311,7 @@ def settings(plan: EvaluationPlan) -> dict[str, Any]:
     return {
         "run": str(plan.run.path),
         "policies": list(plan.policies),
+        "trained": {name: origin.document for name, origin in plan.origins.items()},
         "perturbations": {
             name: msgspec.to_builtins(perturbation or Perturbation())
             for name, perturbation in plan.perturbations.items()

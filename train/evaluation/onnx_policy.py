@@ -34,12 +34,12 @@ _OPSET = 18
 
 
 def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
-    """Write a run's kept policy to `out`: input `observation` (N, D), outputs `values` (N, A) and
+    """Write a run's policy to `out`: input `observation` (N, D), outputs `values` (N, A) and
     `action` (N,). With a teacher's filter both networks are in it, and the values of actions that
     are not plausible are -inf.
 
     Raises:
-        RunError: no such run, no policy kept, or there is something at `out` already.
+        RunError: no such run, no policy yet, or there is something at `out` already.
         ConfigError: the extra `onnx` is not installed, or `out` lies within a store, a panel or
             another run.
     """
@@ -61,6 +61,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
         "profile_toml": profile_toml(profile),
         "run": run.path.resolve().name,
         "version": agent.version,
+        "trained": "" if agent.origin is None else agent.origin.text,
         "restock_version": __version__,
     }
     onnx.helper.set_model_props(model, metadata)

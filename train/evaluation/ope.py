@@ -40,6 +40,7 @@ from restock.train.evaluation.off_policy.dataset import (
 from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes, estimate
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.run.fed_panel import run_panel
+from restock.train.run.kept_policy import PolicyOrigin
 from restock.train.run.run import Run
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import TABLES
@@ -70,6 +71,7 @@ class OpeResult:
     rows: list[dict[str, Any]]
     notes: tuple[str, ...]
     version: str  # of the policy
+    origin: PolicyOrigin | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,7 @@ class OpePlan:
         return {
             "run": str(self.path),
             "policy": self.policy.version,
+            "trained": None if self.policy.origin is None else self.policy.origin.document,
             "measures": list(self.measures),
             "episodes": len(np.unique(evaluated.episode)),
             "rows": len(evaluated.rows),
@@ -131,7 +134,7 @@ def evaluate_run_off_policy(
     *,
     write: bool = True,
 ) -> OpeResult:
-    """Evaluate the policy that a run kept, and write `RUN/eval/off_policy.parquet`.
+    """Evaluate the policy of a run, and write `RUN/eval/off_policy.parquet`.
 
     Args:
         path: the run.
@@ -140,7 +143,7 @@ def evaluate_run_off_policy(
         write: whether to write the file.
 
     Raises:
-        RunError: no such run, no policy kept, or no episode that it did not learn from.
+        RunError: no such run, no policy yet, or no episode that it did not learn from.
         StoreError, PanelError: no such logs.
     """
     return evaluate_planned(plan_off_policy(Path(path), logs, config), progress, write=write)
@@ -160,11 +163,13 @@ def evaluate_planned(
             between=(lambda: None) if progress is None else (lambda: progress(1)),
         )
     if write:
-        steps = int(plan.policy.version.rpartition("@")[2])
-        clocks = {"env_steps": None, "gradient_steps": steps}
+        origin = plan.policy.origin
+        names = ("env_steps", "gradient_steps")
+        clocks = {name: None if origin is None else getattr(origin, name) for name in names}
         table = pa.Table.from_pylist([{**clocks, **row} for row in rows], TABLES["off_policy"])
         write_table(table, plan.path / "eval" / FILE)
-    return OpeResult(rows, notes_of(plan.task, plan.dataset, plan.config), plan.policy.version)
+    notes = notes_of(plan.task, plan.dataset, plan.config)
+    return OpeResult(rows, notes, plan.policy.version, plan.policy.origin)
 
 
 def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:

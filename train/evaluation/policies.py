@@ -1,4 +1,4 @@
-"""Policies by name: the network that a run kept, or an ONNX file. Whatever drives may use them."""
+"""Policies by name: the network of a run, or an ONNX file. Whatever drives may use them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.task.task import Task
 from restock.state import first_mismatch
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
-from restock.train.dqn.config import parse_config
-from restock.train.dqn.learner import greedy_actions
+from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
+from restock.train.run.kept_policy import PolicyOrigin, env_steps_of, latest_drives
 from restock.train.run.run import Run, resuming
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Policy
@@ -30,8 +31,11 @@ class GreedyPolicy:
 
     name = "agent"
 
-    def __init__(self, network: PolicyNetwork, version: str = "") -> None:
-        self.network, self.version = network, version
+    def __init__(
+        self, network: PolicyNetwork, version: str = "", origin: PolicyOrigin | None = None
+    ) -> None:
+        """`origin` is the step of its run that it is from."""
+        self.network, self.version, self.origin = network, version, origin
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
         action = greedy_actions(self.network, observation)
@@ -39,7 +43,7 @@ class GreedyPolicy:
 
 
 def load_policy(name: str, task: Task) -> Policy | None:
-    """The policy that `run:DIRECTORY` (its best) or `onnx:FILE` names; None for other names.
+    """The policy that `run:DIRECTORY` or `onnx:FILE` names; None for other names.
 
     Raises:
         ConfigError: no such file, or a policy of another task.
@@ -65,28 +69,30 @@ def load_policy(name: str, task: Task) -> Policy | None:
 
 
 def load_agent(run: Run) -> GreedyPolicy:
-    """The policy that a run kept as its best, greedy.
+    """The policy of a run that drives, as `kept_policy` says: greedy, with its step as `origin`.
 
     Raises:
-        RunError: none kept yet, a missing or damaged one, or one of a task that the profile no
-            longer is.
+        RunError: it has made no update yet, its policy is missing or damaged, or it is of a task
+            that the profile no longer is.
     """
-    if not run.best.exists() and not (
+    latest = latest_drives(run)
+    if not (latest or run.best.exists()) and not (
         run.latest.is_file() and kept_one(checkpoint.load(run.latest))
     ):
         raise RunError(
-            "has not kept a policy yet: it stopped before its first evaluation",
+            "has no policy yet: it stopped before its first update",
             where=str(run.path),
             remedy=f"continue it with {resuming(run.path)}",
         )
     config = parse_config(run.document["config"], where=str(run.path / "config.json"))
-    state = load_kept(run)
     task = profile_of_run(run).task
+    file = run.latest if latest else run.best
+    state = _latest_agent(run, config, task) if latest else load_kept(run)
     if state["task_hash"] != task.hash:
         raise RunError(
             f"its policy was trained on task {state['task_hash']}, profile"
             f" {config.profile!r} now defines {task.hash}",
-            where=str(run.best),
+            where=str(file),
             remedy="train again: the meaning of observations or actions has changed",
         )
     network = make_policy(config, state["observation_size"], state["actions"])
@@ -95,13 +101,43 @@ def load_agent(run: Run) -> GreedyPolicy:
     except RuntimeError as error:  # torch's of other shapes or names
         raise RunError(
             f"its policy is not of the network that config.json describes: {first_mismatch(error)}",
-            where=str(run.best),
+            where=str(file),
             remedy="put the settings back that were changed in config.json: network, teacher",
         ) from error
     if (start := state.get("start")) is not None:  # what the run began with is not beaten yet
         made = msgspec.convert(start, StartPolicy)
         network = start_network(made, network, task.scaled_actions)
-    return GreedyPolicy(network.eval(), version=f"{run.path.name}@{state['gradient_steps']}")
+    env_steps, updates = state["env_steps"], state["gradient_steps"]
+    origin = PolicyOrigin("latest" if latest else "best", env_steps, updates, env_steps_of(run))
+    return GreedyPolicy(network.eval(), f"{run.path.name}@{updates}", origin)
+
+
+def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
+    """The policy of the last checkpoint, as `save_agent` would have written it.
+
+    Raises:
+        RunError: the checkpoint is damaged, or not of the networks that config.json describes.
+    """
+    state = checkpoint.load(run.latest)
+    plain = msgspec.structs.replace(config, device="cpu")
+    learner = Learner(plain, task.observation_size, len(task.actions))
+    try:
+        learner.load_state_dict(state["learner"])
+    except (KeyError, ValueError, RuntimeError, RunError) as error:
+        raise RunError(
+            f"contains no policy of the network that config.json describes: {error}",
+            where=str(run.latest),
+            remedy="put the settings back that were changed in config.json: network, teacher",
+        ) from error
+    return {
+        "network": dict(learner.policy.state_dict()),
+        "observation_size": task.observation_size,
+        "actions": len(task.actions),
+        "task_hash": run.document["task_hash"],
+        "env_steps": state["progress"]["env_steps"],
+        "gradient_steps": learner.gradient_steps,
+        "start": state["start"] if state["progress"]["online_from"] is None else None,
+    }
 
 
 def kept_one(state: Mapping[str, Any]) -> bool:

@@ -113,8 +113,17 @@ def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     shown = table.filter(pa.array(mask, pa.bool_()))
     seeds = shown["episode_seed"]
     text = f"{shown.num_rows:,} of {every:,} episodes that `restock eval` drove: "
-    text += f"floors {_floors(last['layouts'] or 'not named')}, policy {version or 'not named'}, "
-    return shown, text + f"seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
+    text += f"floors {_floors(last['layouts'] or 'not named')}, policy {version or 'not named'}"
+    if (step := trained_step(shown)) is not None:
+        text += f" of step {step:,}"
+    return shown, text + f", seeds {pc.min(seeds).as_py()} to {pc.max(seeds).as_py()}."
+
+
+def trained_step(shown: pa.Table) -> int | None:
+    """After how many environment steps of training the run's own policy was taken."""
+    own = shown.filter(pc.equal(shown["policy"], "agent"))
+    step: int | None = own["trained_env_steps"][-1].as_py() if own.num_rows else None
+    return step
 
 
 def _floors(layouts: str) -> str:
@@ -145,4 +154,5 @@ __all__ = [
     "planner_times",
     "read_evaluations",
     "shown_evaluation",
+    "trained_step",
 ]

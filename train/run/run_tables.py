@@ -467,6 +467,11 @@ EVAL_EPISODES = _schema(
     ("end_y_m", _F, "y of the position where it ended"),
     ("failure", _S, "null | stuck | timeout | bump | cut"),
     ("version", _S, "version of the policy; null: from an earlier Restock"),
+    (
+        "trained_env_steps",
+        _I,
+        "environment steps of its training; null: scripted, cloned, or a file's",
+    ),
     ("layouts", _S, "floors that were requested; null: from an earlier Restock"),
     (
         "limited_s",

@@ -93,7 +93,7 @@ def _of_policy(run: Run, rows: F32, moment: Moment) -> Critic:
     reward, discount = torch.from_numpy(rows[:, -2]), torch.from_numpy(rows[:, -1])
     action = torch.from_numpy(rows[:, -3]).long()
     td = q.gather(1, action[:, None])[:, 0] - (reward + discount * after)
-    steps = int(agent.version.rpartition("@")[2] or 0)
+    steps = 0 if agent.origin is None else agent.origin.gradient_steps
     named = f"the policy that it kept, from update {steps:,}, used as its own target"
     return _critic(run, named, steps, q, td, moment)
 

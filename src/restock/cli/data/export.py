@@ -65,7 +65,8 @@ class ExportCommand:
                 output.print_json(made)
             else:
                 output.stdout().print(
-                    f"policy {made['version']} of task {made['task_hash']} -> {made['path']}"
+                    f"policy {made['version']} ({made['trained']}) of task {made['task_hash']}"
+                    f" -> {made['path']}"
                     f" ({made['bytes']:,} bytes)",
                     markup=False,
                 )

@@ -17,7 +17,10 @@ _DRIVES = (
 
 @dataclass
 class EvalCommand:
-    """Evaluate a run's kept policy on fixed episodes, beside scripted policies and a random one.
+    """Evaluate a run's policy on fixed episodes, beside scripted policies and a random one.
+
+    It is the best by the evaluations in training. Of a run that was interrupted before it evaluated
+    what it learned in the twin, it is the latest. The output names its step.
 
     Every policy drives the same seeded episodes of every condition for which the floors have room,
     without a perturbation and under each one. Prints success, return, bumps per kilometre, the
@@ -40,7 +43,7 @@ class EvalCommand:
     """Comma-separated: none, friction, latency, payload, wheels, sensors, or FILE.toml (for example
     from `restock twin fit`)."""
     policies: str = "agent,planner,random"
-    """Comma-separated: agent (the run's best), planner, operator, random, cloned (behaviour cloning
+    """Comma-separated: agent (the run's own), planner, operator, random, cloned (behaviour cloning
     of the logs' drivers), cloned:DRIVER, onnx:FILE, run:DIRECTORY."""
     seed: int = 10_000
     """Seed of the first episode. All policies drive the same seeds."""
@@ -183,6 +186,8 @@ class EvalCommand:
 
         if (rows := document.get("results")) is not None:
             show_measures(rows)
+            for name, origin in document.get("trained", {}).items():
+                say(f"{name}: {origin['text']}")
             for clone in document.get("clones", ()):
                 say(clone["text"])
             say(document.get("recorded", f"added to {self.run_path / 'eval' / 'episodes.parquet'}"))

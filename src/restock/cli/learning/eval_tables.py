@@ -69,6 +69,7 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
             {
                 "run": str(path),
                 "policy": result.version,
+                "trained": None if result.origin is None else result.origin.document,
                 "notes": list(result.notes),
                 "results": result.rows,
             }
@@ -82,10 +83,11 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
         )
         shown[row["estimator"]] = _value(row)
         shown["weights worth"] = f"{row['ess']:.1f} episodes"
+    step = "" if result.origin is None else f" ({result.origin.text})"
     print_table(
         list(cells.values()),
-        title=f"{result.version}, greedy with {config.epsilon:.0%} random actions, off-policy on "
-        "logs it did not learn from [95 % over episodes]",
+        title=f"{result.version}{step}, greedy with {config.epsilon:.0%} random actions, "
+        "off-policy on logs it did not learn from [95 % over episodes]",
     )
     for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:

@@ -139,6 +139,8 @@ class RecordCommand:
             wanted = {"path": str(self.out), "dry_run": True, **plan.describe()}
             output.print_json(wanted) if self.json else _print_plan(wanted)
             return
+        if (origin := getattr(policy, "origin", None)) is not None:
+            output.say(f"{plan.policy}: {origin.text}")
         for line in sealed(floors):
             output.say(line)
         ordered_missions = sum(order.missions or 0 for order in plan.orders())

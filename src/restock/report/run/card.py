@@ -1,9 +1,9 @@
 """The replay card: one page, for people and as JSON, that says what a run's critic was fed.
 
 A metric without its replay is half a result. The card answers, in the order a reviewer would ask:
-capacity, sampling rule, age of the sampled rows, target rule, conditions in the batches, whose
-behaviour, which corrections, the mix after them, and the one imbalance most likely to make the
-evaluation look better than deployment.
+which policy, capacity, sampling rule, age of the sampled rows, target rule, conditions in the
+batches, whose behaviour, which corrections, the mix after them, and the one imbalance most likely
+to make the evaluation look better than deployment.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ def replay_card(facts: Facts) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "run": str(facts.run),
+        "policy": None if facts.policy is None else facts.policy.document,
         "capacity": {
             "ring_rows": replay.get("ring_capacity"),
             "panel_rows": len(panel) if panel is not None else None,
@@ -209,6 +210,7 @@ def as_markdown(card: dict[str, Any]) -> str:
     lines = [f"# Replay card of {_cell(card['run'])}", ""]
     lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
     facts = {
+        "Policy": _or_none(card["policy"] and card["policy"]["text"]),
         "Capacity": f"{count(capacity['ring_rows'])} fresh rows; {_panel(capacity)}",
         "Sampling rule": f"batches of {_or_none(sampling['batch_size'])},"
         f" {_percent(sampling['logs_share'])} of all rows from logs, the offline phase among them:"

@@ -19,7 +19,8 @@ from restock.report.look.queries import ask, rows_of, statements
 from restock.train.run.clone_quality import CloneQuality, read_clones
 from restock.train.run.fed_panel import run_panel
 from restock.train.run.fed_shares import fed_shares
-from restock.train.run.kept_evaluations import shown_evaluation
+from restock.train.run.kept_evaluations import shown_evaluation, trained_step
+from restock.train.run.kept_policy import PolicyOrigin, kept_policy, run_clocks
 from restock.train.run.measures import measures
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import open_floors
@@ -49,7 +50,6 @@ class Facts:
     ages: Rows
     policies: Rows
     learning: Rows
-    kept: dict[str, Any] | None
     td: Rows
     lag: Rows
     loss: Rows
@@ -57,6 +57,8 @@ class Facts:
     cells: Rows  # of `restock eval`, with Wilson intervals as low and high
     failures: Rows
     panel: Panel | None = None
+    policy: PolicyOrigin | None = None  # of the run, that would drive now
+    driven_step: int | None = None  # of training, from which the policy is that `cells` are of
     evaluation: str = ""  # which of the episodes that were driven are shown
     ways: Rows = field(default_factory=list)  # as `cells`, on the ways of logs, beside those
     evaluation_on_ways: str = ""  # which they are
@@ -143,15 +145,16 @@ def gather(path: Path) -> Facts:
         row["low"], row["high"] = row["success_low"], row["success_high"]
     for row in rows["ways"]:
         row |= measures(row.pop("driven"))
-    kept = rows.pop("kept")
     (trained,) = rows.pop("trained")
+    clocks = run_clocks(run)  # of an interrupted run they are later than its last logged interval
+    trained |= {name: max(value, clocks.get(name, value)) for name, value in trained.items()}
     facts = Facts(
         run=path,
         config=run.document,
-        kept=kept[0] if kept else None,
         trained=trained,
         **rows,  # type: ignore[arg-type]
     )
+    facts.policy, facts.driven_step = kept_policy(run), trained_step(evaluated)
     facts.evaluation, facts.evaluation_on_ways = shown, ways
     facts.clean = {name: measures(driven) for name, driven in clean.items()}
     facts.clones = read_clones(path)

@@ -25,12 +25,16 @@ _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planne
 
 
 def headline(facts: Facts) -> str:
-    """One sentence."""
+    """The result in one sentence; in another the policy's step, unless that is the run's end."""
     if not facts.twin:
         return logs_alone.headline(facts)
-    cells = facts.clean_cells()
-    if not cells:
+    if not facts.clean_cells():
         return f"Run {facts.run.name}: trained, not yet evaluated"
+    return _result(facts) + _policy_step(facts)
+
+
+def _result(facts: Facts) -> str:
+    cells = facts.clean_cells()
     if facts.no_goal:
         returns = [row["return"] for row in cells]
         return (
@@ -39,11 +43,27 @@ def headline(facts: Facts) -> str:
         )
     average, random = mean_success(cells), facts.clean_cells("random")
     if random and average <= mean_success(random):
+        current = facts.policy is None or facts.driven_step in (None, facts.policy.env_steps)
         return (
-            "Nothing was learned: no better than a random policy on the same episodes"
+            ("Nothing was learned: no" if current else "No")
+            + " better than a random policy on the same episodes"
             f" ({average:.0%} against {mean_success(random):.0%}, mean over conditions)"
         )
     return _against_baseline(facts) + _distrust(facts)
+
+
+def _policy_step(facts: Facts) -> str:
+    """Which policy was driven; nothing if it is that of the run's end, evaluated in training."""
+    step, policy = facts.driven_step, facts.policy
+    if step is None or policy is None:
+        return ""
+    if step != policy.env_steps:
+        return (
+            f". Driven: policy of step {step:,} of {policy.run_env_steps:,}; the run now has that "
+            f"of step {policy.env_steps:,}: evaluate it again"
+        )
+    ended = policy.chosen == "best" and step == policy.run_env_steps
+    return "" if ended else f". Driven: {policy.text}"
 
 
 def baseline(facts: Facts) -> str | None:

@@ -57,7 +57,7 @@ def page(facts: Facts) -> dict[str, Any]:
 
 def _cards(facts: Facts) -> list[dict[str, str]]:
     config = facts.config.get("config", {})
-    replay, kept = config.get("replay", {}), facts.kept
+    replay, policy = config.get("replay", {}), facts.policy
     cards = []
     if facts.panel is not None:
         header = facts.panel.header
@@ -77,13 +77,17 @@ def _cards(facts: Facts) -> list[dict[str, str]]:
         {"value": facts.target_rule, "label": "target rule"},
         {"value": f"{facts.trained['env_steps']:,}", "label": "environment steps"},
     ]
-    if kept is not None:
+    if policy is not None:
+        made = counted(len({row["env_steps"] for row in facts.learning}), "evaluation")
         cards.append(
             {
-                "value": f"{kept['env_steps']:,}",
-                "label": "environment step of the kept policy, the best of"
-                f" {counted(len({row['env_steps'] for row in facts.learning}), 'evaluation')}"
-                " in training",
+                "value": f"{policy.env_steps:,}",
+                "label": "environment step of the "
+                + (
+                    f"kept policy, the best of {made} in training"
+                    if policy.chosen == "best"
+                    else "latest policy; not evaluated in training"
+                ),
             }
         )
     return cards

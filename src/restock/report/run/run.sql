@@ -85,15 +85,6 @@ FROM evaluations
 GROUP BY ALL
 ORDER BY env_steps, condition;
 
--- name: kept
--- The evaluation whose checkpoint was kept.
-SELECT env_steps, gradient_steps, avg(success::INT) AS success
-FROM evaluations
-WHERE best
-GROUP BY env_steps, gradient_steps
-ORDER BY gradient_steps DESC
-LIMIT 1;
-
 -- name: td
 -- TD error by condition on the fixed probe.
 SELECT gradient_steps, condition, sum(td_abs_mean * rows) / sum(rows) AS td_abs_mean

@@ -203,6 +203,8 @@ def _short(value: int) -> str:
 
 def learning(facts: Facts) -> Section:
     figures = []
+    policy = facts.policy
+    latest = policy if policy is not None and policy.chosen == "latest" else None
     if any(row["success"] is not None for row in facts.learning):
         figures.append(
             Figure(
@@ -215,10 +217,12 @@ def learning(facts: Facts) -> Section:
                     percent=True,
                     domain=(0, 1),
                     points=True,
-                    marker=float(facts.kept["env_steps"]) if facts.kept else None,
+                    marker=None if policy is None or latest else float(policy.env_steps),
                 ),
                 "Greedy success on fixed episodes",
-                "The kept checkpoint is the best of these evaluations, not the last.",
+                "The kept checkpoint is the best of these evaluations, not the last."
+                if latest is None
+                else f"None of these is of the {latest.text}.",
             )
         )
     figures.append(

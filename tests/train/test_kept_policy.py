@@ -1,0 +1,146 @@
+"""Which policy of a run drives: the best that it evaluated, or the latest of an interrupted one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support.toy_run import config, run_to_end, session
+
+from restock.cli import main
+from restock.errors import RunError
+from restock.report.run.facts import gather
+from restock.report.run.headline import headline
+from restock.train.evaluation.policies import load_agent
+from restock.train.loop import TrainingInterrupted, train
+from restock.train.prepare import prepare_new, prepare_resumed
+from restock.train.run.kept_policy import PolicyOrigin, kept_policy
+from restock.train.run.run import Run
+from restock.train.session import Session
+
+
+def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
+    with pytest.raises(TrainingInterrupted):
+        train(live, stop=stop)
+    live.close()
+    return live
+
+
+def test_a_run_interrupted_before_it_evaluated_what_it_learned_has_its_latest_policy(
+    tmp_path: Path,
+) -> None:
+    """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
+    live = session(tmp_path / "a", config())
+    interrupted(live, lambda: live.progress.env_steps >= 700)
+    run = Run.open(live.run.path)
+    assert run.best.is_file()
+    assert kept_policy(run) == PolicyOrigin("latest", 700, live.learner.gradient_steps, 700)
+    resumed = session(live.run.path, config(), resume=True)
+    train(resumed)
+    resumed.close()
+    now = kept_policy(Run.open(live.run.path))
+    assert now is not None
+    assert (now.chosen, now.run_env_steps) == ("best", 1600)
+    assert now.env_steps in (800, 1600)
+
+
+@pytest.mark.parametrize(
+    ("phase", "chosen", "step"), [("offline", "latest", 0), ("warmup", "best", 0)]
+)
+def test_a_run_interrupted_before_it_learned_in_the_twin(
+    phase: str, chosen: str, step: int, tmp_path: Path
+) -> None:
+    """On the logs nothing is evaluated yet; in the warm-up, all that it learned is."""
+    live = session(tmp_path / "a", config())
+
+    def stop() -> bool:
+        if phase == "offline":
+            return live.learner.gradient_steps >= 20
+        return live.progress.env_steps >= 100
+
+    interrupted(live, stop)
+    now = kept_policy(Run.open(live.run.path))
+    assert now is not None
+    assert (now.chosen, now.env_steps) == (chosen, step)
+    assert now.gradient_steps == live.learner.gradient_steps
+
+
+def test_an_evaluation_after_the_last_checkpoint_of_a_killed_run_counts(tmp_path: Path) -> None:
+    settings = config(record={"checkpoint_every_env_steps": 700, "keep_checkpoints": 3})
+    live = run_to_end(tmp_path / "a", settings)
+    folder = live.run.latest.parent
+    shutil.copy(folder / "env_steps_000000700.safetensors", live.run.latest)
+    now = kept_policy(Run.open(live.run.path))
+    assert now is not None
+    assert now.chosen == "best"
+    assert now.env_steps >= 800
+
+
+def test_the_latest_policy_is_driven_and_named_until_another_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run"
+    settings = [
+        *("network.hidden=[16]", "env.num_envs=4", "replay.batch_size=16", "schedule.env_steps=80"),
+        *("schedule.warmup_env_steps=20", "schedule.updates_per_env_step=1"),
+        *("evaluation.every_env_steps=80", "evaluation.episodes=1", "record.every_updates=10"),
+        *("record.tensorboard=false", "record.probe_rows=8"),
+    ]
+    live = prepare_new(path, None, None, settings).open()
+    interrupted(live, lambda: live.progress.env_steps >= 60)
+    loaded = load_agent(Run.open(path))
+    for name, weights in live.learner.policy.state_dict().items():
+        assert torch.equal(loaded.network.state_dict()[name], weights), name
+
+    text = "policy of step 60, the latest; not evaluated in training"
+    line = ["eval", str(path), "--episodes", "nominal=1", "--perturbations", "none"]
+    assert main([*line, "--policies", "agent", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    updates = live.learner.gradient_steps
+    assert document["trained"]["agent"] == {
+        "chosen": "latest",
+        "env_steps": 60,
+        "gradient_steps": updates,
+        "run_env_steps": 60,
+        "text": text,
+    }
+    assert main([*line, "--policies", "agent"]) == 0
+    assert f"agent: {text}" in capsys.readouterr().err
+    assert main([*line[:2], "--no-drive"]) == 0
+    assert f"policy run@{updates} of step 60," in " ".join(capsys.readouterr().err.split())
+    assert headline(gather(path)).endswith(f". Driven: {text}")
+    assert main(["report", str(path), "--card", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["policy"]["text"] == text
+    onnx = tmp_path / "policy.onnx"
+    assert main(["export", str(path), "--to", "onnx", "--out", str(onnx), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["trained"] == text
+
+    resumed = prepare_resumed(path, ["schedule.env_steps=160"]).open()
+    train(resumed)
+    resumed.close()
+    step = load_agent(Run.open(path)).origin
+    assert step is not None
+    assert step.chosen == "best"
+    facts = gather(path)
+    assert f"Driven: policy of step 60 of 160; the run now has that of step {step.env_steps}" in (
+        headline(facts)
+    )
+    assert main([*line, "--policies", "agent"]) == 0
+    said = headline(gather(path))
+    assert said.endswith(step.text) == (step.env_steps < 160)
+    assert "step 60" not in said
+
+
+def test_a_run_that_stopped_before_its_first_update_has_no_policy(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"schedule": {"warmup_env_steps": 400}}
+    live = session(tmp_path / "a", config(**changes), logs=None)
+    interrupted(live, lambda: live.progress.env_steps >= 100)
+    run = Run.open(live.run.path)
+    assert kept_policy(run) is None
+    with pytest.raises(RunError, match="stopped before its first update"):
+        load_agent(run)
