@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable
+from pathlib import PurePath
+
+_POLICIES = ("agent", "planner", "operator", "random", "cloned")  # a run's folder is none of them
 
 
 def plural(number: int, noun: str) -> str:
@@ -45,3 +48,29 @@ def between(text: str, begin: str, end: str, written: str) -> str:
     """A page's text with what is `written` between two of its markers, in place of what was."""
     before, rest = text.split(begin, 1)
     return f"{before}{begin}\n\n{written}\n{end}{rest.split(end, 1)[1]}"
+
+
+def policy_words(policies: Iterable[str]) -> dict[str, str]:
+    """Policies as people read them, by the names that `restock eval --policies` takes.
+
+    `run:demo/logs-alone` is `logs alone`. Folders and files of one name are told apart by those
+    that they are in.
+    """
+    names = list(dict.fromkeys(policies))
+    most = max((len(PurePath(name).parts) for name in names), default=0)
+    for parts in range(1, most + 1):
+        shown = {name: _policy_in_words(name, parts) for name in names}
+        if len(set(shown.values())) == len(names):
+            return shown
+    return {name: name for name in names}
+
+
+def _policy_in_words(name: str, parts: int) -> str:
+    """With so many parts of its path, where it has one."""
+    kind, _, path = name.partition(":")
+    if kind == "limited":
+        return f"{_policy_in_words(path, parts)}, limited"
+    if kind not in ("run", "onnx") or not PurePath(path).name:
+        return name
+    text = "/".join(PurePath(path).parts[-parts:]).replace("-", " ").replace("_", " ")
+    return f"{kind}:{text}" if text in _POLICIES else text

@@ -90,7 +90,7 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
         story.RARE,
     )
     assert slip["logs alone"].startswith("1 of 4 [")
-    assert slip["fine-tuned"].startswith("3 of 4 [")
+    assert slip["agent"].startswith("3 of 4 [")
     assert slip["planner"] == rare["planner"]
     assert easy_row["planner"].startswith("2 of 2 [")
     assert easy_row["logs alone"] == ""
@@ -99,7 +99,7 @@ def test_before_after_and_planner_stand_side_by_side(tmp_path: Path) -> None:
     write(to.run, [*after, *easy, *(driven(uniform, "wheel_slip", n < 2, n) for n in range(4))])
     beside = story.before_and_after(to)[1]
     assert beside["fed uniformly"].startswith("2 of 4 [")
-    assert list(beside)[1:] == ["logs alone", "fed uniformly", "fine-tuned", "planner"]
+    assert list(beside)[1:] == ["logs alone", "fed uniformly", "agent", "planner"]
 
 
 def test_without_a_goal_no_success_is_told(tmp_path: Path) -> None:

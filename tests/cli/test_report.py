@@ -8,7 +8,7 @@ import shutil
 from dataclasses import replace
 from html import escape
 from html.parser import HTMLParser
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,13 +24,14 @@ from support.panels import panel_of
 from support.stores import TASK, recording_transitions, with_clear_view, write_store
 
 from restock import cli
+from restock.cli.learning.eval_tables import show_measures
 from restock.errors import RunError
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows
 from restock.replay.store.store import Store
 from restock.report import build_report
-from restock.report.look.charts import POLICY_COLOURS, lines
+from restock.report.look.charts import POLICY_COLOURS, POLICY_SPARES, lines, scale
 from restock.report.look.queries import ask, statements
 from restock.report.look.theme import DARK
 from restock.report.run import shares
@@ -41,12 +42,14 @@ from restock.report.run.sections import success
 from restock.report.run.ways import ways_section
 from restock.report.study.charts import colours
 from restock.stats import ConfidenceInterval
+from restock.train.run.measures import summary_rows
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES
 from restock.train.twin.calibration.twin_gap import TrustLimits, TwinGap, Verdict, write_gap
 from restock.train.twin.floors.floor_file import write_floor
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.occupancy_grid import into_frame
+from restock.words import policy_words
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -299,6 +302,85 @@ def test_a_policy_has_one_colour_in_all_charts(html: str) -> None:
     planner = [colours["planner"] for colours in told if "planner" in colours]
     assert len(planner) >= 4  # success and behaviour, each at several widths
     assert set(planner) == {POLICY_COLOURS["planner"]}
+
+
+def test_policies_look_unlike_each_other_in_both_themes() -> None:
+    """The agent and a policy from the logs alone were two greens: .12 and in the dark .05 apart."""
+    colours = (*POLICY_COLOURS.values(), *POLICY_SPARES)
+    for theme in ({}, DARK):
+        shown = [theme.get(colour, colour) for colour in colours]
+        near = min((apart(a, b), a, b) for a, b in combinations(shown, 2))
+        assert near[0] > 0.1, near
+        ground = luminance(theme.get("#ffffff", "#ffffff"))
+        for colour in shown[len(POLICY_COLOURS) :]:
+            low, high = sorted((luminance(colour), ground))
+            assert (high + 0.05) / (low + 0.05) >= 3, colour  # as WCAG asks of graphics
+    drawn = scale(["agent", "fed uniformly", "logs alone"], POLICY_COLOURS).to_dict()["range"]
+    assert len(set(drawn)) == 3
+    assert set(drawn) <= set(colours)
+
+
+def linear(colour: str) -> list[float]:
+    """Red, green and blue of `#rrggbb`, as light."""
+    values = (int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5))
+    return [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values]
+
+
+def luminance(colour: str) -> float:
+    return float(np.dot((0.2126, 0.7152, 0.0722), linear(colour)))
+
+
+def apart(first: str, second: str) -> float:
+    """How different two colours look: their distance in OKLab."""
+    to_cones = [
+        (0.4122214708, 0.5363325363, 0.0514459929),
+        (0.2119034982, 0.6806995451, 0.1073969566),
+        (0.0883024619, 0.2817188376, 0.6299787005),
+    ]
+    to_lab = [
+        (0.2104542553, 0.7936177850, -0.0040720468),
+        (1.9779984951, -2.4285922050, 0.4505937099),
+        (0.0259040371, 0.7827717662, -0.8086757660),
+    ]
+    a, b = (np.dot(to_lab, np.cbrt(np.dot(to_cones, linear(one)))) for one in (first, second))
+    return float(np.linalg.norm(a - b))
+
+
+def test_a_policy_has_the_same_words_in_report_and_terminal(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    file = copy / "eval" / "episodes.parquet"
+    other = {"planner": "run:demo/logs-alone"}
+    rows = pq.read_table(file).to_pylist()
+    rows = [{**row, "policy": other.get(row["policy"], row["policy"])} for row in rows]
+    pq.write_table(pa.Table.from_pylist(rows, schema=EVAL_EPISODES), file)
+    section = success(gather(copy))
+    assert section is not None
+    assert {row["policy"] for row in section.tables[0].rows} == {"agent", "logs alone"}
+    svg = section.figures[0].widest
+    assert "logs alone" in svg
+    assert "run:demo" not in svg
+    show_measures(summary_rows(rows))
+    said = capsys.readouterr().out
+    assert "logs alone" in said
+    assert "run:demo" not in said
+
+
+def test_policies_of_one_name_are_told_apart() -> None:
+    assert policy_words(["agent", "run:a/x/quotas", "run:b/x/quotas", "onnx:x/quotas.onnx"]) == {
+        "agent": "agent",
+        "run:a/x/quotas": "a/x/quotas",
+        "run:b/x/quotas": "b/x/quotas",
+        "onnx:x/quotas.onnx": "x/quotas.onnx",
+    }
+    assert policy_words(["planner", "run:runs/planner", "limited:run:runs/no_practice"]) == {
+        "planner": "planner",
+        "run:runs/planner": "run:planner",
+        "limited:run:runs/no_practice": "no practice, limited",
+    }
+    for name in ("run:.", "cloned:driver"):
+        assert policy_words([name]) == {name: name}
 
 
 def test_references_have_the_colours_of_reports_on_the_page_of_a_study() -> None:

@@ -30,7 +30,7 @@ from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.model import PEOPLE
-from restock.words import quoted
+from restock.words import policy_words, quoted
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -276,13 +276,8 @@ def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str
 def _told(row: dict[str, Any]) -> str:
     """Who drove and how it ended, in words that fit above a picture."""
     ended = "arrives" if row["success"] else row["failure"]
-    return f"{label_of(row['policy'])}: {ended}, {row['time_s']:.1f} s"
-
-
-def label_of(policy: str) -> str:
-    """A policy's name, of another run that of its folder."""
-    own = policy.removeprefix(OTHER_RUN)
-    return policy if own == policy else Path(own).name
+    who = policy_words([row["policy"]])[row["policy"]]
+    return f"{who}: {ended}, {row['time_s']:.1f} s"
 
 
 def _beside(
@@ -327,7 +322,6 @@ __all__ = [
     "drive_row",
     "everything",
     "film_evaluation",
-    "label_of",
     "scenes",
     "unlike",
 ]

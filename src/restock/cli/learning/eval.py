@@ -183,11 +183,13 @@ class EvalCommand:
     def _show(self, document: dict[str, Any]) -> None:
         from restock.cli.learning.eval_tables import show_measures, show_regression
         from restock.cli.output import say
+        from restock.words import policy_words
 
         if (rows := document.get("results")) is not None:
             show_measures(rows)
-            for name, origin in document.get("trained", {}).items():
-                say(f"{name}: {origin['text']}")
+            trained = document.get("trained", {})
+            for name, shown in policy_words(trained).items():
+                say(f"{shown}: {trained[name]['text']}")
             for clone in document.get("clones", ()):
                 say(clone["text"])
             say(document.get("recorded", f"added to {self.run_path / 'eval' / 'episodes.parquet'}"))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from restock.stats import interval_text
+from restock.words import policy_words
 
 if TYPE_CHECKING:
     from restock.train.evaluation.ope import OpeConfig, OpeResult
@@ -16,11 +17,12 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
     condition. Where it is too wide it is parted, so that no measure is left out."""
     from restock.cli.output import print_parted, say
 
+    names = policy_words(row["policy"] for row in rows)
     for perturbation in dict.fromkeys(row["perturbation"] for row in rows):
         own = [row for row in rows if row["perturbation"] == perturbation]
         cells = list(dict.fromkeys(row["condition"] for row in own))
         own.sort(key=lambda row: cells.index(row["condition"]))
-        shown = [_measures_row(row) for row in own]
+        shown = [_measures_row(row, names[row["policy"]]) for row in own]
         if not any(row["held back"] for row in shown):
             for row in shown:
                 del row["held back"]
@@ -35,11 +37,11 @@ def show_measures(rows: list[dict[str, Any]]) -> None:
         say("time lost is not known: add the planner to --policies once")
 
 
-def _measures_row(row: dict[str, Any]) -> dict[str, Any]:
+def _measures_row(row: dict[str, Any], policy: str) -> dict[str, Any]:
     nearest = row["closest_person_least_m"]
     return {
         "condition": row["condition"],
-        "policy": row["policy"],
+        "policy": policy,
         "episodes": row["episodes"],
         "success": "no goal" if row["success"] is None else _with_interval(row, "success", ".2f"),
         "discounted return": _with_interval(row, "discounted_return", ".2f"),

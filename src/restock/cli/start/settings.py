@@ -50,7 +50,7 @@ class Settings:
     @property
     def uniform(self) -> Path:
         """The run that is fed the logs as they come."""
-        return self.out / "uniform"
+        return self.out / "fed-uniformly"
 
     @property
     def fitted(self) -> Path:

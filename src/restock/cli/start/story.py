@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from restock.cli.start.settings import Settings
 from restock.cli.start.stages import fed_uniformly, from_logs_alone
 from restock.stats import wilson
-from restock.words import quoted
+from restock.words import policy_words, quoted
 
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
@@ -43,25 +43,22 @@ FULL_STEPS = 128_000  # of docs/learning.md, "And three minutes"
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:
-    """Per kind of mission, how many succeeded before and after fine-tuning, by quotas and fed
-    uniformly, and the planner's.
+    """Per kind of mission, how many succeeded before and after fine-tuning (the agent), by quotas
+    and fed uniformly, and the planner's.
 
     On the floor as it was trained on. Empty where the task has no goal: nothing succeeds or fails.
     """
-    from restock.train.run.kept_evaluations import read_evaluations
+    from restock.train.run.kept_evaluations import shown_evaluation
 
-    rows = read_evaluations(to.run).to_pylist()
+    rows = shown_evaluation(to.run)[0].to_pylist()
+    uniform = fed_uniformly(to)
+    names = policy_words([from_logs_alone(to), uniform, "agent", "planner"])
     driven = {
         name: [row for row in rows if row["policy"] == policy and row["perturbation"] == "none"]
-        for name, policy in (
-            ("logs alone", from_logs_alone(to)),
-            ("fed uniformly", fed_uniformly(to)),
-            ("fine-tuned", "agent"),
-            ("planner", "planner"),
-        )
+        for policy, name in names.items()
     }
-    if not driven["fed uniformly"]:
-        del driven["fed uniformly"]
+    if not driven[names[uniform]]:
+        del driven[names[uniform]]
     if any(row["success"] is None for rows in driven.values() for row in rows):
         return []
     kinds = sorted(
@@ -93,7 +90,7 @@ def trained(to: Settings) -> str:
 
     steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
     most = max(steps, default=0)
-    lines = [f"Fine-tuned means {most:,} steps in the twin here."]
+    lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
     if most < FULL_STEPS / 2:
         lines += [
             f"That is little: after {FULL_STEPS:,} it completes .92 of the rare missions of the",

@@ -45,6 +45,8 @@ POLICY_COLOURS = {
     "operator": "#2563eb",
     "random": "#9ca3af",
 }
+# Of other policies: none looks like another or like those above, in either theme.
+POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d")
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
 FEW_POINTS = 10  # of a line, with which each is drawn
@@ -135,21 +137,24 @@ def own_names(svg: str) -> str:
 
 def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
     """A colour scale over the names that occur, known ones in their own colour."""
-    all_of_them = palette(names, colours)
+    spare = POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS
+    all_of_them = palette(names, colours, spare)
     return alt.Scale(domain=list(names), range=[all_of_them[name] for name in names])
 
 
 def palette(
-    names: Collection[str], colours: Mapping[str, str] = CONDITION_COLOURS
+    names: Collection[str],
+    colours: Mapping[str, str] = CONDITION_COLOURS,
+    spare: Sequence[str] = SPARE_COLOURS,
 ) -> dict[str, str]:
     """A colour for each name, whatever their order: its own, else a spare one that it begins to
     look for at the same place in every chart, the first that is free as long as one is."""
     found = {name: colours[name] for name in names if name in colours}
     free: list[str] = []
     for name in sorted(set(names) - set(found)):
-        free = free or list(SPARE_COLOURS)
-        first = sum(map(ord, words(name))) % len(SPARE_COLOURS)
-        likes = SPARE_COLOURS[first:] + SPARE_COLOURS[:first]
+        free = free or list(spare)
+        first = sum(map(ord, words(name))) % len(spare)
+        likes = (*spare[first:], *spare[:first])
         found[name] = next(colour for colour in likes if colour in free)
         free.remove(found[name])
     return found

@@ -14,7 +14,7 @@ from restock.report.look.floor_map import SCALE, Box, FloorMap
 from restock.report.run.facts import Facts
 from restock.train.run.measures import cell_name
 from restock.train.twin.floors.floors import open_floors
-from restock.words import counted
+from restock.words import counted, policy_words
 
 FOLDER, DOCUMENT = "eval/films", "films.json"
 BODY_M = (0.62, 0.44)  # of the robot as it is drawn, length and breadth
@@ -49,14 +49,13 @@ def films_section(facts: Facts) -> Section | None:
 
 
 def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
-    from restock.train.evaluation.film import label_of  # here: with it comes PyTorch
-
     floor = next(f for f in open_floors(film["layouts"]) if f.name == film["layout"])
     racks = [(r.x_min, r.y_min, r.x_max, r.y_max) for r in floor.racks]
     plan = FloorMap(floor.width_m, floor.depth_m, racks)
     data = base64.b64encode((facts.run / FOLDER / str(film["file"])).read_bytes()).decode()
+    other = film["rescued_from"]
     how = (
-        f"arrived after {film['time_s']:.1f} s, where {label_of(film['rescued_from'])} did not"
+        f"arrived after {film['time_s']:.1f} s, where {policy_words([other])[other]} did not"
         f" ({film['other_failure']})"
         if film["success"]
         else f"{film['failure']} after {film['time_s']:.1f} s"

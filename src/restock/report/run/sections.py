@@ -23,7 +23,7 @@ from restock.report.run import shares
 from restock.report.run.facts import CELL_M, NO_GOAL, Facts, evaluation_bias
 from restock.report.run.headline import losses
 from restock.report.run.logs_alone import table as off_policy_table
-from restock.words import counted
+from restock.words import counted, policy_words
 
 _YEARS_FROM_DAYS = 512  # ages are in years from there on
 
@@ -32,9 +32,11 @@ def success(facts: Facts) -> Section | None:
     if not facts.cells:
         return None
     cells = sorted(facts.cells, key=_cell_order)
+    names = policy_words(row["policy"] for row in cells)
     shown = [
         {
             **row,
+            "policy": names[row["policy"]],
             "cell": words(row["cell"]),
             "perturbation": "clean" if row["perturbation"] == "none" else row["perturbation"],
         }

@@ -7,6 +7,7 @@ from typing import Any
 from restock.report.look.blocks import Section, Table, words
 from restock.report.run.facts import Facts
 from restock.stats import interval_text
+from restock.words import policy_words
 
 OWN = "agent"
 
@@ -22,11 +23,12 @@ def ways_section(facts: Facts) -> Section | None:
             *(row["policy"] != OWN, row["policy"]),
         ),
     )
+    names = policy_words(row["policy"] for row in rows)
     shown: list[dict[str, Any]] = [
         {
             "kind of episode": words(row["cell"])
             + ("" if row["perturbation"] == "none" else f", {row['perturbation']}"),
-            "policy": row["policy"],
+            "policy": names[row["policy"]],
             "success": interval_text(
                 row["success"], row["success_low"], row["success_high"], ".0%"
             ),
