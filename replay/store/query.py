@@ -245,7 +245,7 @@ def _message(error: duckdb.Error) -> str:
 
 
 # `WHERE condition = …` of `transitions`, which has none: a row can hold several.
-_NO_CONDITION = re.compile(r'(?:Referenced column|column named) "condition"')
+_NO_CONDITION = re.compile(r'column(?: named)? "condition"', re.IGNORECASE)
 OF_CONDITIONS = (
     "a row can hold several conditions: `FROM held_conditions WHERE condition = '…'` has every row"
     " that holds it, as has `FROM transitions WHERE list_contains(conditions, '…')`;"

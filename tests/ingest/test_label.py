@@ -44,7 +44,7 @@ def rows(path: Path, columns: str = "*") -> list[tuple]:
 
 def test_the_same_conditions_over_the_store_give_the_same_labels(store, capsys):
     """Also at the last transition of each episode, which looks at a step that is no row."""
-    before = rows(store, "condition, conditions")
+    before = rows(store, "primary_condition, conditions")
     assert any(name == "soon" for name, _ in before)
     found = {}
     profile = load_profile(store.parent / "amr.toml")
@@ -54,12 +54,12 @@ def test_the_same_conditions_over_the_store_give_the_same_labels(store, capsys):
     found = {outcome.source_file: outcome.changed for outcome in outcomes}
     assert set(found.values()) == {0}
     assert version is not None
-    assert rows(store, "condition, conditions") == before
+    assert rows(store, "primary_condition, conditions") == before
     assert {v for (v,) in rows(store, "labels_version")} == {labels_version(conditions)}
 
 
 def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, capsys):
-    others = "* EXCLUDE (condition, conditions, labels_version, ingest_id)"
+    others = "* EXCLUDE (primary_condition, conditions, labels_version, ingest_id)"
     before = rows(store, others)
     changed = tmp_path / "changed.toml"
     changed.write_text(TEXT + SOON.format("lead(pose_x_m) OVER episode > 1.95"))
@@ -125,7 +125,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_left_alone(store, tmp_path):
     writer.rows = rows_and_a_rival  # type: ignore[method-assign]
     with pytest.raises(StoreError, match="ingested again or removed in the meantime"):
         relabel_store(writer, conditions_of)
-    assert {name for (name,) in rows(store, "condition")} == {"nominal", "soon"}
+    assert {name for (name,) in rows(store, "primary_condition")} == {"nominal", "soon"}
 
 
 def test_rows_without_their_episodes_ends_are_refused(store):

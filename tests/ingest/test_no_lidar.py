@@ -270,7 +270,7 @@ def test_a_proposed_profile_says_that_it_has_no_lidar_and_ingests(drives, tmp_pa
     assert "unknown (null, no lidar): recovery, near_collision, blocked_aisle" in said
     assert main(["sql", str(store), "FROM coverage_by_condition", "--json"]) == 0
     rows = {row["condition"]: row for row in json.loads(capsys.readouterr().out)}
-    assert rows["near_collision"]["rows"] is None
+    assert rows["near_collision"]["rows_held"] is None
 
 
 def test_rows_of_an_older_restock_are_named_by_the_audit(blind, tmp_path):
