@@ -87,7 +87,7 @@ def main(
         buffer.close()
     return {
         "env_steps": result.train_step,
-        "update_steps": result.update_step,
+        "updates": algorithm._iter,  # result.update_step counts collections
         "return": float(result.best_reward),
     }
 

@@ -163,7 +163,7 @@ class _Rows:
             raise StoreError(
                 f"step {self.step[row]} of episode {self.episode[row]} comes twice",
                 where=self.where,
-                remedy="select each transition once: a join may have doubled rows",
+                remedy="select each transition once: a join or held_conditions may double rows",
             )
         goes_on = same & (self.step[1:] == self.step[:-1] + 1)
         goes_on &= ~(self.terminated[:-1] | self.truncated[:-1])

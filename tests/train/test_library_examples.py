@@ -143,9 +143,9 @@ def test_stable_baselines3_with_a_mixture(panel: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("mixed", [True, False])
 def test_tianshous_collectors_and_dqn(panel: Path, tmp_path: Path, mixed: bool) -> None:
     given = {"panel": str(panel), "run": str(tmp_path / "run")} if mixed else {}
-    done = example("tianshou_dqn").main(steps=96, num_envs=4, **given)
+    done = example("tianshou_dqn").main(steps=96, num_envs=8, **given)
     assert done["env_steps"] == 96
-    assert done["update_steps"] == 96 / 4
+    assert done["updates"] == 96 / 4
     assert (tmp_path / "run" / "strata.parquet").is_file() == mixed
 
 

@@ -59,9 +59,8 @@ def event(tmp_path_factory: pytest.TempPathFactory) -> Event:
     folder = tmp_path_factory.mktemp("view")
     ingest(RECORDING, load_profile("warehouse_amr"), store=StoreWriter(folder / "store"))
     with Store(folder / "store") as store:
-        slips = (
-            "FROM held_conditions WHERE condition = 'wheel_slip' AND step_index > 12 ORDER BY ALL"
-        )
+        slips = "FROM transitions WHERE primary_condition = 'wheel_slip' AND step_index > 12"
+        slips += " ORDER BY ALL"
         row = store.sql(slips).to_arrow_table().slice(0, 1).to_pylist()[0]
         window = (
             f"FROM transitions WHERE stamp_ns BETWEEN {row['stamp_ns'] - 2 * 10**9}"
@@ -143,7 +142,7 @@ def test_an_mcap_holds_what_the_store_has_of_each_step(event: Event, shown: Path
         return [getattr(message, field) for _, message in decoded[f"/restock/{topic}"]]
 
     steps = event.steps
-    assert said("condition") == [step["condition"] for step in steps]
+    assert said("condition") == [step["primary_condition"] for step in steps]
     assert "wheel_slip" in said("condition")
     assert said("true_condition") == [step["true_condition"] for step in steps]
     assert said("reward") == pytest.approx([step["reward"] for step in steps])
