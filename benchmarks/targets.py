@@ -3,17 +3,19 @@
     python benchmarks/targets.py --out DIR [--budget ten-minutes] [--seeds 5] [--json] [--check]
 
 `restock train` on the sample logs with mixture `coverage`, practice by success and the twin's
-teacher, once a seed; a budget is a number of environment steps. The policy that each run kept
-drives, beside planner and operator, the same `--episodes` of each kind as they are; 60 of each
-under every perturbation, and 100 of each on generated floors of which none was seen.
+teacher, once a seed; a budget is a number of environment steps. Beside each, a run of the same seed
+is fed uniformly (mixture `uniform`). The policy that each run kept drives, beside planner and
+operator, the same `--episodes` of each kind as they are; those fed by quotas also 60 of each under
+every perturbation, and 100 of each on generated floors of which none was seen.
 
 Intervals of the agent draw seeds and episodes again (five seeds: a little too narrow), those of
-planner and operator are Wilson's. "Ahead" is paired by episode. What is done is not done again;
-`--check` exits 1 where a target of the budget is missed.
+planner and operator are Wilson's. "Ahead" is paired by episode, and by seed of the run fed
+uniformly. What is done is not done again; `--check` exits 1 where a target of the budget is missed.
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from collections.abc import Sequence
@@ -62,50 +64,56 @@ def main() -> int:
     if options.quick:
         settings += ["schedule.env_steps=2000", "schedule.offline_updates=200"]
         settings += ["evaluation.every_env_steps=1000", "evaluation.episodes=2"]
-    panel = _panel(options.out)
-    runs = []
-    for seed in range(options.seeds):
-        path = options.out / f"{'quick' if options.quick else options.budget}-{seed}"
+    name = "quick" if options.quick else options.budget
+    runs: dict[str, list[Path]] = {"coverage": [], "uniform": []}
+    for seed, mixture in itertools.product(range(options.seeds), runs):
+        path = options.out / f"{name}-{'' if mixture == 'coverage' else 'uniform-'}{seed}"
         there, began = (path / "done").exists(), (time.process_time(), time.monotonic())
-        trained(path, [*settings, f"seed={seed}"], panel)
+        trained(path, [*settings, f"seed={seed}"], _panel(options.out, mixture))
         if not there:
             spent = time.process_time() - began[0], time.monotonic() - began[1]
             print(f"{path.name}: {spent[0]:.0f} s of CPU in {spent[1]:.0f} s", file=sys.stderr)
-        _judge(path, few, ["agent", *(REFERENCES if seed == 0 else ())])
-        runs.append(path)
-    rows = _table(runs)
+        if mixture == "uniform":
+            _drive(path, "clean", ["agent"], few[0], "none")
+        else:
+            _judge(path, few, ["agent", *(REFERENCES if seed == 0 else ())])
+        runs[mixture].append(path)
+    rows = _table(runs["coverage"], runs["uniform"])
     return finish(options, rows, _missed(rows, options.budget), [_as_markdown(rows)])
 
 
-def _panel(out: Path) -> Path:
-    store, panel = out / "store", out / "panel"
+def _panel(out: Path, mixture: str) -> Path:
+    store, panel = out / "store", out / ("panel" if mixture == "coverage" else mixture)
     run_restock(["ingest", str(LOGS), "--store", str(store)])  # skips what it has
     if not panel.exists():
-        run_restock(["mix", str(store), "--mixture", "coverage", "--out", str(panel)])
+        run_restock(["mix", str(store), "--mixture", mixture, "--out", str(panel)])
     return panel
 
 
 def _judge(run: Path, episodes: tuple[int, int, int], policies: Sequence[str]) -> None:
-    clean, perturbed, unseen = map(str, episodes)
-    for mark, what in {
-        "clean": ["--perturbations", "none", "--episodes", clean],
-        "perturbed": ["--perturbations", PERTURBATIONS, "--episodes", perturbed],
-        "unseen": [
-            *("--perturbations", "none", "--episodes", unseen),
-            *("--layouts", "generated:test"),
-        ],
-    }.items():
-        words = ["eval", str(run), "--policies", ",".join(policies), *what]
-        once(run / f"judged-{mark}", words[2:], partial(run_restock, words))
+    clean, perturbed, unseen = episodes
+    _drive(run, "clean", policies, clean, "none")
+    _drive(run, "perturbed", policies, perturbed, PERTURBATIONS)
+    _drive(run, "unseen", policies, unseen, "none", "--layouts", "generated:test")
 
 
-def _table(runs: Sequence[Path]) -> list[dict[str, Any]]:
+def _drive(
+    run: Path, mark: str, policies: Sequence[str], episodes: int, perturbations: str, *more: str
+) -> None:
+    words = ["eval", str(run), "--policies", ",".join(policies), "--perturbations", perturbations]
+    words += ["--episodes", str(episodes), *more]
+    once(run / f"judged-{mark}", words[2:], partial(run_restock, words))
+
+
+def _table(runs: Sequence[Path], uniform: Sequence[Path]) -> list[dict[str, Any]]:
     """A row for each cell, and for rare conditions and all of them, of each setting."""
     rng = np.random.default_rng(0)
     rows = []
     for setting in ("none", *PERTURBATIONS.split(","), "unseen floors"):
         drives = {"agent": [_episodes(run, "agent", setting) for run in runs]}
         drives |= {name: [_episodes(runs[0], name, setting)] for name in REFERENCES}
+        if setting == "none":
+            drives["fed_uniformly"] = [_episodes(run, "agent", setting) for run in uniform]
         first = drives["planner"][0]
         parts = {
             cell: np.flatnonzero((first["condition"] == condition) & (first["block"] == block))
@@ -141,18 +149,19 @@ def _row(
         values = np.stack([drive["success"][ids] for drive in of]) * weights
         success[name] = values
         row[name] = float(values.mean())
-        if name == "agent":
-            row["agent_interval"] = mean_interval(values, rng, RESAMPLES)
+        if name in ("agent", "fed_uniformly"):
+            row[f"{name}_interval"] = mean_interval(values, rng, RESAMPLES)
         elif len(parts) == 1:
             row[f"{name}_interval"] = wilson(int(values.sum()), values.size)
         row[f"{name}_bumps_per_km"] = 1e3 * float(
             sum(drive["bumps"][ids].sum() for drive in of)
             / sum(drive["distance_m"][ids].sum() for drive in of)
         )
-    for name in REFERENCES:
+    for name in success.keys() - {"agent"}:
         ahead = success["agent"] - success[name]
         row[f"ahead_of_{name}"] = float(ahead.mean())
         row[f"ahead_of_{name}_interval"] = mean_interval(ahead, rng, RESAMPLES)
+    for name in REFERENCES:
         row[f"seconds_less_than_{name}"] = _faster(drives, name, ids)
     return row
 
@@ -203,6 +212,12 @@ def _as_markdown(rows: Sequence[dict[str, Any]]) -> str:
             row["cell"],
             row["episodes"],
             *(success(row, name) for name in ("agent", *REFERENCES)),
+            success(row, "fed_uniformly") if "fed_uniformly" in row else "",
+            interval_text(
+                row["ahead_of_fed_uniformly"], *row["ahead_of_fed_uniformly_interval"], "+.2f"
+            )
+            if "fed_uniformly" in row
+            else "",
             interval_text(row["ahead_of_planner"], ahead[0], ahead[1], "+.2f"),
             "{:.1f}, {:.1f}, {:.1f}".format(
                 *(row[f"{name}_bumps_per_km"] for name in ("agent", *REFERENCES))
@@ -215,7 +230,8 @@ def _as_markdown(rows: Sequence[dict[str, Any]]) -> str:
         for row in rows
         for ahead in [row["ahead_of_planner_interval"]]
     ]
-    header = ["twin", "cell", "episodes", "agent", *REFERENCES, "ahead of the planner"]
+    header = ["twin", "cell", "episodes", "agent", *REFERENCES, "fed uniformly", "ahead of it"]
+    header += ["ahead of the planner"]
     header += ["bumps per km: agent, planner, operator"]
     return markdown([*header, "s less than planner", "than operator"], lines)
 

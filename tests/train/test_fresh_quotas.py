@@ -16,6 +16,7 @@ from support.toy_run import assert_same_run, config, run_to_end, session
 from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK as TOY_TASK
 
+from restock.cli.data.mix import TRAINING
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import held
 from restock.replay.mixture.mixture import parse_mixture
@@ -24,6 +25,7 @@ from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.audit import load_audits, load_thresholds
 from restock.train.describe import describe_forecast
+from restock.train.dqn.config import TrainConfig
 from restock.train.feed.fresh_strata import FreshStrata
 from restock.train.feed.logs import Logs
 from restock.train.loop import TrainingInterrupted, time_left, train
@@ -282,3 +284,9 @@ def test_planned_draws_of_a_run() -> None:
     settings = config(schedule={"env_steps": 1_000, "seconds": None})
     assert planned_draws(settings) == PlannedDraws(60 * 32, 800 * 0.25 * 32, 200, 1_000)
     assert planned_draws(settings, 600) == PlannedDraws(60 * 32, 400 * 0.25 * 32, 200, 600)
+
+
+def test_mix_speaks_of_the_default_training_budget() -> None:
+    planned, (updates, batch_size) = planned_draws(TrainConfig()), TRAINING
+    assert updates * batch_size == planned.offline + planned.online
+    assert batch_size == TrainConfig().replay.batch_size

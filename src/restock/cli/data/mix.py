@@ -22,6 +22,7 @@ _UNCERTAIN = {
     "keep": "their labels count as they are",
     "nominal": "it does not count as held",
 }
+TRAINING = 51_500, 128  # updates and rows of each, of `restock train` by default
 _WIDE = 110  # columns of a terminal from which on the table says more
 
 
@@ -229,6 +230,26 @@ def _missing(line: dict[str, Any]) -> str:
     return f"{text}: {hours} h of driving ({low} to {high})"
 
 
+def _in_training(document: dict[str, Any], most: float) -> list[str]:
+    """What logged rows bear of their quotas at `restock train`'s default budget, if it is less."""
+    updates, batch_size = TRAINING
+    short = []
+    for line in document["strata"]:
+        asked = line["wanted_share"] * document["logs_share_wanted"]
+        bears = most * line["rows"] / (updates * batch_size)
+        if bears < 0.98 * asked:
+            short.append(f"{line['stratum']} {bears:.1%} of {asked:.1%}")
+    lines = [f"no row is drawn more than {most:g} times (max_replays_per_row)"]
+    if short:
+        lines.append(
+            f"warning: at the default training budget ({updates:,} updates of {batch_size:,} rows),"
+            f" logged rows can give less of a batch than is asked of the logs: {', '.join(short)};"
+            " the twin's fresh rows fill the rest of each quota, and a learner without a twin falls"
+            " short (`restock train --dry-run`)"
+        )
+    return lines
+
+
 def _summary(document: dict[str, Any]) -> list[str]:
     strata = document["strata"]
     lines = [
@@ -258,13 +279,11 @@ def _summary(document: dict[str, Any]) -> list[str]:
     left_out = ", ".join(f"{count:,} {reason}" for reason, count in document["left_out"].items())
     updates, batch_size = (document["planned"][key] for key in ("updates", "batch_size"))
     draws = [
-        f"replays a row: how often each would be drawn in {updates:,} updates of {batch_size:,}"
-        " rows ([planned]: set it to what you train)"
+        f"these numbers are for {updates:,} updates of {batch_size:,} rows, of logged rows alone"
+        " ([planned]: set it to what you train); a run plans with its own"
     ]
     if (most := document["max_replays_per_row"]) is not None:
-        draws.append(
-            f"a run counts its own, and draws no row more than {most:g} times (max_replays_per_row)"
-        )
+        draws += _in_training(document, most)
     moving = " on average" if document["schedules"] else ""
     lines += [
         *draws,
