@@ -12,7 +12,9 @@ from restock import cli
 from restock.cli.start import stages, story
 from restock.cli.start.settings import Settings
 from restock.replay.panel.panel import Panel
+from restock.train.run.fed_shares import fed_shares
 from restock.train.run.kept_evaluations import FILE
+from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 
 LOGS = ROOT / "sample_logs" / "amr_tuesday"
@@ -32,18 +34,25 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def test_a_stratum_is_shown_by_its_share_before_and_after(told: Settings) -> None:
-    head, *lines, legend = story.shelves(told.panel)
+def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(told: Settings) -> None:
+    """The plan of the panel was printed, as if it had been drawn."""
+    head, *lines, legend, note = story.shelves(told.run)
     strata = {stratum.name: stratum for stratum in Panel.open(told.panel).strata}
+    fed = {row["stratum"]: row for row in fed_shares(Run.open(told.run))}
+    drawn_rows = Run.open(told.run).table("strata").to_pylist()
+    whole = sum(row["drawn_rows"] for row in drawn_rows)
     assert [line.split()[0] for line in lines] == list(strata)
     for line in lines:
-        name, rows, natural, drawn, *bar = line.split()
-        stratum = strata[name]
-        assert rows == f"{stratum.rows:,}"
-        assert (natural, drawn) == (f"{stratum.natural_share:.1%}", f"{stratum.share:.1%}")
+        name, natural, wanted, drawn, logged, fresh, *bar = line.split()
+        of_name = [row["drawn_rows"] for row in drawn_rows if row["stratum"] == name]
+        assert drawn == f"{sum(of_name) / whole:.1%}"
+        assert (logged, fresh) == (f"{drawn},", "0.0%")  # nothing was driven
+        assert natural == f"{strata[name].natural_share:.1%}"
+        assert wanted == f"{fed[name]['wanted_share']:.1%}"
         added = "".join(bar).count("▒") - "".join(bar).count("·")
-        assert abs(added - 30 * (stratum.share - stratum.natural_share)) <= 1
-    assert max(map(len, [head, *lines, legend])) <= 80
+        assert abs(added - 30 * (sum(of_name) / whole - strata[name].natural_share)) <= 1
+    assert f"all {whole:,} rows" in note
+    assert max(map(len, [head, legend, note])) <= 90
 
 
 def test_a_rare_event_is_followed_from_its_message_to_an_update(told: Settings) -> None:

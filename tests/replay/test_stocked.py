@@ -255,9 +255,27 @@ def test_an_audit_finds_a_panel_and_a_run_whose_weights_undo_a_quota(
         for step in (100, 200)
     ]
     pq.write_table(pa.Table.from_pylist(rows), run / "strata.parquet")
+    fed = [  # stratum, wanted, drawn rows
+        ("nominal", 0.5, 80),
+        ("wheel_slip", 0.1, 15),
+        ("recovery", 0.4, 5),
+    ]
+    rows = [
+        {"phase": "online", "stratum": stratum, "gradient_steps": step, "natural_share": 0.1}
+        | {"wanted_share": wanted, "drawn_rows": drawn, "short_share": 0.35, "reason": "few"}
+        for stratum, wanted, drawn in fed
+        for step in (100, 200)
+    ]
+    pq.write_table(pa.Table.from_pylist(rows), run / "fed.parquet")
     with open_place(store_path, beside={"run": run}) as connection:
         found = run_audits(connection, [AUDITS[name]], {name: THRESHOLDS[name]}, beside=["run"])
-    (row,) = found[0].sample
+    starved, row = found[0].sample  # of the batch, then by weights
+    assert (starved["stratum"], starved["source"], starved["reason"]) == (
+        "recovery",
+        "batch",
+        "few",
+    )
+    assert (starved["wanted_share"], starved["drawn_share"]) == pytest.approx((0.4, 0.05))
     assert (found[0].status, row["stratum"]) == ("fail", "wheel_slip")
     assert row["drawn_share"] == pytest.approx(0.3)
     assert row["effective_share"] == pytest.approx(0.01)

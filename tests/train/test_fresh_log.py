@@ -117,7 +117,7 @@ def test_a_flushed_run_is_a_recording_like_any_other(
             np.array(row["next_observation"], np.float32), packed[ring.columns["next_observation"]]
         )
         assert row["step_index"] == ring.meta["episode_step"][slot]
-        assert row["condition"] == labels[ring.condition(np.array([slot]))[0]]
+        assert row["primary_condition"] == labels[ring.condition(np.array([slot]))[0]]
         assert row["action_probability"] == ring.meta["action_probability"][slot]
         assert row["behaviour_policy"] == "dqn"
         began = ring.meta["policy_version"][slot] - row["step_index"]

@@ -560,7 +560,7 @@ def test_the_record_says_what_the_filter_did(taught: Any) -> None:
 
 def test_the_replay_card_names_the_teacher(taught: Any) -> None:
     known: dict[str, Any] = {field.name: [] for field in dataclasses.fields(Facts)}
-    known |= {"run": taught.run.path, "config": {}, "panel": None}
+    known |= {"run": taught.run.path, "config": {}, "panel": None, "policy": None}
     untaught = replay_card(Facts(**known))
     assert untaught["teacher"] is None
     assert "none: every action may be chosen" in as_markdown(untaught)

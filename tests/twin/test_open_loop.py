@@ -74,13 +74,13 @@ def test_the_fit_and_the_gap_read_the_same_rows(store: Path, steps: LoggedSteps)
     rows = cut.row[:, None] + np.arange(cut.horizon_steps)
     with Store(store) as opened:
         table = opened.connection.sql(
-            "SELECT transition_id, pose_x_m, wheel_speed_mps, command_speed_mps, condition"
+            "SELECT transition_id, pose_x_m, wheel_speed_mps, command_speed_mps, primary_condition"
             " FROM transitions ORDER BY recording_id, episode_index, step_index"
         ).fetchnumpy()
     assert len(cut) > 5
     assert np.array_equal(table["transition_id"], steps.transition_id)
     assert np.array_equal(table["transition_id"][rows[:, 0]], cut.transition_id)
-    assert np.array_equal(table["condition"][rows].astype(str), cut.condition)
+    assert np.array_equal(table["primary_condition"][rows].astype(str), cut.condition)
     for name in ("pose_x_m", "wheel_speed_mps"):
         stored = np.asarray(table[name], np.float64)
         assert np.array_equal(stored, steps.now[name])

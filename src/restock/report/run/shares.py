@@ -74,7 +74,8 @@ def remarks(facts: Facts) -> list[str]:
     natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
     lost = []
     for row in facts.sampled:
-        of_rows, weighted = natural.get(row["stratum"]), row["effective_share"]
+        of_rows = natural.get(row["stratum"], row["available_share"])
+        weighted = row["effective_share"]
         if row["source"] == "fresh" or of_rows is None or weighted is None:
             continue
         if row["drawn_share"] >= of_rows and weighted < (1 - TOLERANCE) * of_rows:
