@@ -105,6 +105,26 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for name, rows in (("nominal", 90), (HOSTILE, 10))
         ],
     )
+    made.append(
+        "fed",
+        [
+            filled(
+                "fed",
+                gradient_steps=n,
+                phase="online",
+                stratum=name,
+                wanted_share=0.5,
+                drawn_share=rows / 100,
+                logs_share=rows / 200,
+                fresh_share=rows / 200,
+                short_share=max(0.5 - rows / 100, 0.0),
+                reason=f"too few rows of {HOSTILE}" if rows < 50 else None,
+                drawn_rows=2 * rows,
+            )
+            for n in steps
+            for name, rows in (("nominal", 90), (HOSTILE, 10))
+        ],
+    )
     # Of three actions the logs never have the last, which the policy takes in 18 of 60 rows.
     made.append(
         "actions",
@@ -904,14 +924,16 @@ def test_what_is_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert f"{place}: {said}" in "".join(capsys.readouterr().err.splitlines())
 
 
-def test_four_shares_stand_side_by_side_and_a_loss_by_weights_is_said(run: Path) -> None:
+def test_shares_stand_side_by_side_and_what_is_short_or_lost_by_weights_is_said(run: Path) -> None:
     facts = gather(run)
     kinds = {row["kind"] for row in shares.bars(facts)}
-    assert kinds == {"natural", "wanted", "drawn", "after weights"}
-    (said,) = shares.remarks(facts)
-    assert "nominal (86.27% of the rows, 90.00% of the draws, 50.00% of the gradient)" in said
+    assert kinds == {"natural", "wanted", "drawn"}
+    short, lost = shares.remarks(facts)
+    assert "was short by 40.0% of the rows fed, of 50.0% wanted: too few rows of" in short
+    assert "nominal (86.27% of the rows, 90.00% of the draws, 50.00% of the gradient)" in lost
     facts.sampled = [row | {"effective_share": row["drawn_share"]} for row in facts.sampled]
-    assert shares.remarks(facts) == []
+    assert shares.remarks(facts) == [short]
     figure = shares.figure(facts)
     assert figure is not None
-    assert "after weights" in figure.widest
+    assert "wanted" in figure.widest
+    assert [row["drawn"] for row in shares.fed_table(facts).rows] == ["90%", "10%"]

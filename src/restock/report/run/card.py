@@ -141,20 +141,6 @@ _TABLES = (
         },
     ),
     (
-        "Strata by source (shares of the source's rows)",
-        "strata",
-        {
-            "source": "source",
-            "stratum": "stratum",
-            "timing": "timing",
-            "available_rows": "available",
-            "quota_share": "intended",
-            "drawn_share": "drawn",
-            "effective_share": "after weights",
-            "terminal_share": "terminal",
-        },
-    ),
-    (
         "Age of the sampled rows",
         "ages",
         {name: name for name in ("source", "unit", "rows", "p50", "p90", "p99")},
