@@ -147,7 +147,8 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
         f"no update was made in {outcome.env_steps:,} environment steps, so the policy is {learnt};"
         " online updates begin after"
         f" schedule.warmup_env_steps={config.schedule.warmup_env_steps:,}, once there are"
-        f" replay.batch_size={config.replay.batch_size:,} rows: give more --env-steps"
+        f" replay.batch_size={config.replay.batch_size:,} rows: give more"
+        f" {'--env-steps' if config.schedule.seconds is None else '--seconds'}"
     )
 
 
