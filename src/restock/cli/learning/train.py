@@ -129,12 +129,19 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
         say(f"nothing to do: {why}")
     if store is not None or (session.run.path / "fresh").is_dir():
         session.collector.keep(session.run.path / "fresh")
+    seconds = config.schedule.seconds
+
+    def spent() -> int:
+        """Of the budget: seconds, or environment steps."""
+        return session.progress.env_steps if seconds is None else round(session.wall_s)
+
+    budget = config.schedule.env_steps if seconds is None else round(seconds)
     try:
         with (
-            progress("training", config.schedule.env_steps) as advance,
+            progress("training", budget) as advance,
             _stop_on_interrupt() as stop,
         ):
-            seen = session.progress.env_steps
+            seen = spent()
             advance(seen)
 
             def notify(event: str, values: dict[str, Any]) -> None:
@@ -149,8 +156,8 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                     for note in values["notes"]:
                         say(f"off-policy evaluation: {note}")
                 elif event == "progress":
-                    advance(values["env_steps"] - seen, _progress_note(values))
-                    seen = values["env_steps"]
+                    advance(spent() - seen, _progress_note(values))
+                    seen = spent()
 
             try:
                 outcome = train(session, stop=stop, notify=notify)
