@@ -527,13 +527,15 @@ def test_the_verb_says_what_replays_are_counted_over(
 ) -> None:
     assert cli.main(["mix", str(store_path), "--dry-run"]) == 0
     text = capsys.readouterr().out
-    assert "how often each would be drawn in 20,000 updates of 128 rows" in text
-    assert "draws no row more than 400 times (max_replays_per_row)" in text
+    assert "these numbers are for 20,000 updates of 128 rows, of logged rows alone" in text
+    assert "no row is drawn more than 400 times (max_replays_per_row)" in text
+    # Few rows: at the default training budget they bear less.
+    assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
     (tmp_path / "m.toml").write_text("[planned]\nupdates = 100\n[sources]\nlogs = 1\n" + EVERY)
     asked = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
     assert cli.main(asked) == 0
     text = capsys.readouterr().out
-    assert "drawn in 100 updates of 128 rows" in text
+    assert "these numbers are for 100 updates of 128 rows" in text
     assert "max_replays_per_row" not in text
 
 
