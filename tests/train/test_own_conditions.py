@@ -103,7 +103,9 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     (folder / "mine.toml").write_text(text)
     capsys.readouterr()
     assert main(["label", str(folder / "store"), "--profile", str(folder / "mine.toml")]) == 0
-    query = "SELECT count(*) FILTER (condition = 'creeping' AND battery_v IS NULL) AS fresh,"
+    query = (
+        "SELECT count(*) FILTER (primary_condition = 'creeping' AND battery_v IS NULL) AS fresh,"
+    )
     query += " count(*) FILTER (primary_condition = 'sagging') AS sagging FROM transitions"
     capsys.readouterr()
     assert main(["sql", str(folder / "store"), query, "--json"]) == 0
