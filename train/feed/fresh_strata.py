@@ -16,13 +16,7 @@ from restock.arrays import Bools, Ints
 from restock.ingest.task.conditions import NOMINAL, Condition, of_kind
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.panel.panel import Panel
-from restock.replay.plan.strata import (
-    NO_STRATUM,
-    NOMINAL_PRIORITY,
-    ResolvedStratum,
-    assign,
-    rules_of,
-)
+from restock.replay.plan.strata import NOMINAL_PRIORITY, ResolvedStratum, assign, rules_of
 
 
 class FreshStrata:
@@ -56,13 +50,13 @@ class FreshStrata:
 
     @classmethod
     def of(cls, panel: Panel, conditions: Sequence[Condition]) -> FreshStrata:
-        """For the mixture that a panel was made by."""
+        """Make one for the mixture that a panel was made by."""
         header = panel.header
         first = header.strata[: len(header.strata) // (1 + len(header.others))]
         return cls(header.mixture, [stratum.name for stratum in first], conditions)
 
     def codes(self, labels: Mapping[str, Bools], steps: int, rows: Ints) -> NDArray[np.int16]:
-        """The stratum of each step (T,) of an episode; -1 where it is in none.
+        """Return the stratum of each step (T,) of an episode; -1 for a step in none.
 
         Args:
             labels: (T,) by condition, whether it holds.
@@ -88,6 +82,3 @@ class FreshStrata:
                 fewest = min(met, key=lambda i: (rows[i], self._strata[i].priority))
                 code[np.isin(code, met)] = fewest
         return code
-
-
-__all__ = ["NO_STRATUM", "FreshStrata"]

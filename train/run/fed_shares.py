@@ -14,7 +14,7 @@ LOW_PART = 0.5  # of a quota: a run that fed less warns
 
 
 def fed_shares(run: Run) -> list[dict[str, Any]]:
-    """Return a row a stratum: its natural, wanted, drawn and short share of all rows fed.
+    """Return a row per stratum: its natural, wanted, drawn and short share of all rows fed.
 
     `logs_share` and `fresh_share` say where the drawn rows came from, `reason` why it was short.
     Empty for a run without a panel.
