@@ -19,7 +19,6 @@ from restock.ingest.task.conditions import Condition
 from restock.interrupts import interrupts_raised
 from restock.replay.panel.logged_sampler import controller_for
 from restock.replay.panel.panel import Panel
-from restock.replay.sampling.share_controller import FreshSupply
 from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
@@ -396,12 +395,12 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
     fed = None
     if panel is not None:
-        supply = None
+        fresh_strata = None
         if config.env.twin:
             conditions, exposures = told_in_twin(profile)
-            supply = FreshSupply(FreshStrata.of(panel, [*conditions, *exposures]).known)
+            fresh_strata = FreshStrata.of(panel, [*conditions, *exposures]).known
         planned = planned_draws(config)
-        controller = controller_for(panel, planned, config.replay.logs_share, supply)
+        controller = controller_for(panel, planned, config.replay.logs_share, fresh_strata)
         fed = {
             **panel_document(panel),
             # The quotas, and what fills them, as far as this run's own draws say.

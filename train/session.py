@@ -21,7 +21,6 @@ from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.share_controller import FreshSupply
 from restock.state import Stateful
 from restock.toml import by_path
 from restock.train.dqn.behaviour import PolicyNetwork
@@ -349,7 +348,7 @@ def open_session(
         batch_size=config.replay.batch_size,
         logs_share=config.replay.logs_share,
         seed=seed,
-        fresh=None if strata is None else FreshSupply(strata.known),
+        fresh=None if strata is None else strata.known,
     )
     executor = ThreadPoolExecutor(1, "twin") if config.env.overlap else None
     collector = Collector(env, ring, conditions, task, executor, teacher, strata)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import F32, F64, Ints
+from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.represented import stands_for_others
@@ -30,7 +30,6 @@ from restock.replay.sampling.chunked import ChunkedSampler
 from restock.replay.sampling.priorities import sampler_by_rules
 from restock.replay.sampling.sampler import QuotaSampler, Sampler
 from restock.replay.sampling.share_controller import (
-    FreshSupply,
     PlannedDraws,
     SampledStratum,
     ShareController,
@@ -236,7 +235,7 @@ def sampler_for(
     planned: PlannedDraws | None = None,
     logs_share: float | None = None,
     lap_floor: float = 1.0,
-    fresh: FreshSupply | None = None,
+    fresh: Bools | None = None,
 ) -> LoggedSampler:
     """The sampler that draws from a panel as its mixture says.
 
@@ -247,7 +246,7 @@ def sampler_for(
             mixture says under [planned].
         logs_share: of an online batch, in place of the mixture's.
         lap_floor: the threshold of the Huber loss, where `within = "lap"`.
-        fresh: what a ring beside the panel can give of each stratum; None: there is no ring.
+        fresh: (S,) which strata rows of a ring beside the panel can be in; None: there is no ring.
 
     Raises:
         MixtureError: rows too few for what is planned, where the mixture refuses that; too little
@@ -337,7 +336,7 @@ def controller_for(
     panel: Panel,
     planned: PlannedDraws,
     logs_share: float | None = None,
-    fresh: FreshSupply | None = None,
+    fresh: Bools | None = None,
 ) -> ShareController:
     """The shares of a learner that draws so much from a panel.
 

@@ -51,13 +51,6 @@ class PlannedDraws:
 
 
 @dataclass(frozen=True)
-class FreshSupply:
-    """Which strata (S,) fresh rows can be told to be in."""
-
-    known: Bools
-
-
-@dataclass(frozen=True)
 class SampledStratum:
     """A stratum of a panel, as the controller needs it."""
 
@@ -142,7 +135,7 @@ class ShareController(Stateful):
         strata: of the panel, source by source.
         planned: what the run will draw.
         logs_share: a share of an online batch, in place of the mixture's.
-        fresh: what a ring of fresh rows can give; None: there is none.
+        fresh: (S,) which strata rows of a ring can be told to be in; None: there is no ring.
 
     With K sources of S strata, `shares` (K * S,) are of the logged part of a batch and sum to 1,
     `logs_share` is that part of an online batch, `drawn` (K * S,) what was drawn of each stratum.
@@ -166,10 +159,10 @@ class ShareController(Stateful):
         planned: PlannedDraws,
         *,
         logs_share: float | None = None,
-        fresh: FreshSupply | None = None,
+        fresh: Bools | None = None,
     ) -> None:
         self.mixture, self.strata, self.planned = mixture, list(strata), planned
-        self.supply, self.online = fresh, False
+        self.fresh, self.online = fresh, False
         size = len(strata) // len(mixture.sources.parts)
         self._of: Ints = np.arange(len(strata)) % size  # the stratum of each source's stratum
         self.wanted: F64 = np.zeros(size)
@@ -269,12 +262,12 @@ class ShareController(Stateful):
         `stock` (S,) is how many fresh rows of each stratum may be drawn, in batches.
         """
         self.env_steps = env_steps
-        began = self.supply is not None and not self.online
-        if not (began or self._moves or self.supply is not None):
+        if self.fresh is None and not self._moves:
             return False
+        began = self.fresh is not None and not self.online
         if self.batches % REFRESH_BATCHES and not began:
             return False
-        self.online = self.supply is not None
+        self.online = self.fresh is not None
         if stock is not None:
             self.stock = stock
         return self._work_out("redistribute")
@@ -325,7 +318,7 @@ class ShareController(Stateful):
         """Shares for this moment, within what the rows still allow."""
         if self.online:
             return self._beside_ring()
-        if self.mixture.shortfall == "shrink" and self.supply is None:
+        if self.mixture.shortfall == "shrink" and self.fresh is None:
             shortfall = "shrink"
         parts, shares, logs_share = self.parts_at(self.env_steps), np.zeros(len(self.strata)), 0.0
         for source in self.sources:
@@ -380,10 +373,10 @@ class ShareController(Stateful):
             return logs, np.zeros(len(wanted)), wanted
         rest = np.maximum(wanted - np.bincount(self._of, logs), 0.0)
         fresh = np.minimum(rest * self.boosted, stock)
-        # Logged rows fill in for what the ring has not, if they may be drawn more often.
+        # Logged rows fill in for what the ring does not give, if they may be drawn more often.
         room = limit - logs
         of_stratum = np.bincount(self._of, room)
-        lack = np.minimum((rest - fresh) * self.boosted, of_stratum)
+        lack = np.minimum(rest - fresh, of_stratum)
         part = np.divide(lack, of_stratum, out=np.zeros(len(lack)), where=of_stratum > 0)
         return logs + room * part[self._of], fresh, wanted
 
@@ -400,7 +393,7 @@ class ShareController(Stateful):
         Not those of a stratum whose boost weights are to take away: fresh rows have no weights.
         """
         corrected = np.array([stratum.corrected for stratum in self.strata[: len(self.wanted)]])
-        known = np.zeros(len(corrected), np.bool_) if self.supply is None else self.supply.known
+        known = np.zeros(len(corrected), np.bool_) if self.fresh is None else self.fresh
         return np.asarray(known & ~corrected, np.bool_)
 
     def _wanted_fresh(self, stock: F64) -> F64:
@@ -437,7 +430,7 @@ class ShareController(Stateful):
         with the reason. It counts on the ring for every stratum that fresh rows can be in.
         """
         planned, size = self.planned, len(self.wanted)
-        online = planned.online if self.supply is not None else 0.0
+        online = planned.online if self.fresh is not None else 0.0
         total = max(planned.offline + online, 1e-12)
         logs = planned.offline / total * np.bincount(self._of, self.planned_shares)
         wanted, fresh = planned.offline / total * self._wanted_offline, np.zeros(size)
@@ -481,9 +474,9 @@ class ShareController(Stateful):
         if rows:
             reason = f"its {rows:,} logged rows"
             reason += " are all there is" if limit is None else f" give {limit:,} draws each"
-        if self.supply is None:
+        if self.fresh is None:
             return reason
-        if not self.supply.known[stratum]:
+        if not self.fresh[stratum]:
             return f"{reason}, and fresh rows of the twin cannot be told to be in it"
         if not self.boosted[stratum]:
             return f"{reason}, and fresh rows are not boosted where importance weights correct it"
@@ -542,7 +535,7 @@ class ShareController(Stateful):
 
     def _ahead(self, source: _SourceDraws, drawn: float) -> float:
         """The draws that batches to come ask of a source: not what those before did not get."""
-        if self.supply is not None:  # online, the ring gives what these rows do not bear
+        if self.fresh is not None:  # online, the ring gives what these rows do not bear
             return source.offline - drawn
         by_draws = source.offline + source.online - drawn
         begin, end = self.planned.begin_env_steps, self.planned.end_env_steps

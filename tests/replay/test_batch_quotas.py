@@ -12,7 +12,6 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.plan.strata import rules_of
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.share_controller import (
-    FreshSupply,
     PlannedDraws,
     SampledStratum,
     ShareController,
@@ -47,7 +46,7 @@ def controller(
         )
     ]
     planned = PlannedDraws(2_000 * BATCH, 0.25 * (env_steps - 2_000) * BATCH, 2_000, env_steps)
-    return ShareController(mixture, strata, planned, fresh=FreshSupply(np.array(known)))
+    return ShareController(mixture, strata, planned, fresh=np.array(known))
 
 
 def drive(
@@ -116,6 +115,16 @@ def test_what_neither_has_is_short_and_nominal_does_not_take_it() -> None:
     with pytest.raises(MixtureError, match=r"near wants 30\.0% of the rows fed and gets 0\.4%"):
         controller(1_800_000, known=(True, True, False), text="shortfall = 'refuse'\n" + QUOTAS)
     controller(1_800_000, text="shortfall = 'refuse'\n" + QUOTAS)  # the ring fills it
+
+
+def test_logged_rows_alone_fill_a_quota_that_fresh_rows_cannot_be_in() -> None:
+    """They gave half of it, and the rest was short, whatever they could bear."""
+    for hindered in ({"known": (True, True, False)}, {"corrected": (False, False, True)}):
+        shares = controller(10_000, **hindered)
+        shares.at(2_000, PLENTY)
+        assert (shares.shares * shares.logs_share)[2] == pytest.approx(0.3)
+        assert shares.fresh_shares[3] == pytest.approx(0, abs=1e-12)
+        assert shares.forecast()[2]["short_share"] == 0
 
 
 def test_no_shelf_has_a_stratum() -> None:

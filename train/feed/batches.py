@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.panel.logged_sampler import (
     BatchDraw,
@@ -27,7 +27,6 @@ from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.gather import gather_rows
 from restock.replay.sampling.quotas import Quotas
 from restock.replay.sampling.share_controller import (
-    FreshSupply,
     PlannedDraws,
     ShareController,
 )
@@ -68,7 +67,7 @@ class Batches(Stateful):
 
     Args:
         logs_share: of an online batch; None leaves it to the mixture of the logs' panel.
-        fresh: what the ring can give of each stratum; None: it is drawn from as it is.
+        fresh: (S,) which strata the ring's rows can be in; None: it is drawn from as it is.
 
     Raises:
         MixtureError: the panel's rows cannot bear what the run will draw, where that is refused.
@@ -86,7 +85,7 @@ class Batches(Stateful):
         batch_size: int,
         logs_share: float | None,
         seed: int,
-        fresh: FreshSupply | None = None,
+        fresh: Bools | None = None,
     ) -> None:
         self.logs, self.ring = logs, ring
         self.batch_size = batch_size
@@ -97,7 +96,7 @@ class Batches(Stateful):
         # Logged rows of an online batch, and what rounding them owes; quotas of the fresh ones,
         # the last for rows of any kind.
         self._logged, self._owed, self._taken_over = 0, 0.0, 0.0
-        strata = 0 if fresh is None else len(fresh.known)
+        strata = 0 if fresh is None else len(fresh)
         self._fresh_quotas = Quotas(np.append(np.zeros(strata), 1.0), batch_size)
         if logs is not None:
             self._draws = logs.sampler(batch_size, logs_share, seed, fresh)

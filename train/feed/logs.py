@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from restock.arrays import F32, Ints
+from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
-from restock.replay.sampling.share_controller import FreshSupply, PlannedDraws
+from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import LossConfig
 
 if TYPE_CHECKING:
@@ -126,11 +126,11 @@ class Logs:
         batch_size: int,
         logs_share: float | None,
         seed: int,
-        fresh: FreshSupply | None = None,
+        fresh: Bools | None = None,
     ) -> LoggedSampler:
         """What draws from them: by the mixture of their panel, else by their shares.
 
-        `fresh` is what a ring beside them can give; None: there is none.
+        `fresh` (S,): which strata rows of a ring beside them can be in; None: there is no ring.
 
         Raises:
             MixtureError: see `sampler_for`.
