@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from restock.arrays import F32, Ints
+from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError, PanelError, RunError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.ingest.task.conditions import Condition
@@ -301,6 +302,14 @@ def told_in_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
     return conditions, exposures
 
 
+def _never_driven(names: Sequence[str], config: TrainConfig) -> Bools:
+    """Return which strata (S,) are of kinds of missions that the twin is told not to drive."""
+    env = config.env
+    return np.array(
+        [name in KINDS and not env.conditions.get(name) and env.missions is None for name in names]
+    )
+
+
 def refuse_short_budget(session: Session, seconds: float) -> None:
     """Estimate the time of an evaluation, and refuse a budget that two of them would use up.
 
@@ -395,12 +404,13 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
 def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dict[str, Any]:
     fed = None
     if panel is not None:
-        fresh_strata = None
+        fresh = None
         if config.env.twin:
             conditions, exposures = told_in_twin(profile)
-            fresh_strata = FreshStrata.of(panel, [*conditions, *exposures]).known
+            strata = FreshStrata.of(panel, [*conditions, *exposures])
+            fresh = strata.known & ~_never_driven(strata.names, config)
         planned = planned_draws(config)
-        controller = controller_for(panel, planned, config.replay.logs_share, fresh_strata)
+        controller = controller_for(panel, planned, config.replay.logs_share, fresh)
         fed = {
             **panel_document(panel),
             # The quotas, and what fills them, as far as this run's own draws say.

@@ -477,7 +477,7 @@ class ShareController(Stateful):
         if self.fresh is None:
             return reason
         if not self.fresh[stratum]:
-            return f"{reason}, and fresh rows of the twin cannot be told to be in it"
+            return f"{reason}, and the twin gives no fresh rows of it"
         if not self.boosted[stratum]:
             return f"{reason}, and fresh rows are not boosted where importance weights correct it"
         if not self.online:

@@ -109,8 +109,7 @@ def test_what_neither_has_is_short_and_nominal_does_not_take_it() -> None:
     row = shares.forecast()[2]
     assert row["short_share"] == pytest.approx(0.3 - row["logs_share"])
     assert row["reason"] == (
-        "its 559 logged rows give 400 draws each, and fresh rows of the twin cannot be told to be"
-        " in it"
+        "its 559 logged rows give 400 draws each, and the twin gives no fresh rows of it"
     )
     with pytest.raises(MixtureError, match=r"near wants 30\.0% of the rows fed and gets 0\.4%"):
         controller(1_800_000, known=(True, True, False), text="shortfall = 'refuse'\n" + QUOTAS)
@@ -130,7 +129,7 @@ def test_logged_rows_alone_fill_a_quota_that_fresh_rows_cannot_be_in() -> None:
 def test_no_shelf_has_a_stratum() -> None:
     shares = controller(48_000, rows=(7_628, 915, 0), known=(True, True, False))
     assert shares.forecast()[2]["reason"] == (
-        "the logs have no row of it, and fresh rows of the twin cannot be told to be in it"
+        "the logs have no row of it, and the twin gives no fresh rows of it"
     )
 
 

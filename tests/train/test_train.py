@@ -111,6 +111,33 @@ def test_a_run_says_what_fills_its_quotas(panel: Path, tmp_path: Path) -> None:
     assert "in the twin" not in alone
 
 
+def test_a_quota_that_neither_logs_nor_twin_can_fill_is_named_before_the_first_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = load_profile("warehouse_amr").task
+    text = (
+        "max_replays_per_row = 4\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
+        "[[strata]]\nname = 'wheel_slip'\nshare = 0.5\ncorrection = 'none'\n"
+        "[each_condition]\nshare = 'equal'\n"
+    )
+    rows = recording_transitions(1, episodes=40, task=task)
+    few = build_panel(rows, parse_mixture(text), tmp_path / "panel", task=task)
+    words = ["train", "--panel", str(few.path), "--out", str(tmp_path / "a"), *TINY, "--dry-run"]
+    words += ["--env-steps", "9000"]
+    assert main(words) == 0
+    assert "warning" not in capsys.readouterr().err  # the twin drives such missions
+    assert main([*words, "--set", "env.conditions={nominal=1.0, wheel_slip=0.0}"]) == 0
+    captured = capsys.readouterr()
+    assert "warning: wheel_slip will be short by" in captured.err
+    assert "and the twin gives no fresh rows of it" in captured.err
+    slip = next(
+        row
+        for row in json.loads(captured.out)["panel"]["forecast"]
+        if row["stratum"] == "wheel_slip"
+    )
+    assert slip["short_share"] > 0.3
+
+
 @pytest.mark.long  # test_loop shows it on the corridor
 def test_finished_episodes_of_the_twin_are_labelled(tmp_path: Path) -> None:
     path = tmp_path / "a"
