@@ -128,7 +128,9 @@ def test_conditions_are_compared_whatever_the_strata_of_that_name_are(tmp_path, 
     for seed, path in enumerate(paths):
         run_to_end(path, config(schedule={"env_steps": 800}), logs=logs_by(path.name))
         shares = {"nominal": 0.98 - 0.13 * seed, "wheel_slip": 0.02 + 0.13 * seed}
-        whole = document(seed, panel__id=path.name, panel__strata=shares) | {"format": FORMAT}
+        forecast = [{"stratum": name, "wanted_share": share} for name, share in shares.items()]
+        panel = {"panel__id": path.name, "panel__strata": shares, "panel__forecast": forecast}
+        whole = document(seed, **panel) | {"format": FORMAT}
         (path / "config.json").write_text(json.dumps(whole), "utf-8")
 
     def slipping(column: str) -> list[int]:

@@ -261,7 +261,8 @@ def _settings(run: Run) -> dict[str, Any]:
     config = without_removed(run.document.get("config", {}))
     document = {**run.document, "config": config}
     settings = by_path({key: document[key] for key in document if key not in _NO_SETTING})
-    return {name: value for name, value in settings if not name.startswith("panel.strata.")}
+    shares = ("panel.strata.", "panel.forecast")
+    return {name: value for name, value in settings if not name.startswith(shares)}
 
 
 def kind_of(setting: str) -> Kind:

@@ -93,8 +93,8 @@ def trained(to: Settings) -> str:
     lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
     if most < FULL_STEPS / 2:
         lines += [
-            f"That is little: after {FULL_STEPS:,} it completes .92 of the rare missions of the",
-            "sample logs (docs/learning.md). Give more --seconds, or run nothing else beside it.",
+            f"That is little: docs/learning.md says what {FULL_STEPS:,} steps gave. Give more",
+            "--seconds, or run nothing else beside it.",
         ]
     if not most:
         lines = ["The time was up before anything was driven: give more --seconds."]
