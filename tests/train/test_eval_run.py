@@ -136,7 +136,8 @@ def test_evaluations_add_up_and_the_newest_floors_are_shown(
     shown, said = shown_evaluation(run)
     assert (shown.num_rows, set(shown["version"].to_pylist())) == (2, {"a@9"})
     assert said == (
-        "2 of 10 episodes that `restock eval` drove: floors elsewhere, policy a@9, seeds 1 to 1."
+        "2 of 10 episodes that `restock eval` drove: floors elsewhere, policy a@9 of step 0, seeds"
+        " 1 to 1."
     )
     many = ",".join(f"/some/where/floor-{number}.toml" for number in range(1, 7))
     place = newer.schema.get_field_index("layouts")

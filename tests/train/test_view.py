@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from restock.train.evaluation.evaluation_plan import plan_evaluation
 from restock.train.run import checkpoint
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.run.run import Run
+from restock.train.session import Progress
 from restock.train.view.critic import critic_along
 from restock.train.view.view import ViewOptions, layout_of, write_view
 
@@ -75,7 +76,8 @@ def event(tmp_path_factory: pytest.TempPathFactory) -> Event:
     with torch.no_grad():  # a target that lags
         for parameter in learner.target_network.parameters():
             parameter.mul_(0.9)
-    checkpoint.save(made.latest, {"learner": learner.state_dict()})
+    progress = asdict(Progress(evaluated_at=0))
+    checkpoint.save(made.latest, {"learner": learner.state_dict(), "progress": progress})
     return Event(folder / "store", run, row, steps)
 
 
