@@ -23,7 +23,8 @@ from restock.errors import StoreError
 from restock.files import first_line
 from restock.ingest.store.data_files import AddedFile, add_action, rewrite, unwritten
 from restock.ingest.store.lineage import StoredFile, active_files, own_path, stored_files
-from restock.ingest.store.location import TRANSITIONS
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS
+from restock.ingest.store.protocol import expect_writable
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
 from restock.ingest.task.schema import recording_schema
@@ -55,6 +56,7 @@ class TableCommits(StoreReader):
                     configuration={"delta.checkpointInterval": str(CHECKPOINT_COMMITS)},
                 )
             table = self.path.open_table(name)
+            expect_writable(table, where=str(self.path))
             have = {field.name: field for field in table.schema().fields}
             refuse_other_signals(have, schema, str(self.path))
             extra = [field.with_nullable(True) for field in schema if field.name not in have]
@@ -78,11 +80,14 @@ class TableCommits(StoreReader):
             )
 
     def expect_store(self) -> None:
-        """Raises StoreError where there is no store, or not all of it."""
+        """Raises StoreError where there is no store, not all of it, or one that others' features
+        protect from what takes rows out."""
         self.expect_folder()
         self.path.expect_both_tables()
         if not self.path.has_table(TRANSITIONS):
             raise self.path.absent()
+        for name in (RECORDINGS, TRANSITIONS):
+            expect_writable(self.path.open_table(name), where=str(self.path), removing=True)
 
     def allow_nulls(self, names: Collection[str]) -> None:
         """Let these signals be null: in a store of an older Restock the clearance of a robot
@@ -264,8 +269,11 @@ class TableCommits(StoreReader):
 
         Raises:
             CommitFailedError: another writer was faster.
-            StoreError: a folder cannot be written.
+            StoreError: a folder cannot be written, or the table uses a feature that Restock cannot
+                write.
         """
+        removing = any(isinstance(one, RemoveAction) for one in actions)
+        expect_writable(table, where=str(self.path), removing=removing)
         try:
             table.create_write_transaction(
                 list(actions),

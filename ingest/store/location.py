@@ -28,6 +28,7 @@ from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError, expect
 from restock.files import first_line
+from restock.ingest.store.protocol import expect_readable, unsupported
 from restock.ingest.store.version import (
     LOG,
     Version,
@@ -203,7 +204,8 @@ class Location:
         """One of its tables, at a version (or the newest of a moment) or at its newest.
 
         Raises:
-            StoreError: no such table or version, or the place cannot be reached.
+            StoreError: no such table or version, one that uses a feature that Restock cannot read,
+                or the place cannot be reached.
         """
         try:
             with self.translate_errors():
@@ -211,16 +213,18 @@ class Location:
                 if isinstance(version, datetime):
                     version = version_at(table, version, where=self.text)
                 newest = table.version()
-                if version is None or version == newest:
-                    self._expect_whole(name, newest)
-                    return table
-                if not 0 <= version <= newest:
-                    raise StoreError(
-                        f"has no version {version}: its newest is {newest}", where=self.text
-                    )
-                self._expect_whole(name, version)
-                return DeltaTable(self.table(name), version=version, storage_options=self.options)
+                if version is not None and version != newest:
+                    if not 0 <= version <= newest:
+                        raise StoreError(
+                            f"has no version {version}: its newest is {newest}", where=self.text
+                        )
+                    table.load_as_version(version)
+                self._expect_whole(name, table.version())
+                expect_readable(table, where=self.text)
+                return table
         except (TableNotFoundError, DeltaError, ValueError) as error:
+            if refused := unsupported(error, self.table(name), where=self.text):
+                raise refused from error
             if self.folder and (known := log_damage(self.folder / name / LOG, where=self.text)):
                 raise known from error
             raise StoreError(

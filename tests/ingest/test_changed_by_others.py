@@ -1,0 +1,116 @@
+"""A store whose Delta tables another tool has changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from deltalake import DeltaTable
+from support.stores import one, shown
+
+from restock import cli
+from restock.errors import StoreError
+from restock.ingest.store import commits
+from restock.ingest.store.compaction import compact
+from restock.ingest.store.location import RECORDINGS, TRANSITIONS
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    place = tmp_path / "s"
+    StoreWriter(place).write_all([one(1), one(2)])
+    return place
+
+
+def with_protocol(store: Path, name: str = TRANSITIONS, **protocol: object) -> Path:
+    """A commit that changes a table's protocol, as Spark writes it."""
+    log = store / name / "_delta_log"
+    number = len(list(log.glob("*.json")))
+    text = json.dumps({"protocol": protocol}) + "\n"
+    (log / f"{number:020}.json").write_text(text, encoding="utf-8")
+    return store
+
+
+def features(*names: str, reading: bool = True) -> dict[str, object]:
+    listed = {"minReaderVersion": 1, "minWriterVersion": 7, "writerFeatures": list(names)}
+    return listed | ({"minReaderVersion": 3, "readerFeatures": list(names)} if reading else {})
+
+
+@pytest.mark.parametrize("feature", ["deletionVectors", "typeWidening", "fromTheFuture"])
+def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, capsys, feature):
+    """Rows that deletion vectors delete are in the Parquet files still."""
+    before = sum(shown(store).values())
+    with_protocol(store, **features(feature))
+    for verb in (["sql", str(store), "FROM coverage"], ["compact", str(store)]):
+        assert cli.main(verb) == 2
+        said = capsys.readouterr().err
+        assert f"its table `transitions` uses Delta's feature `{feature}`" in said
+        assert "DROP FEATURE" in said
+        assert "Traceback" not in said
+    with pytest.raises(StoreError, match=feature):
+        StoreWriter(store).write(*one(3))
+    if feature != "fromTheFuture":  # which Delta's library does not open at all
+        with Store(store, version=1) as earlier:
+            assert earlier.sql("SELECT count(*) FROM transitions").fetchall() == [(before,)]
+
+
+@pytest.mark.parametrize(
+    ("protocol", "said"),
+    [
+        (features("rowTracking", "domainMetadata", reading=False), "feature `rowTracking`"),
+        ({"minReaderVersion": 1, "minWriterVersion": 6}, "feature `identityColumns`"),
+        ({"minReaderVersion": 1, "minWriterVersion": 8}, "version 8 of the protocol"),
+    ],
+)
+@pytest.mark.parametrize("name", [TRANSITIONS, RECORDINGS])
+def test_a_writer_feature_that_is_not_known_refuses_to_write(store, protocol, said, name):
+    before = shown(store)
+    with_protocol(store, name, **protocol)
+    writer = StoreWriter(store)
+    files = {path for path in store.rglob("*") if path.is_file()}
+    for write in (lambda: writer.write(*one(3)), lambda: compact(writer)):
+        with pytest.raises(StoreError, match=f"`{name}` uses Delta's {said}.*unchanged"):
+            write()
+    assert shown(store) == before  # reading is allowed
+    assert {path for path in store.rglob("*") if path.is_file()} == files
+
+
+def test_a_constraint_of_delta_is_not_passed_over(store):
+    table = DeltaTable(str(store / TRANSITIONS))
+    table.alter.add_constraint({"forward": "step_index >= 0"})
+    with pytest.raises(StoreError, match="feature `checkConstraints`"):
+        StoreWriter(store).write(*one(3))
+    DeltaTable(str(store / TRANSITIONS)).alter.drop_constraint("forward")
+    StoreWriter(store).write(*one(3))
+    assert len(shown(store)) == 3
+
+
+def test_an_append_only_table_gets_new_recordings_and_loses_none(store, monkeypatch):
+    monkeypatch.setattr(commits, "ATTEMPTS", 1)
+    DeltaTable(str(store / TRANSITIONS)).alter.set_table_properties({"delta.appendOnly": "true"})
+    before = shown(store)
+    for write in (lambda w: w.write(*one(1, "b")), compact):
+        with pytest.raises(StoreError, match="feature `appendOnly`"):
+            write(StoreWriter(store))
+    assert shown(store) == before
+    StoreWriter(store).write(*one(3))
+    assert len(shown(store)) == 3
+
+
+def test_features_that_are_not_in_use_change_nothing(store):
+    with_protocol(
+        store,
+        minReaderVersion=3,
+        minWriterVersion=7,
+        readerFeatures=["timestampNtz", "columnMapping"],
+        writerFeatures=[
+            *("timestampNtz", "columnMapping", "appendOnly", "invariants"),
+            *("checkConstraints", "changeDataFeed", "generatedColumns"),
+        ],
+    )
+    StoreWriter(store).write(*one(1, "b"))
+    compact(StoreWriter(store))
+    assert set(shown(store)) == {f"{1:016x}-b", f"{2:016x}-a"}
