@@ -8,6 +8,7 @@ and `restock.ingest.task.task.observe`; all that is different is who hands over 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from restock.errors import ConfigError, expect
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, join
 from restock.ingest.live.clock import LiveClock
+from restock.ingest.profile.conventions import conventions_of
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.not_live import not_live
 from restock.ingest.profile.profile import Profile
@@ -115,6 +117,7 @@ class LiveObserver:
         paths = dict.fromkeys(path for source in sources for path in field_paths(source))
         latched = all(source.max_age_s is None for source in sources)
         fields = {path: _column(message, path) for path in paths}
+        fields |= _said(message, sources)
         self._newest_ns = log_time_ns
         stamp_ns = self._stamp(topic, message, log_time_ns, latched)
         if stamp_ns is None:
@@ -222,6 +225,20 @@ def value_of(message: Any, path: str) -> Any:
     head, place = element_of(path)
     value = _member(message, head)
     return value if place is None else value[place]
+
+
+def _said(message: Any, sources: Sequence[Input]) -> dict[str, FieldColumn]:
+    """Return the fields by which a message says that it has no estimate, as columns of one row."""
+    rules = (
+        rule
+        for source in sources
+        for path in source.fields.values()
+        for rule in conventions_of(source.type, path)
+        if rule.of_messages
+    )
+    with suppress(AttributeError):  # the type of another package, by the same name
+        return {path: _column(message, path) for rule in rules for path in rule.fields}
+    return {}
 
 
 def _columns(messages: Sequence[_Message]) -> TopicColumns:

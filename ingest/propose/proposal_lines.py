@@ -258,6 +258,7 @@ def _input_lines(
         if role in REQUIRED:
             fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
             if role == "pose":
+    why = seen.unmeasured.get(role, "")
                 fits += ", or transforms that join two frames"
             named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
             return [
@@ -266,6 +267,7 @@ def _input_lines(
                 f"# [inputs.{role}]",
                 '# topic = "/TOPIC"',
                 '# type = "ITS TYPE"',
+                *told,
                 f"# fields = {{ {named} }}",
                 "# max_age_s = 0.5",
                 "",
@@ -273,12 +275,14 @@ def _input_lines(
         if role == "wheels":
             by_hand = ["# [motion]", "# window_s = 0.5"] if seen.motion is None else []
             return [
-                "# [inputs.wheels]  # no odometry seen; instead: speeds from poses",
+                *told,
+                "# [inputs.wheels]  # no usable odometry; instead: speeds from poses",
                 *by_hand,
                 "",
             ]
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
-        return [f"# [inputs.{role}]  # no topic seen; instead: {fallback}", ""]
+        none = "none of use" if why else "no topic seen"
+        return [*told, f"# [inputs.{role}]  # {none}; instead: {fallback}", ""]
     topic, kind = fitting[0]
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
     beside = dict.fromkeys(other.name for other, _ in fitting if other.name != topic.name)
@@ -290,6 +294,7 @@ def _input_lines(
             if role == "command" and seen.commands.measured
             else []
         ),
+        *(f"# Not used: {line}" for line in textwrap.wrap(why, 86)),
         *(
             [
                 "# The navigation stack's proposal, by its name. It is part of the observation,",

@@ -151,6 +151,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.command.wheelbase_m", told))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
+    advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
         advice.append(Advice("task.body", f"{said}--footprint"))
     if len(seen.lidars) > 1:
         scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)

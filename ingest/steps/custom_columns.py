@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from textwrap import shorten
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns, offsets_of
+from restock.ingest.profile.conventions import Convention, conventions_of, said_in
 from restock.ingest.profile.custom_signal import LIST, NUMBER, QUATERNION, CustomSignal, Reduce
 from restock.ingest.profile.signal_paths import PathProblem, PathValues
 from restock.ingest.steps.align import LatestMessages
@@ -29,6 +30,7 @@ class CustomColumn:
     signal: CustomSignal
     values: Ragged  # (N,) of a signal that is no list: one value a message, or none
     unread: Sequence[str] = ()  # of each message that has one: a text that is no number
+    unmeasured: int = 0  # messages that say themselves that it was not measured
 
     @cached_property
     def samples(self) -> NDArray[np.bool_]:
@@ -75,9 +77,13 @@ class CustomColumn:
         return pa.ListArray.from_arrays(pa.array(offsets), flat, type=LIST, mask=pa.array(~known))
 
 
-def custom_reduction(signals: Mapping[str, CustomSignal]) -> Reduction:
-    """What makes the columns of these signals, all of one topic, of its messages' fields."""
+def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] = ()) -> Reduction:
+    """What makes the columns of these signals, all of one topic whose messages have the fields
+    `has`, of its messages' fields."""
     fields = [path for signal in signals.values() for path in signal.wanted()]
+    for signal in signals.values():
+        for rule in conventions_of(signal.type, signal.path, has):
+            fields += rule.fields
 
     def apply(columns: Fields) -> dict[str, FieldColumn]:
         made: dict[str, FieldColumn] = {}
@@ -115,6 +121,12 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
         raise RecordingError(
             f"`signals.{name}.path`: {signal.path!r} of {signal.topic} {problem}"
         ) from None
+    if signal.reduce != "count":
+        for rule in conventions_of(signal.type, signal.path, columns):
+            read = _measured(rule, columns, read)
+            gone = np.bincount(read.message, np.isnan(read.values), count)
+            every = np.bincount(read.message, minlength=count)
+            texts[f"{_key(name)}, not measured"] = (every > 0) & (gone == every)
     if signal.reduce in ("min", "max", "mean", "sum"):
         read = _reduced(read, signal.reduce)
     stored = np.asarray(read.values, np.float64) * signal.scale + signal.offset
@@ -124,6 +136,12 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
                            offsets_of(lengths)),
         **texts,
     }  # fmt: skip
+
+
+def _measured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
+    """The same with NaN for what messages say was not measured."""
+    said = (said_in(columns, path)[read.message] for path in rule.said_by)
+    return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *said))
 
 
 def _key(name: str) -> str:
@@ -179,17 +197,26 @@ class Custom:
     @property
     def notes(self) -> list[str]:
         """What of them could not be used, in words."""
-        return [
-            f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages have"
-            f" a value that is not a number, such as {shorten(column.unread[0], 60)!r}"
-            for name, column in self.columns.items()
-            if column.unread
-        ] + [
-            f"signals.{name}: {count:,} of {len(column.values):,} messages do not have the length "
-            f"{column.signal.length}: null"
-            for name, column in self.columns.items()
-            if (count := column.of_other_length)
-        ]
+        return (
+            [
+                f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages have"
+                f" a value that is not a number, such as {shorten(column.unread[0], 60)!r}"
+                for name, column in self.columns.items()
+                if column.unread
+            ]
+            + [
+                f"signals.{name}: {column.unmeasured:,} of {len(column.values):,} messages of"
+                f" {column.signal.topic} say that it was not measured ({_how(column.signal)}): null"
+                for name, column in self.columns.items()
+                if column.unmeasured
+            ]
+            + [
+                f"signals.{name}: {count:,} of {len(column.values):,} messages do not have the length "
+                f"{column.signal.length}: null"
+                for name, column in self.columns.items()
+                if (count := column.of_other_length)
+            ]
+        )
 
     def rows(self) -> list[dict[str, Any]]:
         """What came of each, as `recordings.signals` holds it."""
@@ -251,4 +278,10 @@ def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomCol
         fields = custom_reduction({name: signal}).apply(fields)
     values, texts = fields[_key(name)], fields.get(f"{_key(name)}, no number", np.zeros(0))
     assert isinstance(values, Ragged)
-    return CustomColumn(signal, values, [text for text in np.asarray(texts).tolist() if text])
+    unmeasured = int(np.sum(np.asarray(fields.get(f"{_key(name)}, not measured", 0))))
+    unread = [text for text in np.asarray(texts).tolist() if text]
+    return CustomColumn(signal, values, unread, unmeasured)
+
+
+def _how(signal: CustomSignal) -> str:
+    return " or ".join(rule.words for rule in conventions_of(signal.type, signal.path))

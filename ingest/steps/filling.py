@@ -7,7 +7,7 @@ finite) is kept beside it as a reason, so that everything left out can be counte
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from math import isnan, nan
 from typing import Any
@@ -36,6 +36,11 @@ from restock.ingest.task.scan import with_unseen
 from restock.ingest.task.signals import Signals, localised_velocity
 from restock.ingest.task.surroundings import SCANNED, came_nearer, steps_remembered
 
+# What rows have in place of a field without an estimate, if it is not left unknown.
+NO_ESTIMATE = {
+    "angular_velocity": ": gyro yaw rate taken from the wheels",
+    "linear_acceleration": ": acceleration 0",
+}
 _CHUNK = 4096  # steps
 
 
@@ -63,14 +68,28 @@ class Filling:
         )
         self._pose()
         lateral_by_poses = self._wheels()
+        instead = {
+            "gyro_yaw_rate_radps": self.signals["wheel_yaw_rate_radps"],
+            "accel_x_mps2": np.zeros(len(self.tick_ns)),
+        }
         if "imu" in self.inputs.by_name:
-            self._numbers("imu", yaw_rate_radps="gyro_yaw_rate_radps", accel_x_mps2="accel_x_mps2")
+            self._numbers(
+                "imu",
+                instead,
+                yaw_rate_radps="gyro_yaw_rate_radps",
+                accel_x_mps2="accel_x_mps2",
+            )
         else:
-            self.signals["gyro_yaw_rate_radps"] = self.signals["wheel_yaw_rate_radps"].copy()
-            self.signals["accel_x_mps2"] = np.zeros(len(self.tick_ns))
+            self.signals |= {name: column.copy() for name, column in instead.items()}
         self._scans()
         self._bumper()
         self._nav_command()
+        self.notes += [
+            f"{name}: {count:,} of {len(self.inputs.topics[source.topic]):,} messages of"
+            f" {source.topic} have no estimate of {field} ({how}){NO_ESTIMATE.get(field, '')}"
+            for name, field, count, how in self.inputs.unestimated()
+            if (source := self.inputs.by_name[name])
+        ]
         if self.profile.goal_source == "hindsight":
             self._hindsight()
         elif self.task.goal == "route":
@@ -171,12 +190,23 @@ class Filling:
         self._mark_invalid(~latest.fresh, f"{name}: stale", route=route)
         return latest
 
-    def _numbers(self, name: str, **signal_of: str) -> None:
-        """Fields of a required input straight into signals; 0 where the tick is unusable."""
+    def _numbers(
+        self, name: str, instead: Mapping[str, F64] | None = None, /, **signal_of: str
+    ) -> None:
+        """Write fields of a required input to signals; 0 where the tick is unusable.
+
+        A tick whose message has no estimate takes the value `instead` of it, if there is one.
+        """
         latest = self._required(name)
         for key, signal in signal_of.items():
             values = self.inputs.numbers(name, key)
             column = values[latest.row] if len(values) else np.zeros(len(latest.row))
+            if len(values):
+                none = self.inputs.no_estimate(name, key)[latest.row] & latest.known
+                if instead is not None:
+                    column = np.where(none, instead[signal], column)
+                elif none.any():
+                    self._mark_invalid(none, f"{name}: no estimate")
             self._set(name, signal, column, latest.known)
 
     def _set(self, name: str, signal: str, values: F64, known: Bools) -> None:

@@ -6,14 +6,17 @@ and plans that were given in another frame are put into it by their `Placement`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
-from restock.arrays import F64, Ints
+from restock.arrays import F64, Bools, Ints
 from restock.errors import RecordingError
+from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
+from restock.ingest.profile.conventions import Convention, conventions_of, said_in
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
@@ -38,9 +41,9 @@ class InputColumns:
     def column(self, name: str, key: str) -> FieldColumn:
         """A field of an input as it was read."""
         source = self.by_name[name]
+        fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
-        column = self.topics[source.topic].fields[path]
-        return column if place is None else _element(column, place)
+        return fields[path] if place is None else said_in(fields, source.fields[key])
 
     def numbers(self, name: str, key: str) -> F64:
         """A field of an input, one number a message (N,)."""
@@ -58,7 +61,27 @@ class InputColumns:
                 f"{source.fields[key]!r} of {source.topic} is not one number per message",
                 remedy=f"correct `inputs.{name}.fields.{key}` in the profile",
             )
-        return np.asarray(column, np.float64)
+        none = self.no_estimate(name, key)
+        return np.where(none, np.nan, column) if none.any() else np.asarray(column, np.float64)
+
+    def no_estimate(self, name: str, key: str) -> Bools:
+        """Which messages (N,) say themselves that they have no estimate of this field."""
+        source = self.by_name[name]
+        columns = self.topics[source.topic]
+        none = np.zeros(len(columns), np.bool_)
+        for rule in _said_of(source, source.fields.get(key, "")):
+            none |= _flags(columns, rule)
+        return none
+
+    def unestimated(self) -> Iterator[tuple[str, str, int, str]]:
+        """Of each input that has messages without an estimate: its name, the field, how many
+        messages, and how they say so."""
+        for name, source in self.by_name.items():
+            columns = self.topics[source.topic]
+            rules = (rule for path in source.fields.values() for rule in _said_of(source, path))
+            for rule in dict.fromkeys(rules):
+                if count := int(_flags(columns, rule).sum()):
+                    yield name, rule.values[0], count, rule.words
 
     def texts(self, name: str) -> list[str]:
         """The text of an input, one a message."""
@@ -72,6 +95,8 @@ class InputColumns:
         if "heading" in self.by_name:
             yaw = self._heading_at(columns.log_time_ns)
         fixes = fixes_of(columns, source.fields, yaw)
+        if (none := self.no_estimate("pose", "latitude_deg")).any():
+            fixes = replace(fixes, status=np.where(none, -1.0, 0.0))
         return fixes.poses(source.origin_deg, source.max_std_m, source.track_m)
 
     def _heading_at(self, time_ns: Ints) -> F64:
@@ -126,14 +151,44 @@ class InputColumns:
         fields = self.topics[source.topic].fields
         path = source.fields["orientation"]
         x, y, z, w = (np.asarray(fields[f"{path}.{axis}"], np.float64) for axis in "xyzw")
-        return yaw_of(x, y, z, w)
+        none = self.no_estimate(name, "orientation")
+        return np.where(none, np.nan, yaw_of(x, y, z, w)) if none.any() else yaw_of(x, y, z, w)
 
 
-def _element(column: FieldColumn, place: int) -> F64:
-    """One element of each row's list (N,); NaN where a list is shorter."""
-    if not isinstance(column, Ragged):
-        return np.asarray(column[:, place], np.float64)
-    values = np.full(len(column), np.nan)
-    has = column.lengths > place
-    values[has] = np.asarray(column.values)[column.offsets[:-1][has] + place]
-    return values
+def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Reduction | None:
+    """Return what makes of a topic's messages whether they have an estimate of what these inputs
+    take from them; None if messages with these fields never say so."""
+    rules = list(
+        dict.fromkeys(
+            rule
+            for source in sources
+            for path in source.fields.values()
+            for rule in _said_of(source, path)
+            if set(rule.fields) <= set(fields)
+        )
+    )
+    if not rules:
+        return None
+
+    def apply(columns: Fields) -> dict[str, FieldColumn]:
+        return {_key(rule): rule.flags(columns) for rule in rules}
+
+    return Reduction(tuple(dict.fromkeys(path for rule in rules for path in rule.fields)), apply)
+
+
+def _said_of(source: Input, path: str) -> list[Convention]:
+    return [rule for rule in conventions_of(source.type, path) if rule.of_messages]
+
+
+def _key(rule: Convention) -> str:
+    """A convention among the columns of its topic; names of fields hold no space."""
+    return f"no estimate of {rule.values[0]}"
+
+
+def _flags(columns: TopicColumns, rule: Convention) -> Bools:
+    """(N,) which messages say so; none of them where they do not have the fields for it."""
+    if _key(rule) in columns.fields:
+        return np.asarray(columns.fields[_key(rule)], np.bool_)
+    if set(rule.fields) <= columns.fields.keys():  # whole, as no recording's reader gives them
+        return rule.flags(columns.fields)
+    return np.zeros(len(columns), np.bool_)

@@ -25,6 +25,7 @@ from restock.ingest.steps.clearance import scan_reduction
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.frames import FIELDS, frame_path, transform_fields
+from restock.ingest.steps.input_columns import estimate_reduction
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
@@ -54,7 +55,7 @@ def read_topics(
         profile = msgspec.structs.replace(profile, cameras={})  # images do not fit into memory
     readable = {name: info for name, info in recording.topics.items() if info.skipped is None}
     leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in readable}
-    wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable)
+    wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable, leaves)
     if not reduced:
         wanted = {
             topic: [*paths, *(made[topic].fields if topic in made else ())]
@@ -139,10 +140,19 @@ def wanted_fields(
     return wanted
 
 
-def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Reduction]:
-    """topic -> what is made of its messages as they are read: clearance, custom signals, and what
-    a camera's images are."""
+def reductions(
+    profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
+) -> dict[str, Reduction]:
+    """topic -> what is made of its messages as they are read: clearance, custom signals, what a
+    camera's images are, and which messages say that they have no estimate."""
     parts: dict[str, list[Reduction]] = {}
+    has = {topic: {leaf.path.removesuffix("[]") for leaf in some} for topic, some in leaves.items()}
+    inputs: dict[str, list[Input]] = {}
+    for source in profile.sources.values():
+        inputs.setdefault(source.topic, []).append(source)
+    for topic, sources in inputs.items():
+        if said := estimate_reduction(sources, has.get(topic, ())):
+            parts.setdefault(topic, []).append(said)
     for scan in profile.inputs.scans.values():
         if scan.topic in available:
             parts.setdefault(scan.topic, []).append(scan_reduction(profile.task, scan))
@@ -151,7 +161,7 @@ def reductions(profile: Profile, available: Mapping[str, Any]) -> dict[str, Redu
         if signal.topic in available:
             signals.setdefault(signal.topic, {})[name] = signal
     for topic, here in signals.items():
-        parts.setdefault(topic, []).append(custom_reduction(here))
+        parts.setdefault(topic, []).append(custom_reduction(here, has.get(topic, ())))
     for topic in dict.fromkeys(camera.topic for camera in profile.cameras.values()):
         if topic in available:
             parts.setdefault(topic, []).append(frame_reduction(available[topic].type))

@@ -374,7 +374,7 @@ def test_whole_messages_are_never_kept(monkeypatch):
         leaves = {topic: recording.fields(topic) for topic in there}
         wanted = wanted_fields(profile, recording.topics, leaves)
         read: dict[str, TopicColumns] = recording.read(
-            wanted, reductions(profile, recording.topics)
+            wanted, reductions(profile, recording.topics, leaves)
         )
     assert "ranges" not in read["/scan"].fields
     assert "signal beams_m" in read["/scan"].fields

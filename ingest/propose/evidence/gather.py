@@ -9,7 +9,8 @@ import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
-from restock.ingest.profile.inputs import is_motion
+from restock.ingest.profile.conventions import conventions_of
+from restock.ingest.profile.inputs import Input, is_motion
 from restock.ingest.propose.driven.command_hold import (
     CommandHold,
 )
@@ -79,7 +80,11 @@ from restock.ingest.propose.evidence.scanned_outline import (
     with_lidar,
 )
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.steps.motion import PoseSeries
+
+# Input -> the field without which a topic is of no use for it.
+MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,7 @@ class Evidence:
     cameras: list[CameraTopic]
     robot: RobotProposal
     node_topics: dict[str, str]  # of Restock's own node: name -> type
+    unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
 
 
 def gather(
@@ -128,6 +134,9 @@ def gather(
         return [fit for _, fit in own_first(recording, [(fit[0].name, fit) for fit in found])]
 
     roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
+    unmeasured: dict[str, str] = {}
+    for role, key in MEASURED.items():
+        roles[role], unmeasured[role] = _measured(recording, roles[role], key)
     chosen = CommandChoice()
     if not roles["command"] and odometry_as_command:
         roles["command"] = fitting(ODOMETRY_AS_COMMAND)
@@ -231,7 +240,32 @@ def gather(
         [one for one in camera_topics(recording, recorded_s) if one.topic.name not in others],
         robot,
         node_topics(recording),
+        unmeasured,
     )
+
+
+def _measured(
+    recording: Recording, fits: list[tuple[TopicInfo, Kind]], key: str
+) -> tuple[list[tuple[TopicInfo, Kind]], str]:
+    """Return the topics for an input without those before the first that measures `key`, and what
+    those say instead."""
+    reasons: list[str] = []
+    for place, (topic, kind) in enumerate(fits):
+        leaves = set(recording.leaves(topic.name))
+        path = kind.fields.get(key, "")
+        source = Input(topic.name, topic.type, {key: path})
+        said = estimate_reduction([source], leaves)
+        if said is None:
+            return fits[place:], "; ".join(reasons)
+        flags = recording.read({topic.name: []}, {topic.name: said})[topic.name].fields
+        if not all(len(column) and np.asarray(column).all() for column in flags.values()):
+            return fits[place:], "; ".join(reasons)
+        (rule,) = conventions_of(topic.type, path)
+        reasons.append(
+            f"all {topic.expected:,} messages of {topic.name} have no estimate of"
+            f" {rule.values[0]} ({rule.words})"
+        )
+    return [], "; ".join(reasons)
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:

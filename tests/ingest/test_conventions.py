@@ -1,0 +1,217 @@
+"""What messages say in place of a value that was not measured is no value: null, and counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import Drive, columns, ragged, typed_topics, write_topics
+from support.profile_texts import WAREHOUSE
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.live.observer import LiveObserver
+from restock.ingest.profile.conventions import CONVENTIONS, conventions_of
+from restock.ingest.profile.profile import Profile, load_profile, parse_profile
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import Steps, steps_of
+
+SECONDS, TURN_RADPS = 6.0, 0.4
+Topics = dict[str, tuple[str, TopicColumns]]
+
+
+def covariance(count: int, unknown: Any) -> np.ndarray:
+    """Of each message (N, 9), with -1 as its first element where it is unknown."""
+    rows = np.zeros((count, 9))
+    rows[unknown, 0] = -1
+    return rows
+
+
+def drive(**unknown: Any) -> Topics:
+    """A drive whose wheels turn, and whose IMU says of some messages that it measured nothing."""
+    topics = typed_topics(Drive(SECONDS))
+    fast = np.arange(0, SECONDS, 0.02)
+    said = {f"{key}_covariance": covariance(len(fast), rows) for key, rows in unknown.items()}
+    topics["/imu"] = (
+        "sensor_msgs/msg/Imu",
+        columns(
+            fast,
+            {
+                "angular_velocity.z": np.full(len(fast), 0.1),
+                "linear_acceleration.x": np.full(len(fast), 0.3),
+                **said,
+            },
+        ),
+    )
+    odometry = topics["/odom"][1].fields
+    odometry["twist.twist.angular.z"] = np.full(len(fast), TURN_RADPS)
+    return topics
+
+
+def steps_in(topics: Topics, folder: Path, profile: Profile | str = "warehouse_amr") -> Steps:
+    profile = load_profile(profile) if isinstance(profile, str) else profile
+    with open_recording(write_topics(topics, folder / "bag", storage="mcap")) as recording:
+        return steps_of(profile, read_topics(recording, profile))
+
+
+def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
+    steps = steps_in(drive(angular_velocity=slice(None)), tmp_path)
+    assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
+    assert steps.signals["accel_x_mps2"] == pytest.approx(0.3)
+    told = (
+        "imu: 300 of 300 messages of /imu have no estimate of angular_velocity "
+        "(angular_velocity_covariance[0] is -1): gyro yaw rate taken from the wheels"
+    )
+    assert told in steps.notes
+    assert set(steps.problem) == {""}
+
+
+def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
+    """The gyroscope fails half way; there is no accelerometer."""
+    half = slice(150, None)
+    steps = steps_in(drive(angular_velocity=half, linear_acceleration=slice(None)), tmp_path)
+    gyro = steps.signals["gyro_yaw_rate_radps"]
+    measured = np.arange(len(gyro)) < len(gyro) // 2 + 1
+    assert gyro[measured][:-1] == pytest.approx(0.1)
+    assert gyro[~measured][1:] == pytest.approx(TURN_RADPS)
+    assert not steps.signals["accel_x_mps2"].any()
+    assert any("150 of 300 messages of /imu have no estimate of angular" in n for n in steps.notes)
+
+
+def test_a_known_covariance_changes_nothing(tmp_path: Path) -> None:
+    steps = steps_in(drive(angular_velocity=slice(0)), tmp_path)
+    assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(0.1)
+    assert not [note for note in steps.notes if "estimate" in note]
+
+
+def test_odometry_without_speeds_makes_no_rows(tmp_path: Path) -> None:
+    topics = drive()
+    fields = topics["/odom"][1].fields
+    unknown = np.zeros((len(topics["/odom"][1]), 36))
+    unknown[:, 0] = -1
+    fields["twist.covariance"] = unknown
+    steps = steps_in(topics, tmp_path)
+    assert set(steps.problem) == {"wheels: no estimate"}
+
+
+def test_a_fix_is_none_by_its_status_whether_the_profile_names_it_or_not(tmp_path: Path) -> None:
+    topics = drive()
+    tenth = np.arange(0, SECONDS, 0.1)
+    fix = {
+        "latitude": 48.0 + tenth * 0.5 / 111_000,
+        "longitude": np.full(len(tenth), 11.0),
+        "status.status": np.where(tenth < 3, 0, -1),
+    }
+    topics["/fix"] = ("sensor_msgs/msg/NavSatFix", columns(tenth, fix))
+    text = WAREHOUSE.replace('topic = "/amcl_pose"', 'topic = "/fix"')
+    text = text.replace(
+        'type = "geometry_msgs/msg/PoseWithCovarianceStamped"', 'type = "sensor_msgs/msg/NavSatFix"'
+    )
+    start = text.index("fields", text.index("[inputs.pose]"))
+    end = text.index("\n", start)
+    text = (
+        text[:start]
+        + 'fields = { latitude_deg = "latitude", longitude_deg = "longitude" }'
+        + text[end:]
+    )
+    steps = steps_in(topics, tmp_path, parse_profile(text, where="p"))
+    half = len(steps) // 2
+    assert set(steps.problem[half + 1 :]) == {"pose: no fix"}
+    assert "pose: no fix" not in steps.problem[:half]
+
+
+def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
+    topics = drive(angular_velocity=slice(None))
+    ticks = np.arange(0, SECONDS, 0.1)
+    share = np.where(ticks < 3, 0.8, np.nan)
+    battery = {"percentage": share, "voltage": np.full(len(ticks), 24.0)}
+    topics["/battery"] = ("sensor_msgs/msg/BatteryState", columns(ticks, battery))
+    limits = {"min_range": np.full(len(ticks), 0.2), "max_range": np.full(len(ticks), 3.0)}
+    near = np.select([ticks < 2, ticks < 4], [-np.inf, 1.5], 5.0)
+    topics["/sonar"] = ("sensor_msgs/msg/Range", columns(ticks, {"range": near} | limits))
+    beams = np.full((len(ticks), 3), 2.0, np.float32)
+    beams[:, 0], beams[::2, 1] = 0.0, -np.inf  # no return, and too close
+    scan = {"range_min": np.full(len(ticks), 0.1), "range_max": np.full(len(ticks), 8.0)}
+    topics["/aside"] = (
+        "sensor_msgs/msg/LaserScan",
+        columns(ticks, scan | {"ranges": ragged(list(beams.T))}),
+    )
+    wanted = {
+        "gyro": ("/imu", "Imu", "angular_velocity.z", ""),
+        "share": ("/battery", "BatteryState", "percentage", ""),
+        "voltage": ("/battery", "BatteryState", "voltage", ""),
+        "sonar": ("/sonar", "Range", "range", ""),
+        "beam": ("/aside", "LaserScan", "ranges[:]", 'reduce = "min"'),
+    }
+    text = WAREHOUSE + "".join(
+        f'\n[signals.{name}]\ntopic = "{topic}"\ntype = "sensor_msgs/msg/{kind}"\n'
+        f'path = "{path}"\nunit = "1"\nmax_age_s = 0.5\n{more}\n'
+        for name, (topic, kind, path, more) in wanted.items()
+    )
+    steps = steps_in(topics, tmp_path, parse_profile(text, where="p"))
+    found = {name: steps.custom.table[name].to_pylist() for name in wanted}
+    assert set(found["gyro"]) == {None}
+    assert found["share"][:15] == pytest.approx([0.8] * 15, abs=1e-6)
+    assert set(found["share"][16:]) == {None}
+    assert set(found["voltage"]) == {24.0}
+    assert found["sonar"][0] == pytest.approx(0.2)  # nearer than it can measure
+    assert found["sonar"][12] == 1.5
+    assert found["sonar"][-1] is None
+    assert {round(beam, 3) for beam in found["beam"]} <= {0.1, 2.0}
+    notes = "\n".join(steps.notes)
+    assert (
+        "signals.share: 30 of 60 messages of /battery say that it was not measured" in notes
+    )
+    assert "signals.sonar: 20 of 60 messages of /sonar say" in notes
+    assert "signals.voltage" not in notes
+
+
+def test_a_robot_sees_what_its_recordings_say() -> None:
+    """The observer on a robot takes the wheels' yaw rate, too."""
+    observer = LiveObserver(load_profile("warehouse_amr"))
+    point = SimpleNamespace(x=0.0, y=0.0, z=0.1)
+    unknown = [-1.0] + [0.0] * 8
+    stamp = SimpleNamespace(sec=1, nanosec=0)
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp),
+        angular_velocity=point,
+        linear_acceleration=point,
+        angular_velocity_covariance=unknown,
+        linear_acceleration_covariance=[0.0] * 9,
+    )
+    observer.receive("/imu", message, 10**9)
+    kept = observer._buffers["/imu"][-1].fields
+    (rule,) = conventions_of("sensor_msgs/msg/Imu", "angular_velocity.z")
+    assert rule.flags(kept).tolist() == [True]
+
+
+def test_each_convention_names_fields_that_its_type_has() -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    full = {name.split("/")[-1]: name for name in types.fielddefs if name.split("/")[0] != "px4"}
+    for rule in CONVENTIONS:
+        for path in (*rule.values, *rule.fields):
+            kind = full[rule.type]
+            for part in path.split("."):
+                fields = dict(types.fielddefs[kind][1])
+                assert part in fields, (rule.type, path)
+                kind = fields[part][1] if isinstance(fields[part][1], str) else kind
+
+
+def test_a_proposal_takes_no_gyro_that_measures_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_topics(drive(angular_velocity=slice(None)), tmp_path / "bag", storage="mcap")
+    out = tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(out)]) == 0
+    said = capsys.readouterr().err
+    told = "all 300 messages of /imu have no estimate of angular_velocity"
+    assert told in said
+    text = out.read_text()
+    assert told in text
+    assert parse_profile(text, where="p").inputs.imu is None
