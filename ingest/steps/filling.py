@@ -60,6 +60,7 @@ class Filling:
         self.routing = Routing.none(len(self.tick_ns))
         self.located = np.zeros(len(self.tick_ns), np.bool_)  # the pose is known
         self.notes: list[str] = []
+        self.stand_ins: dict[str, str] = {}  # of inputs none of whose messages has an estimate
 
     def fill(self) -> Signals:
         """Every signal; what else is known of the ticks is in the attributes afterwards."""
@@ -79,6 +80,8 @@ class Filling:
                 yaw_rate_radps="gyro_yaw_rate_radps",
                 accel_x_mps2="accel_x_mps2",
             )
+            if self.inputs.no_estimate("imu", "yaw_rate_radps").all():
+                self.stand_ins["imu"] = NO_ESTIMATE["angular_velocity"].removeprefix(": ")
         else:
             self.signals |= {name: column.copy() for name, column in instead.items()}
         self._scans()

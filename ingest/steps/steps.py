@@ -47,6 +47,7 @@ class Steps:
     cameras: dict[str, CameraFrames] = field(default_factory=dict)
     clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
     notes: list[str] = field(default_factory=list)  # for people
+    stand_ins: dict[str, str] = field(default_factory=dict)  # of inputs that measured nothing
 
     def __len__(self) -> int:
         return len(self.segment)
@@ -113,4 +114,5 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         aligned.camera_frames(),
         clocks,
         [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
+        stand_ins=filling.stand_ins,
     )

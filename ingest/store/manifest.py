@@ -96,7 +96,7 @@ def recorded_facts(
 ) -> dict[str, Any]:
     """What `manifest_row` needs to know of a recording."""
     stamps, span = steps.signals["stamp_ns"], recording.span_ns or (0, 0)
-    fallbacks = fallbacks_used(profile, columns)
+    fallbacks = fallbacks_used(profile, columns) | steps.stand_ins
     return {
         "format": recording.format,
         "integrity": recording.integrity,

@@ -15,6 +15,7 @@ from restock.cli import main
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.live.observer import LiveObserver
+from restock.ingest.pipeline import ingest
 from restock.ingest.profile.conventions import CONVENTIONS, conventions_of
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
 from restock.ingest.steps.needs import read_topics
@@ -68,6 +69,9 @@ def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
     )
     assert told in steps.notes
     assert set(steps.problem) == {""}
+    result = ingest(tmp_path / "bag", load_profile("warehouse_amr"), store=None)
+    stand_ins = {item["input"]: item["instead"] for item in result.manifest["stand_ins"]}
+    assert stand_ins["imu"] == "gyro yaw rate taken from the wheels"
 
 
 def test_only_what_is_unknown_is_left_out(tmp_path: Path) -> None:
