@@ -24,7 +24,12 @@ from restock.ingest.store.lineage import (
     damage_named,
     packed_ingests,
 )
-from restock.ingest.store.location import TRANSITIONS, Location, open_parquet
+from restock.ingest.store.location import (
+    TRANSITIONS,
+    Location,
+    open_parquet,
+    with_plain_text,
+)
 
 GROUP_ROWS = 65_536  # of a compacted file's row groups
 GROUP_BYTES = 64 << 20  # or where rows are large, as manifests are
@@ -65,8 +70,8 @@ def compacted_name() -> str:
 def rewrite(place: Location, file: StoredFile, kept: Sequence[Ingest]) -> AddedFile:
     """A compacted file of transitions without the ingests that are not kept."""
     path = f"{TRANSITIONS}/{file.path}"
-    with damage_named(place, path), place.reading(path) as source:
-        schema = pq.read_schema(source)
+    with damage_named(place, path):
+        schema = place.read_schema(path)
     return merge(place, TRANSITIONS, [file], kept, schema)
 
 
@@ -166,7 +171,7 @@ def _parts(
         path = f"{name}/{file.path}"
         with damage_named(place, path), place.reading(path) as source:
             for batch in open_parquet(source).iter_batches(READ_ROWS):
-                rows = pa.table(batch)
+                rows = with_plain_text(pa.table(batch))
                 rows = rows.filter(pc.is_in(rows["ingest_id"], wanted))
                 yield conformed(rows, schema)
 

@@ -111,7 +111,7 @@ def damage_named(place: Location, path: str) -> Iterator[None]:
             + ("is missing" if missing else f"cannot be read: {first_line(error)}"),
             where=str(place),
             remedy="make the file readable: it need not be damaged"
-            if by_system(error)
+            if by_system(error) or isinstance(error, pa.ArrowNotImplementedError)
             else damage_remedy(place, path),
         ) from error
 

@@ -223,7 +223,7 @@ class Location:
                 expect_readable(table, where=self.text)
                 return table
         except (TableNotFoundError, DeltaError, ValueError) as error:
-            if refused := unsupported(error, self.table(name), where=self.text):
+            if refused := unsupported(error, name, where=self.text):
                 raise refused from error
             if self.folder and (known := log_damage(self.folder / name / LOG, where=self.text)):
                 raise known from error
@@ -287,7 +287,8 @@ class Location:
         where: pc.Expression | None = None,
         repeated: Sequence[str] = (),
     ) -> pa.Table:
-        """A Parquet file's rows, as they were written: of these columns, those that it has.
+        """A Parquet file's rows, as they were written: of these columns, those that it has; text
+        that other tools wrote as views as plain text.
 
         Text of `repeated` columns comes as Arrow's dictionaries, once for all rows that have it.
 
@@ -296,15 +297,19 @@ class Location:
             StoreError: the place cannot be reached.
         """
         with self.reading(path) as file:
-            if where is not None:
-                return pq.read_table(
-                    file, partitioning=None, filters=where, page_checksum_verification=True
-                )
             whole = open_parquet(file)  # `read_table` imports Arrow's data sets
+            if where is not None:
+                if plain_text(whole.schema_arrow) == whole.schema_arrow:
+                    return pq.read_table(
+                        file, partitioning=None, filters=where, page_checksum_verification=True
+                    )
+                groups = map(whole.read_row_group, range(whole.num_row_groups))
+                return pa.concat_tables([with_plain_text(one).filter(where) for one in groups])
             names = whole.schema_arrow.names
             if shared := [name for name in repeated if name in names]:
                 whole = open_parquet(file, metadata=whole.metadata, read_dictionary=shared)
-            return whole.read([name for name in names if columns is None or name in columns])
+            read = [name for name in names if columns is None or name in columns]
+            return with_plain_text(whole.read(read))
 
     def row_groups(self, path: str, columns: Sequence[str]) -> Iterator[pa.Table]:
         """A Parquet file's rows, a row group at a time: of these columns, those that it has. One
@@ -320,12 +325,12 @@ class Location:
             leaves = [whole.schema.column(number).path for number in range(len(whole.schema))]
             read = [leaf for leaf in leaves if is_asked(leaf)]
             for group in range(whole.num_row_groups):
-                yield whole.read_row_group(group, read)
+                yield with_plain_text(whole.read_row_group(group, read))
 
     def read_schema(self, path: str) -> pa.Schema:
         """A Parquet file's schema, with its metadata. Raises as `read` does."""
         with self.translate_errors(), self.files.open_input_file(path) as file:
-            return pq.read_schema(file)
+            return plain_text(pq.read_schema(file))
 
     def listing(self, folder: str) -> set[str]:
         """The files below a folder of the store, by their paths in that folder."""
@@ -390,6 +395,30 @@ def open_parquet(source: pa.NativeFile, **options: Any) -> pq.ParquetFile:
     """A Parquet file, to be read with the checksums of its pages verified: bytes that changed are
     an OSError. Files of an older Restock have none, and are read as they are."""
     return pq.ParquetFile(source, page_checksum_verification=True, **options)
+
+
+def with_plain_text(rows: pa.Table) -> pa.Table:
+    """Rows with the columns of `plain_text`: Arrow cannot compare or look up text in views."""
+    schema = plain_text(rows.schema)
+    return rows if schema == rows.schema else rows.cast(schema)
+
+
+def plain_text(schema: pa.Schema) -> pa.Schema:
+    """The same columns with text as strings, where another tool wrote it as views."""
+    fields = [field.with_type(_plain(field.type)) for field in schema]
+    return pa.schema(fields, metadata=schema.metadata)
+
+
+def _plain(kind: pa.DataType) -> pa.DataType:
+    if pa.types.is_string_view(kind):
+        return pa.string()
+    if pa.types.is_map(kind):
+        return pa.map_(_plain(kind.key_type), _plain(kind.item_type))
+    if pa.types.is_list(kind):
+        return pa.list_(kind.value_field.with_type(_plain(kind.value_type)))
+    if pa.types.is_struct(kind):
+        return pa.struct([field.with_type(_plain(field.type)) for field in kind])
+    return kind
 
 
 def _region() -> str | None:

@@ -9,7 +9,7 @@ refused by name.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from deltalake import DeltaTable
 
@@ -52,14 +52,14 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
     Raises:
         StoreError: the table uses a feature that Restock cannot read.
     """
-    protocol = table.protocol()
+    protocol, name = table.protocol(), table.table_uri.rstrip("/").rpartition("/")[2]
     version = protocol.min_reader_version
     if version > _LISTED_READER:
-        raise _unreadable(f"version {version} of the protocol (minReaderVersion)", table.table_uri, where)
+        raise _unreadable(f"version {version} of the protocol (minReaderVersion)", name, where)
     listed = version == _LISTED_READER and protocol.reader_features
     for feature in listed or _legacy(_BY_READER_VERSION, version):
         if feature not in _READ and _in_use(table, feature):
-            raise _unreadable(f"feature `{feature}`", table.table_uri, where)
+            raise _unreadable(f"feature `{feature}`", name, where)
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
@@ -68,27 +68,28 @@ def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) ->
     Raises:
         StoreError: the table uses a feature that Restock cannot write.
     """
-    protocol = table.protocol()
+    protocol, name = table.protocol(), table.table_uri.rstrip("/").rpartition("/")[2]
     version = protocol.min_writer_version
     if version > _LISTED_WRITER:
-        raise _unwritable(f"version {version} of the protocol (minWriterVersion)", table.table_uri, where)
+        raise _unwritable(f"version {version} of the protocol (minWriterVersion)", name, where)
     listed = version == _LISTED_WRITER and protocol.writer_features
     for feature in listed or _legacy(_BY_WRITER_VERSION, version):
         allowed = feature in _WRITTEN or (feature == "appendOnly" and not removing)
         if not allowed and _in_use(table, feature):
-            raise _unwritable(f"feature `{feature}`", table.table_uri, where)
+            raise _unwritable(f"feature `{feature}`", name, where)
 
 
-def unsupported(error: Exception, table: str, *, where: str) -> StoreError | None:
-    """The refusal of a feature that Delta's library could not open, if that is the error."""
+def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None:
+    """The refusal of table `name` for a feature that Delta's library could not open, if that is
+    the error."""
     named = _UNSUPPORTED.search(str(error))
     if named is None:
         return None
     # Older versions cannot be named: the library opens the newest first.
-    return _unreadable(f"feature `{named[1]}`", table, where, otherwise=_AGAIN)
+    return _unreadable(f"feature `{named[1]}`", name, where, otherwise=_AGAIN)
 
 
-def _legacy(by_version: dict[int, tuple[str, ...]], version: int) -> Iterator[str]:
+def _legacy(by_version: Mapping[int, tuple[str, ...]], version: int) -> Iterator[str]:
     return (one for least, several in by_version.items() if least <= version for one in several)
 
 
@@ -104,22 +105,17 @@ def _in_use(table: DeltaTable, feature: str) -> bool:
     )
 
 
-def _unreadable(what: str, table: str, where: str, otherwise: str = _EARLIER) -> StoreError:
+def _unreadable(what: str, name: str, where: str, otherwise: str = _EARLIER) -> StoreError:
     return StoreError(
-        f"its table `{_name(table)}` uses Delta's {what}, which Restock cannot read",
+        f"its table `{name}` uses Delta's {what}, which Restock cannot read",
         where=where,
         remedy=f"{_REMOVE}, or {otherwise}",
     )
 
 
-def _unwritable(what: str, table: str, where: str) -> StoreError:
+def _unwritable(what: str, name: str, where: str) -> StoreError:
     return StoreError(
-        f"its table `{_name(table)}` uses Delta's {what}, which Restock cannot write: it is unchanged",
+        f"its table `{name}` uses Delta's {what}, which Restock cannot write: nothing changed",
         where=where,
         remedy=f"{_REMOVE}, or {_AGAIN}",
     )
-
-
-def _name(table: str) -> str:
-    """The name in a store of the table at an address."""
-    return table.rstrip("/").rpartition("/")[2]

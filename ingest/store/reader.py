@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
+from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.ingest.store.lineage import (
@@ -36,6 +37,8 @@ class StoreReader:
 
     def __init__(self, path: str | Path | Location) -> None:
         self.path = Location.of(path)
+        self._opened: DeltaTable | None = None  # transitions, as `_files_of` read them
+        self._by_ingest: dict[str, list[str]] = {}
 
     def reach(self) -> None:
         """Check that the place can be reached, and what is there is no part of a store.
@@ -113,22 +116,41 @@ class StoreReader:
             FileNotFoundError: there are none of this ingest.
             StoreError: a file is missing or damaged, or the place cannot be reached.
         """
-        own = f"{TRANSITIONS}/{own_path(recording_id, ingest_id)}"
-        with damage_named(self.path, own), suppress(FileNotFoundError):
-            return self.path.read(own)
         import pyarrow.compute as pc  # slow to import
 
+        own = own_path(recording_id, ingest_id)
+        files = self._files_of(ingest_id)
+        if files in ([], [own]):  # replaced rows, and those in no commit yet, lie there as well
+            with damage_named(self.path, f"{TRANSITIONS}/{own}"), suppress(FileNotFoundError):
+                return self.path.read(f"{TRANSITIONS}/{own}")
         parts = []
-        for file in self.files(TRANSITIONS):
-            if ingest_id in {one.ingest_id for one in file.ingests}:
-                place = f"{TRANSITIONS}/{file.path}"
-                with damage_named(self.path, place):
-                    parts.append(self.path.read(place, where=pc.field("ingest_id") == ingest_id))
+        for file in files:
+            place = f"{TRANSITIONS}/{file}"
+            with damage_named(self.path, place):
+                parts.append(self.path.read(place, where=pc.field("ingest_id") == ingest_id))
         if not parts:
-            raise FileNotFoundError(own_path(recording_id, ingest_id))
+            raise FileNotFoundError(own)
         rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
         told = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
         return with_ends(rows, told.get(ingest_id))
+
+    def _files_of(self, ingest_id: str) -> list[str]:
+        """The active files of transitions that hold rows of an ingest; the log is read again only
+        where it went on."""
+        if self._opened is None and not self.path.has_table(TRANSITIONS):
+            return []
+        version = None
+        if self._opened is not None:
+            version = self._opened.version()
+            with self.path.translate_errors():
+                self._opened.update_incremental()
+        if self._opened is None or self._opened.version() != version:
+            self._opened = self.path.open_table(TRANSITIONS)
+            self._by_ingest = {}
+            for file in stored_files(self.path, TRANSITIONS, self._opened):
+                for one in file.ingests:
+                    self._by_ingest.setdefault(one.ingest_id, []).append(file.path)
+        return self._by_ingest.get(ingest_id, [])
 
     def ends(self, ingests: Sequence[Ingest]) -> Iterator[tuple[str, pa.Table]]:
         """The recording of each of these ingests and the ends of its episodes, as `episode_ends`
