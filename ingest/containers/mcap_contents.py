@@ -1,8 +1,8 @@
 """What is in an MCAP file: its chunks, loose messages, channels and counts, from one walk.
 
-The summary at a file's end is used for channels and counts, never for where
-things are: the walk over the top-level records is cheap (a few records a chunk) and finds all
-there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
+The summary at a file's end is used for counts and compared for schemas and channels, never used
+for where things are: the walk over the top-level records is cheap (a few records a chunk) and finds
+all there is in a file with a wrong summary, or none. See https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entri
 MOST_CHUNKS = 1_000_000
 MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
 MOST_DAMAGED = 100
+FOOTER_BYTES = 20  # of its content; the last 4 are the CRC of the summary and of what is before it
 TELL_EVERY = 65_536  # records, of how far the walk is
 ROSBAG2 = "rosbag2"  # the metadata record of rosbag2's storage
 MOST_OTHERS = 1_000_000  # records beside those of messages
@@ -48,7 +49,9 @@ class Contents:
     profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
     loose: dict[int, list[int]] = field(default_factory=dict)  # channel -> records outside chunks
-    definitions: Definitions = field(default_factory=Definitions)
+    definitions: Definitions = field(default_factory=Definitions)  # outside chunks
+    copies: Definitions = field(default_factory=Definitions)  # the summary's
+    summary_proven: bool = False  # by its CRC
     statistics: Statistics | None = None
     data_end: tuple[int, int] = (0, 0)  # position, and CRC of the data section (0: unchecked)
     cut: Malformed | None = None  # where and why the walk ended
@@ -97,6 +100,7 @@ def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
                 raise Malformed(f"more than {MOST_OTHERS:,} records of no messages", at)
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
+                contents.damaged += check_summary(contents, file, at, stop)
                 break
             try:
                 take_record(contents, file, opcode, at, stop)
@@ -131,7 +135,8 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
         index = parse(Op.MESSAGE_INDEX, file, at, stop)
         contents.chunks[-1].index[index["channel_id"]] = index["records"]
     elif opcode in (Op.SCHEMA, Op.CHANNEL):
-        contents.definitions.take(opcode, file, at, stop)
+        beyond = contents.data_end[0] > 0
+        (contents.copies if beyond else contents.definitions).take(opcode, file, at, stop)
     elif opcode == Op.STATISTICS:
         contents.statistics = statistics_at(file, at, stop)
     elif opcode == Op.DATA_END:
@@ -146,6 +151,22 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
         _keep(contents, file.path.name, named["name"], named["metadata"])
     elif opcode == Op.HEADER and not contents.profile:
         contents.profile = parse(Op.HEADER, file, at, stop)["profile"]
+
+
+def check_summary(contents: Contents, file: FileBytes, at: int, stop: int) -> list[str]:
+    """Check the summary by the CRC in the footer, whose content is file[at:stop]: drop what it says
+    if they differ. Return what is wrong, in words."""
+    if stop - at < FOOTER_BYTES:
+        return ["its footer is too short"]
+    footer = parse(Op.FOOTER, file, at, stop)
+    if not footer["summary_crc"]:
+        return []
+    start = footer["summary_start"] or at - PREFIX
+    if start < at and file.crc(start, at + FOOTER_BYTES - 4) == footer["summary_crc"]:
+        contents.summary_proven = True
+        return []
+    contents.copies, contents.statistics = Definitions(), None
+    return ["the CRC of its summary does not match: its data section is read without it"]
 
 
 def statistics_at(file: FileBytes, at: int, stop: int) -> Statistics:

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 from restock.errors import RecordingError
 from restock.files import cores
 from restock.ingest.containers.formats import mcap_chunk
-from restock.ingest.containers.formats.mcap_chunk import LATEST_NS, Chunk, Messages
-from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, FileBytes, crc32
+from restock.ingest.containers.formats.mcap_chunk import (
+    LATEST_NS,
+    Chunk,
+    Definitions,
+    Messages,
+)
+from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, FileBytes
 from restock.ingest.containers.mcap_contents import ROSBAG2, survey
 from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_salvage import resume
@@ -114,16 +119,46 @@ class McapFile:
         return counts
 
     def _channels(self) -> dict[int, Channel]:
-        definitions = self._contents.definitions
+        """Return the channels as the data section defines them: the summary's copies count only
+        for what it does not define."""
+        contents = self._contents
         needed = {channel for channel, count in self.counts.items() if count}
-        for chunk in self._contents.chunks:
-            if definitions.cover(needed):
+        own = self._compared(contents.definitions, contents.data_end[1] > 0)
+        for chunk in contents.chunks:
+            if not (left := own.lacking(needed)):
                 break
-            definitions.add_chunk(self._chunks.inflate(chunk))
-        for number in needed - definitions.channels.keys():
+            begun, records = self._chunks.begin_in(chunk, left)
+            sought = left if chunk is contents.chunks[0] else begun  # some writers define all first
+            own = contents.copies.repeated_in(records, sought).beneath(own)
+            if own.lacking(begun):
+                own = self._defined_in(chunk).beneath(own)
+        every = contents.copies.beneath(own)
+        if (every if contents.summary_proven else own).lacking(needed):
+            for chunk in contents.chunks:  # a definition may lie chunks before the first message
+                if not own.lacking(needed):
+                    break
+                own = self._defined_in(chunk).beneath(own)
+            every = contents.copies.beneath(own)
+        for number in needed - every.channels.keys():
             what = f"{self.counts[number]} messages of channel {number}, which the file never names"
             self._checks.damaged(what, {number: self.counts[number]})
-        return definitions.named()
+        return every.named()
+
+    def _defined_in(self, chunk: Chunk) -> Definitions:
+        """Return what a whole chunk defines, checked by its CRC; nothing if that does not match."""
+        records = self._chunks.inflate(chunk)
+        return self._compared(mcap_chunk.definitions_in(records), chunk.crc > 0)
+
+    def _compared(self, found: Definitions, checked: bool) -> Definitions:
+        """Compare definitions of the data section with the summary's copies, and note differences
+        as damage. What no CRC checks gives way to copies that one confirms."""
+        copies = self._contents.copies
+        trusted = "summary" if self._contents.summary_proven and not checked else "data"
+        for what in found.differing(copies):
+            self._checks.damaged(
+                f"its summary and its data define {what} differently: the {trusted}'s is used", {}
+            )
+        return found if trusted == "data" else found.as_in(copies)
 
     def _span(self) -> tuple[int, int] | None:
         contents = self._contents
@@ -159,11 +194,7 @@ class McapFile:
         if not crc:
             self._checks.unchecked += 1
             return
-        computed = 0
-        for start in range(0, position, GROUP_BYTES):
-            stop = min(start + GROUP_BYTES, position)
-            computed = crc32(self._file[start:stop], computed)
-        if computed == crc:
+        if self._file.crc(0, position) == crc:
             self._checks.verified += 1
         else:
             self._checks.damaged("the CRC of its data section does not match", {})

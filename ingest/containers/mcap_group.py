@@ -96,6 +96,18 @@ class ChunkReader:
         self._checks.read(chunk)
         return data
 
+    def begin_in(self, chunk: Chunk, channels: set[int]) -> tuple[set[int], bytes]:
+        """Return which of these channels have messages in a chunk, as far as that is known without
+        walking it, and its records before the first messages of all of them: unchecked."""
+        if walked := self.walked.get(chunk.at):
+            first = {n: int(walked[n].min()) for n in walked.keys() & channels}
+        else:
+            held = {n for n, count in chunk.counts().items() if count} & channels
+            first = {n: mcap_chunk.first_offset(self._file[slice(*chunk.index[n])]) for n in held}
+        if not first:
+            return set(), b""
+        return {*first}, mcap_chunk.inflate_partly(chunk, self._file, max(first.values()))
+
     def walk(self, chunk: Chunk) -> Positions:
         """Where a chunk's messages are, by walking it; remembered, as it is needed again."""
         if chunk.at not in self.walked:

@@ -17,19 +17,20 @@ from restock.ingest.containers.formats.mcap_records import (
     FileBytes,
     Malformed,
     Op,
-    crc32,
     parse,
     walk,
 )
 from restock.ingest.containers.mcap_contents import (
+    FOOTER_BYTES,
     Contents,
     Statistics,
+    check_summary,
     cut_chunk_at,
     statistics_at,
     take_record,
 )
 
-FOOTER_SIZE = PREFIX + 20
+FOOTER_SIZE = PREFIX + FOOTER_BYTES
 BEFORE_COMPRESSION = PREFIX + 28  # of a chunk's record: times, size, CRC
 _NAMES = (b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4")
 
@@ -57,6 +58,7 @@ class _Summary:
         self.definitions: list[tuple[int, int, int]] = []  # schemas, channels: opcode, start, stop
         self.statistics: Statistics | None = None
         self.start = 0
+        self.proven = False  # by its CRC
 
 
 def _summary(file: FileBytes) -> _Summary | None:
@@ -70,9 +72,10 @@ def _summary(file: FileBytes) -> _Summary | None:
     summary.start = footer["summary_start"]
     if not len(MAGIC) <= summary.start <= at:
         return None
-    checked = file[summary.start : at + PREFIX + 16]
-    if footer["summary_crc"] and crc32(checked) != footer["summary_crc"]:
-        return None
+    if footer["summary_crc"]:
+        if file.crc(summary.start, end - 4) != footer["summary_crc"]:
+            return None
+        summary.proven = True
     try:
         for opcode, start, stop in walk(file, summary.start, at):
             if opcode == Op.CHUNK_INDEX:
@@ -104,8 +107,8 @@ def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) 
             chunks.append(chunk)
     contents.chunks = sorted(chunks, key=lambda chunk: chunk.at)
     for opcode, start, stop in summary.definitions:
-        take_record(contents, file, opcode, start, stop)
-    contents.statistics = summary.statistics
+        contents.copies.take(opcode, file, start, stop)
+    contents.statistics, contents.summary_proven = summary.statistics, summary.proven
     # What the walk took for messages outside chunks, but lies within the damage, is dropped.
     contents.loose = {
         channel: whole
@@ -137,6 +140,7 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
             for opcode, start, stop in walk(file, at, len(file)):
                 cut = stop
                 if opcode == Op.FOOTER:
+                    lost += check_summary(contents, file, start, stop)
                     contents.resumed = contents.statistics is not None
                     return lost
                 take_record(contents, file, opcode, start, stop)

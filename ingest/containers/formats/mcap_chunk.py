@@ -148,18 +148,18 @@ def _check(chunk: Chunk, data: bytes | memoryview) -> None:
         raise BadChunk("its CRC does not match")
 
 
-def inflate_partly(chunk: Chunk, file: Buffer) -> bytes:
-    """The part of a cut or damaged chunk that still decompresses; unchecked."""
-    stored = file[chunk.start : chunk.stop]
-    limit = min(chunk.size, most_bytes(len(stored)), LARGEST_CHUNK)
+def inflate_partly(chunk: Chunk, file: Buffer, limit: int = LARGEST_CHUNK) -> bytes:
+    """Return the first records of a chunk, up to `limit` bytes and as far as they decompress;
+    unchecked."""
+    limit = min(limit, chunk.size, most_bytes(chunk.stop - chunk.start))
     if chunk.compression == "":
-        return stored[:limit]
+        return file[chunk.start : min(chunk.start + limit, chunk.stop)]
     if chunk.compression not in _DECODERS:
         return b""
     decoder, parts, size = _DECODERS[chunk.compression](), list[bytes](), 0
     with suppress(*_DAMAGED):
-        for position in range(0, len(stored), STEP):
-            parts.append(decoder.decompress(stored[position : position + STEP]))
+        for position in range(chunk.start, chunk.stop, STEP):
+            parts.append(decoder.decompress(file[position : min(position + STEP, chunk.stop)]))
             size += len(parts[-1])
             if size >= limit:
                 break
@@ -223,6 +223,11 @@ def indexed_messages(
         return None
     messages = _messages(at, head)
     return None if (messages.stop > base + size).any() else messages
+
+
+def first_offset(entries: bytes) -> int:
+    """Return where the first message of some index entries, one at least, lies in its chunk."""
+    return int(np.frombuffer(entries, _INDEX, len(entries) // _INDEX.itemsize)["offset"].min())
 
 
 def _stamps(values: NDArray[np.uint64]) -> Ints:
@@ -296,6 +301,7 @@ class Definitions:
 
     schemas: dict[int, SchemaRecord] = field(default_factory=dict)
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    raw: dict[tuple[int, int], bytes] = field(default_factory=dict)  # records, by opcode and id
 
     def take(self, opcode: int, buffer: Buffer, at: int, stop: int) -> None:
         """Add the record whose content is buffer[at:stop], if it is a schema or a channel."""
@@ -304,6 +310,7 @@ class Definitions:
             low, high = record["data"]
             text = bytes(buffer[low:high])
             self.schemas[record["id"]] = SchemaRecord(record["name"], record["encoding"], text)
+            self.raw[opcode, record["id"]] = bytes(buffer[at - PREFIX : stop])
         elif opcode == Op.CHANNEL:
             record = parse(Op.CHANNEL, buffer, at, stop)
             self.channels[record["id"]] = ChannelRecord(
@@ -312,21 +319,46 @@ class Definitions:
                 record["schema_id"],
                 dict(record["metadata"]).get("offered_qos_profiles", ""),
             )
+            self.raw[opcode, record["id"]] = bytes(buffer[at - PREFIX : stop])
 
-    def add_chunk(self, records: bytes) -> None:
-        """Add those of an uncompressed chunk that are not known yet, up to what is cut."""
-        inside = Definitions()
-        with suppress(Malformed):
-            for opcode, at, stop in walk(records, 0, len(records)):
-                inside.take(opcode, records, at, stop)
-        self.schemas = inside.schemas | self.schemas
-        self.channels = inside.channels | self.channels
+    def beneath(self, other: Definitions) -> Definitions:
+        """Return both; where both define an id, what `other` says."""
+        return Definitions(self.schemas | other.schemas, self.channels | other.channels)
 
-    def cover(self, channels: set[int]) -> bool:
-        """Whether all these channels are defined, with their schemas."""
-        return channels <= self.channels.keys() and all(
-            self.channels[number].schema_id in self.schemas.keys() | {0} for number in channels
+    def as_in(self, other: Definitions) -> Definitions:
+        """Return what defines the same ids: as `other` does, for those that it has."""
+        return Definitions(
+            {number: other.schemas.get(number, own) for number, own in self.schemas.items()},
+            {number: other.channels.get(number, own) for number, own in self.channels.items()},
         )
+
+    def lacking(self, channels: set[int]) -> set[int]:
+        """Return those of these channels that are not defined, or whose schemas are not."""
+        known = self.schemas.keys() | {0}
+        return {
+            number
+            for number in channels
+            if number not in self.channels or self.channels[number].schema_id not in known
+        }
+
+    def repeated_in(self, records: bytes, channels: set[int]) -> Definitions:
+        """Return the definitions of these channels whose records are among `records`, byte by byte:
+        searching takes a hundredth of the time of walking."""
+        channels = channels & self.channels.keys()
+        schemas = {self.channels[n].schema_id for n in channels} & self.schemas.keys()
+        return Definitions(
+            {n: self.schemas[n] for n in schemas if self.raw[Op.SCHEMA, n] in records},
+            {n: self.channels[n] for n in channels if self.raw[Op.CHANNEL, n] in records},
+        )
+
+    def differing(self, other: Definitions) -> list[str]:
+        """Return what both define, but differently."""
+        schemas = self.schemas.keys() & other.schemas.keys()
+        channels = self.channels.keys() & other.channels.keys()
+        return [
+            *(f"schema {n}" for n in sorted(schemas) if self.schemas[n] != other.schemas[n]),
+            *(f"channel {n}" for n in sorted(channels) if self.channels[n] != other.channels[n]),
+        ]
 
     def named(self) -> dict[int, Channel]:
         """Every channel with its schema; without one, its messages have no type."""
@@ -342,3 +374,12 @@ class Definitions:
             )
             for number, channel in self.channels.items()
         }
+
+
+def definitions_in(records: bytes) -> Definitions:
+    """Return the schemas and channels of an uncompressed chunk, up to what is cut."""
+    found = Definitions()
+    with suppress(Malformed):
+        for opcode, at, stop in walk(records, 0, len(records)):
+            found.take(opcode, records, at, stop)
+    return found

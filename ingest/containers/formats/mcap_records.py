@@ -37,7 +37,7 @@ class FileBytes:
     """
 
     WINDOW = 16 << 10  # bytes kept of the last small read: fields are read one by one
-    PIECE = 8 << 20  # searched at a time
+    PIECE = 8 << 20  # searched or checked at a time
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -97,6 +97,13 @@ class FileBytes:
             parts.append(part)
             left -= len(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def crc(self, start: int, stop: int) -> int:
+        """Return the CRC-32 of the bytes from `start` to `stop`."""
+        crc = 0
+        for at in range(start, stop, self.PIECE):
+            crc = crc32(self[at : min(at + self.PIECE, stop)], crc)
+        return crc
 
     def find(self, what: bytes, start: int) -> int:
         """Where these bytes are next, from a place on; -1 where they are not."""
