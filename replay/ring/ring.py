@@ -268,6 +268,18 @@ class FreshRing(Stateful):
         self._next_key += count
         return keys
 
+    def begin_episodes(self) -> Ints:
+        """Begin a new episode in every environment, and forget steps without a whole return.
+
+        Returns the keys of the episodes that this ended, (N,): no labels will come for them.
+        """
+        keys = self.episode_key
+        self._pending.waiting = np.zeros_like(self._pending.waiting)
+        self._episode_step = np.zeros_like(self._episode_step)
+        self.episode_key = self._next_key + np.arange(self.num_envs, dtype=np.int64)
+        self._next_key += self.num_envs
+        return keys
+
     def _emit(self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]) -> None:
         """Pack the oldest pending step of each of these environments into slots of its own."""
         if not len(envs):

@@ -114,15 +114,16 @@ def test_weights_that_the_library_cannot_use_are_refused(store: Path, tmp_path: 
     env = sb3_envs(1)
     arguments = (100, env.observation_space, env.action_space)
     with pytest.raises(MixtureError, match="do not use any"):
-        MixtureReplayBuffer(*arguments, panel=weighted)
-    assert MixtureReplayBuffer(*arguments, panel=weighted, ignore_weights=True).size() == 0
+        MixtureReplayBuffer(*arguments, panel=weighted).sample(1)
+    unweighted = MixtureReplayBuffer(*arguments, panel=weighted, ignore_weights=True)
+    assert len(unweighted.sample(3).rewards) == 3
 
 
 def test_a_panel_of_another_task_is_refused(store_path: Path, tmp_path: Path) -> None:
     other = make_panel(store_path, tmp_path / "other")
     env = sb3_envs(1)
     with pytest.raises(PanelError, match="its rows are of task"):
-        MixtureReplayBuffer(100, env.observation_space, env.action_space, panel=other)
+        MixtureReplayBuffer(100, env.observation_space, env.action_space, panel=other).sample(1)
 
 
 def test_a_blown_up_step_is_not_learnt_from() -> None:

@@ -163,6 +163,11 @@ class InfoLabels:
         self._running[env] = []
         return whole
 
+    def forget(self) -> None:
+        """Forget the episodes under way: they stay unlabelled."""
+        self.unlabelled_episodes += sum(bool(steps) for steps in self._running)
+        self._running = [[] for _ in self._running]
+
     def label(self, *, all_of_them: bool = False) -> list[Labelled]:
         """Label the ended episodes, once enough wait to be worth a query."""
         waiting = self._ended

@@ -31,11 +31,15 @@ from restock.train.feed.logs import Logs
 from restock.train.finite import NotFinite, check_fed
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.libraries.library_run import PartialTables, create_run, episode_row
-from restock.train.run.run import Run, now_ns
+from restock.train.run.run import Run, check_free, now_ns
 from restock.train.run.run_profile import profile_of_panel
 
 PROFILE = "warehouse_amr"
 _NO_ROWS: Ints = np.empty(0, np.int64)
+_GO_ON = (
+    "choose another `run`; to go on in this one, load the replay buffer that was saved with it"
+    " (Stable-Baselines3: model.load_replay_buffer)"
+)
 NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
@@ -110,6 +114,7 @@ class MixedFeed:
         self._begun = time.monotonic()
         self.run: Run | None = None
         if run is not None:
+            check_free(Path(run), _GO_ON)
             settings = {
                 "logs_share": logs_share,
                 "seed": seed,
@@ -297,6 +302,20 @@ class MixedFeed:
         PartialTables(self.run).append("episodes", list(self._episodes.values()))
         self._open, self._episodes = 0, {}
         self.run.flush()
+
+    def give_up(self, keys: Ints) -> None:
+        """Expect no more steps of these episodes (N,), which were under way."""
+        self.labels.forget()
+        for key in keys.tolist():
+            self.episode_labels.give_up(key)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Save how long it ran: a clock of this process means nothing in another."""
+        return vars(self) | {"_begun": time.monotonic() - self._begun}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._begun = time.monotonic() - self._begun
 
     def fresh_meta(self, capacity: int) -> FreshMeta:
         """Metadata beside a buffer that the library keeps."""

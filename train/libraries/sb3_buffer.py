@@ -9,6 +9,9 @@
     model.learn(20_000)
     model.replay_buffer.close()
 
+The panel is opened and the run is made when the first step is added or the first batch is drawn:
+`DQN.load` makes the buffer, too, and a model that is loaded to act needs neither.
+
 Each batch is `logs_share` rows of the panel, by its quotas, and fresh rows for the rest; while
 nothing is fresh, all of it is logs, so `model.train` can be called before `model.learn`. Rows carry
 their own discount (gamma^n, n as the panel and `n_step` have it), which replaces the model's gamma.
@@ -17,6 +20,7 @@ their own discount (gamma^n, n as the panel and `n_step` have it), which replace
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -56,8 +60,9 @@ class MixtureReplayBuffer(ReplayBuffer):
     condition; `dqn_critic(model)` makes one. It costs its forward passes.
 
     Raises:
-        MixtureError: weights that cannot be applied, or `optimize_memory_usage`.
-        PanelError: a panel of another task, or with other actions.
+        MixtureError: `optimize_memory_usage`; at first use, weights that cannot be applied.
+        PanelError: at first use, no panel there, or one of another task or with other actions.
+        RunError: at first use, something is at `run` already.
     """
 
     def __init__(
@@ -83,9 +88,21 @@ class MixtureReplayBuffer(ReplayBuffer):
         super().__init__(n_envs, observation_space, action_space, device, n_envs=n_envs)
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size, n_envs * n_step)
-        size = int(np.prod(self.obs_shape))
+        self.continuous = isinstance(action_space, spaces.Box)
+        self._panel, self._commands, self._ignore_weights = panel, commands, ignore_weights
+        self._n_step, self._discount, self._options = n_step, discount, options
+        self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
+        self._waiting_actions: dict[tuple[int, int], F32] = {}
+        self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
+        self._log_actions: F32 | None = None
+        self.critic: Critic | None = None
+
+    @cached_property
+    def feed(self) -> MixedFeed:
+        """What is drawn and recorded; its first use opens the panel and makes the run."""
+        panel = self._panel
         panel = Panel.open(panel, verify=True) if isinstance(panel, str | Path) else panel
-        if panel is not None and not ignore_weights and weighted(panel):
+        if panel is not None and not self._ignore_weights and weighted(panel):
             raise MixtureError(
                 "its rows have importance weights, but the losses of Stable-Baselines3 do not use "
                 "any",
@@ -93,25 +110,27 @@ class MixtureReplayBuffer(ReplayBuffer):
                 remedy='mix with `correction = {pre = "none", post = "none"}` and without'
                 ' `within = "per"`, or say ignore_weights=True',
             )
+        self._log_actions = self._logged_actions(panel, self._commands)
+        size = int(np.prod(self.obs_shape))
+        return MixedFeed(SB3, self.n_envs, size, panel=panel, **self._options)
+
+    @cached_property
+    def ring(self) -> FreshRing:
+        """The fresh rows, packed as the panel's are."""
+        panel, discount = self.feed.panel, self._discount
         if discount is None:
             discount = panel.discount if panel is not None else 0.99
-        self.feed = MixedFeed(SB3, n_envs, size, panel=panel, **options)
-        self.ring = FreshRing(
+        ring = FreshRing(
             self.buffer_size,
-            n_envs,
-            size,
+            self.n_envs,
+            int(np.prod(self.obs_shape)),
             discount=discount,
-            n_step=n_step,
+            n_step=self._n_step,
             conditions=self.feed.labels.names,
             behaviour_policies=(SB3,),
         )
-        self.feed.keep_record(self.ring)
-        self.continuous = isinstance(action_space, spaces.Box)
-        self._fresh_actions = np.zeros((self.buffer_size, self.action_dim), np.float32)
-        self._waiting_actions: dict[tuple[int, int], F32] = {}
-        self._steps = np.zeros(n_envs, np.int64)  # of the running episodes
-        self._log_actions = self._logged_actions(panel, commands)
-        self.critic: Critic | None = None
+        self.feed.keep_record(ring)
+        return ring
 
     def _logged_actions(self, panel: Panel | None, commands: NDArray[Any] | None) -> F32 | None:
         """(n, A) as Stable-Baselines3 keeps actions: indices, or commands scaled to [-1, 1]."""
@@ -130,10 +149,6 @@ class MixtureReplayBuffer(ReplayBuffer):
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         scaled: F32 = np.float32(2) * (commands - low) / (high - low) - np.float32(1)
         return np.clip(scaled, -1, 1).astype(np.float32)
-
-    def size(self) -> int:
-        """Fresh rows held."""
-        return len(self.ring)
 
     def reset(self) -> None:
         """Stable-Baselines3 calls this only where a buffer is made."""
@@ -231,7 +246,20 @@ class MixtureReplayBuffer(ReplayBuffer):
 
     def close(self) -> None:
         """Write the rest of the record; the run is complete after it."""
-        self.feed.flush()
+        if "feed" in vars(self):  # a model that was only loaded made no run
+            self.feed.flush()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the critic: it holds the model, which is saved by itself."""
+        return vars(self) | {"critic": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin new episodes, as the environments do when a loaded model goes on."""
+        vars(self).update(state)
+        if "ring" in vars(self):
+            self.feed.give_up(self.ring.begin_episodes())
+        self._waiting_actions.clear()
+        self._steps[:] = 0
 
 
 def weighted(panel: Panel) -> bool:

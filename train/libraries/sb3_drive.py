@@ -87,7 +87,6 @@ def dqn(
     buffer: Any = model.replay_buffer
     buffer.critic = dqn_critic(model)
     buffer.feed.run = run
-    buffer.feed.keep_record(buffer.ring)
     drive = _Drive(config, evaluations, [model.q_net.q_net], lambda: buffer.feed.batches)
     model.learn(config.schedule.env_steps, callback=drive)
     buffer.close()

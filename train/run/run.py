@@ -112,6 +112,11 @@ class Run:
     def __repr__(self) -> str:
         return f"<Run {self.path}>"
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on from a pickled run: the next flush writes all tables, without rows of later."""
+        vars(self).update(state)
+        self._on_disk = dict.fromkeys(TABLES, -1)
+
     @property
     def latest(self) -> Path:
         return self.path / "checkpoints" / "latest.safetensors"
@@ -226,15 +231,16 @@ class Run:
                 self._write(name)
 
 
-def check_free(path: Path) -> None:
+def check_free(path: Path, remedy: str | None = None) -> None:
     """Raises RunError when there is something at `path` that a new run would overwrite, or when no
-    run can be made there."""
+    run can be made there; `remedy` is what to do about a run that is there."""
     expect_place(path, RunError)
     if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
         raise RunError(
             "already exists",
             where=str(path),
-            remedy=f"choose another --out, remove it, or continue it with {resuming(path)}",
+            remedy=remedy
+            or f"choose another --out, remove it, or continue it with {resuming(path)}",
         )
 
 

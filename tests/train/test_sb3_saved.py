@@ -1,0 +1,153 @@
+"""A saved model of Stable-Baselines3 is loaded to act, and to train on in its run or another."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from support.library_buffers import make_panel, make_store, run_tables
+
+from restock.errors import RunError
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
+
+from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic  # noqa: E402
+
+BATCH = 32
+# Of an observation's bytes its episodes and steps: a seed's episodes come again when it is loaded.
+Places = dict[bytes, set[tuple[int, int]]]
+
+
+class Seen(gymnasium.Wrapper):
+    """Keeps every observation with its episode and step, by its bytes."""
+
+    def __init__(self, place: Places) -> None:
+        super().__init__(gymnasium.make("restock/Warehouse-v0"))
+        self.place, self.episode, self.at = place, 0, 0
+
+    def _keep(self, observation: Any) -> None:
+        of = self.place.setdefault(np.asarray(observation, np.float32).tobytes(), set())
+        of.add((self.episode, self.at))
+        self.at += 1
+
+    def reset(self, **options: Any) -> Any:
+        result = self.env.reset(**options)
+        self.episode, self.at = self.episode + 1, 0
+        self._keep(result[0])
+        return result
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        self._keep(result[0])
+        return result
+
+
+@pytest.fixture
+def place() -> Places:
+    return {}
+
+
+@pytest.fixture
+def saved(tmp_path: Path, place: Places) -> Any:
+    """A DQN in the middle of an episode, saved with its buffer; its run goes on for a while."""
+    panel = make_panel(make_store(tmp_path), tmp_path / "panel", n_step=3)
+    model = sb3.DQN(
+        "MlpPolicy",
+        DummyVecEnv([lambda: Seen(place)]),
+        replay_buffer_class=MixtureReplayBuffer,
+        replay_buffer_kwargs={
+            "panel": str(panel.path),
+            "run": str(tmp_path / "run"),
+            "n_step": 3,
+            "log_every": 10,
+        },
+        buffer_size=1000,
+        learning_starts=20,
+        batch_size=BATCH,
+        policy_kwargs={"net_arch": [16]},
+        seed=0,
+        device="cpu",
+    )
+    model.replay_buffer.critic = dqn_critic(model)
+    model.learn(104)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    return model
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def test_a_model_is_loaded_to_act_without_its_panel_and_leaves_its_run_alone(
+    saved: Any, tmp_path: Path
+) -> None:
+    saved.replay_buffer.close()
+    before, observation = content(tmp_path / "run"), saved.env.reset()
+    shutil.rmtree(tmp_path / "panel")
+    for env in (None, saved.env):
+        model = sb3.DQN.load(tmp_path / "model", env=env, device="cpu")
+        np.testing.assert_array_equal(
+            model.predict(observation, deterministic=True)[0],
+            saved.predict(observation, deterministic=True)[0],
+        )
+        model.replay_buffer.close()
+    assert content(tmp_path / "run") == before
+
+
+def test_training_without_the_saved_buffer_does_not_write_into_its_run(
+    saved: Any, tmp_path: Path
+) -> None:
+    saved.replay_buffer.close()
+    before = content(tmp_path / "run")
+    model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")
+    with pytest.raises(RunError, match=r"already exists\n.*load_replay_buffer"):
+        model.learn(10)
+    assert content(tmp_path / "run") == before
+
+
+def test_training_goes_on_in_the_same_run(saved: Any, tmp_path: Path, place: Places) -> None:
+    saved.learn(60, reset_num_timesteps=False)  # of which the saved buffer knows nothing
+    saved.replay_buffer.close()
+    model = sb3.DQN.load(tmp_path / "model", env=saved.env, device="cpu")
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.replay_buffer.critic = dqn_critic(model)
+    feed, ring = model.replay_buffer.feed, model.replay_buffer.ring
+    assert (feed.env_steps, feed.batches) == (104, model._n_updates)
+    model.learn(40, reset_num_timesteps=False)
+    model.replay_buffer.close()
+    assert (feed.env_steps, feed.batches) == (144, model._n_updates)
+    tables = run_tables(tmp_path / "run")
+    assert sum(row["updates"] for row in tables["progress"]) == feed.batches
+    assert sum(row["drawn_rows"] for row in tables["strata"]) == BATCH * feed.batches
+    assert [row["env_steps"] for row in tables["episodes"]] == sorted(
+        row["env_steps"] for row in tables["episodes"]
+    )
+    seconds = [row["wall_s"] for row in tables["progress"]]
+    assert seconds == sorted(seconds)
+    # Two steps were under way as the buffer was saved and two are now.
+    assert len(ring) == 144 - 2 - 2
+    for row, horizon in zip(ring.rows, ring.meta["horizon"][: len(ring)], strict=False):
+        begin = place[row[ring.columns["observation"]].tobytes()]
+        end = place[row[ring.columns["next_observation"]].tobytes()]
+        assert end & {(episode, step + horizon) for episode, step in begin}
+
+
+def test_training_goes_on_in_another_run(saved: Any, tmp_path: Path) -> None:
+    saved.replay_buffer.close()
+    before = content(tmp_path / "run")
+    options = saved.replay_buffer_kwargs | {"run": str(tmp_path / "second")}
+    model = sb3.DQN.load(
+        tmp_path / "model", env=saved.env, device="cpu", replay_buffer_kwargs=options
+    )
+    model.learn(40, reset_num_timesteps=False)
+    model.replay_buffer.close()
+    rows = run_tables(tmp_path / "second")["progress"]
+    assert sum(row["updates"] for row in rows) == model._n_updates - saved._n_updates > 0
+    assert content(tmp_path / "run") == before
