@@ -270,6 +270,7 @@ class _Ingest:
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._lost_messages(steps),
+            [one.told for one in steps.findings if not one.repaired],
             self._notes(steps, table),
         )
         return Prepared(result, staged, self.repeated, profile.task.control_period_s)
@@ -345,6 +346,7 @@ class _Ingest:
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *self.told.notes, *steps.notes]
+        notes += [one.told for one in steps.findings if one.repaired]
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(
                 f"in place of its {self.before['transitions']:,} transitions by the profile"

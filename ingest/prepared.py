@@ -41,14 +41,15 @@ class IngestResult:
     scores: list[LabelScore] = field(default_factory=list)
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     lost_messages: list[str] = field(default_factory=list)  # or lost bytes, and why
+    contradictions: list[str] = field(default_factory=list)  # of topics; kept in the rows
     notes: list[str] = field(default_factory=list)
     version: int | None = None  # of the store's transitions, where they were written
     repeats: RepeatedDrive | None = None  # one in the store with largely the same rows
 
     @property
     def lossy(self) -> bool:
-        """Whether data of the topics used was lost."""
-        return bool(self.lost_messages)
+        """Whether data of the topics used was lost, or contradicts itself."""
+        return bool(self.lost_messages or self.contradictions)
 
 
 @dataclass(frozen=True)

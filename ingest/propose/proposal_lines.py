@@ -155,7 +155,11 @@ def _trial_lines(trial: Trial) -> list[str]:
         return []
     most = [f"{reason} {count:,}" for reason, count in list(trial.dropped.items())[:3]]
     dropped = f" (dropped: {', '.join(most)})" if most else ""
-    return [f"# It gives {trial.transitions:,} transitions from {trial.ticks:,} ticks{dropped}."]
+    found = (f"CONTRADICTS ITSELF: {one}" for one in trial.findings if not one.repaired)
+    return [
+        f"# It gives {trial.transitions:,} transitions from {trial.ticks:,} ticks{dropped}.",
+        *(f"# {line}" for one in found for line in textwrap.wrap(one, 98)),
+    ]
 
 
 def _topic_lines(seen: Evidence) -> list[str]:
@@ -254,20 +258,21 @@ def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
 def _input_lines(
     role: str, fitting: list[tuple[TopicInfo, Kind]], seen: Evidence, trial: Trial
 ) -> list[str]:
+    why = seen.unmeasured.get(role, "")
     if not fitting:
+        told = [f"# {line}" for line in textwrap.wrap(why, 96)]
         if role in REQUIRED:
             fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
             if role == "pose":
-    why = seen.unmeasured.get(role, "")
                 fits += ", or transforms that join two frames"
             named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
             return [
+                *told,
                 f"# MISSING, and required: no topic of {fits}.",
                 "# If one of another type has it (JSON, protobuf, the robot's own), name it here:",
                 f"# [inputs.{role}]",
                 '# topic = "/TOPIC"',
                 '# type = "ITS TYPE"',
-                *told,
                 f"# fields = {{ {named} }}",
                 "# max_age_s = 0.5",
                 "",
@@ -289,12 +294,12 @@ def _input_lines(
     others = ", ".join([*beside][:3])
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     lines = [
+        *(f"# Not used: {line}" for line in textwrap.wrap(why, 86)),
         *(
             ["# No command was recorded: the measured motion is used in place of commands."]
             if role == "command" and seen.commands.measured
             else []
         ),
-        *(f"# Not used: {line}" for line in textwrap.wrap(why, 86)),
         *(
             [
                 "# The navigation stack's proposal, by its name. It is part of the observation,",

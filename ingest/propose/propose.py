@@ -17,7 +17,7 @@ from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
 from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
-from restock.ingest.propose.evidence.gather import Evidence, gather
+from restock.ingest.propose.evidence.gather import Evidence, gather, with_other_wheels
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.roles import (
     REQUIRED,
@@ -30,6 +30,7 @@ from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profil
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.needs import as_recorded, read_topics
 
 # What a recording lacks -> what to do about it.
@@ -65,6 +66,9 @@ class Proposal:
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
     kinds: list[RobotKind] = field(default_factory=list)  # where there are several: its own first
+    findings: list[Finding] = field(
+        default_factory=list
+    )  # where it contradicts itself
     wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
@@ -130,6 +134,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         if trial.problem and BY_LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
+        seen, trial = _by_other_wheels(seen, name, trial)
         seen, trial = _by_rate(recording, seen, name, trial)
         goal = seen.goal.tried(trial.transitions, trial.dropped)
         if goal != seen.goal and not goal_decided:
@@ -146,12 +151,12 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     advice += [*_seldom_poses(seen), *_odd_commands(seen)]
+    advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
     if seen.commands.steered and not seen.robot.wheelbase_from:
         told = "a guess, and with it every yaw rate that was commanded: measure it"
         advice.append(Advice("inputs.command.wheelbase_m", told))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
-    advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
         advice.append(Advice("task.body", f"{said}--footprint"))
     if len(seen.lidars) > 1:
         scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)
@@ -163,6 +168,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     return Proposal(
         *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
         several_commands(recording),
+        findings=trial.findings,
         wheeled=other is None,
     )
 
@@ -199,6 +205,17 @@ def _odd_commands(seen: Evidence) -> list[Advice]:
         text = f"{topic.name} never asks the robot to move: the actions are a guess"
         found.append(Advice("task.actions", text))
     return found
+
+
+def _by_other_wheels(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Trial]:
+    """Without odometry whose speed is another one than that of the poses."""
+    while off := [one for one in trial.findings if one.kind == "wheels"]:
+        other = with_other_wheels(seen, f"{off[0].topic} is not used: {off[0].what}.")
+        if other is None:
+            break
+        seen = other
+        trial = tried(seen.recording, "\n".join(profile_lines(seen, name, [])))
+    return seen, trial
 
 
 def _by_rate(

@@ -19,6 +19,7 @@ from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.aligned_inputs import align_inputs
+from restock.ingest.steps.consistency import Finding
 from restock.ingest.steps.episodes import Split, split, why_none
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.conditions import in_steps
@@ -59,6 +60,7 @@ class Trial:
     endings: dict[str, int] = field(default_factory=dict)  # episodes by what ended them
     advice: list[Advice] = field(default_factory=list)
     problem: str = ""  # why there is nothing
+    findings: list[Finding] = field(default_factory=list)  # what contradicts itself
     pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
 
     def comments(self, *keys: str) -> list[str]:
@@ -95,7 +97,8 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         dict(endings.most_common()),
         advice,
         problem,
-        _pose_noise_m(steps, profile.task),
+        steps.findings,
+        None if steps.findings else _pose_noise_m(steps, profile.task),
     )
 
 

@@ -5,7 +5,10 @@ Three clocks may be in a recording: when a message was received (`log_time`), se
 on it, and nothing is ever taken from a time after the tick that asks.
 
 A topic without a header is put on a `header.stamp` clock by subtracting the recording's offset:
-the smallest, over the stamped topics, of the median of (log time - stamp). That offset is one
+the smallest, over the stamped topics, of the median of (log time - stamp). Topics whose stamps are
+of another clock have no say in it, and count from their reception: commands (they take effect when
+they arrive) whose delay is another one, and what is stamped later than it was received while others
+are not. The offset is one
 constant a clock segment, unless it drifts by more than the tolerance, as it does where a simulation
 runs slower than real time: then log time is mapped piece by piece (`clock_map`). Either is measured
 over the whole segment, so it uses later messages' clocks, but never their values.
@@ -37,6 +40,8 @@ AHEAD_NS = 50_000_000  # a transform stamped further ahead counts from when it w
 CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time is
 BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
 TOLERANCE_S = 0.1  # half a control period
+IMPOSSIBLE_S = 0.25  # by which a stamp is after the reception, of a clock of its own
+LATENCY_S = 1.0  # of a topic that is stamped by the recorder's clock, at most
 MOST_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
 
@@ -97,6 +102,7 @@ class ClockReport:
     jumps: int = 0
     off_clock: dict[str, int] = field(default_factory=dict)  # messages left out, per topic
     restamped: dict[str, int] = field(default_factory=dict)  # latched ones put at their log time
+    by_reception: dict[str, int] = field(default_factory=dict)  # topic -> how far ahead it is, ns
 
 
 def align(
@@ -104,6 +110,7 @@ def align(
     clock: Clock,
     latched: frozenset[str] = frozenset(),
     transforms: frozenset[str] = frozenset(),
+    commands: frozenset[str] = frozenset(),
     *,
     tolerance_s: float = TOLERANCE_S,
 ) -> tuple[list[ClockSegment], ClockReport]:
@@ -114,6 +121,9 @@ def align(
     left out and counted, but one of a `latched` topic (it may have been published long before
     the recording began) is put at its log time instead. `transforms` may be stamped ahead: they
     do not say what time it is, and count from when they were received. So do images of cameras.
+    Where the stamps of a topic of `commands` are further from the other topics' clock than
+    `tolerance_s`, its messages count from when they were received; so do those of a topic that
+    is stamped after its reception (`report.by_reception`).
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, all log times
@@ -136,6 +146,10 @@ def align(
             "none of the profile's topics has a header stamp (other than zero)",
             remedy=BY_LOG_TIME,
         )
+    stamped = {name: one for name, one in stamped.items() if name not in commands} or stamped
+    for name, ahead_ns in _stamped_ahead(stamped).items():
+        report.by_reception[name] = ahead_ns
+        del stamped[name]
     reference = max(stamped, key=lambda name: (len(stamped[name]), name))
     if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > clock.jump_s * NS:
         refuse_still_log_time(reference, stamped[reference])
@@ -146,6 +160,7 @@ def align(
     for index in range(len(edges) + 1):
         inside = {name: _during(edges, index, columns) for name, columns in topics.items()}
         clock_map, middle = drifts.map_of(topics, stamped, reference, inside, edges, index)
+        drifts.place_commands(topics, commands - stamped.keys(), inside, clock_map)
         segments.append(
             _segment(topics, inside, every, clock_map, middle, clock, latched, transforms, report)
         )
@@ -177,6 +192,16 @@ def stamped_topics(
         and name not in besides
         and np.any(np.asarray(columns.fields[STAMP]))
     }
+
+
+def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
+    """The topics stamped after their reception, and by how many ns, where others are stamped by the
+    recorder's clock; none where all are ahead (the recorder's clock is behind)."""
+    medians = {name: median(delay_ns(columns)) for name, columns in stamped.items()}
+    limit = round(IMPOSSIBLE_S * NS)
+    if not any(-limit < each < LATENCY_S * NS for each in medians.values()):
+        return {}
+    return {name: -each for name, each in medians.items() if each <= -limit}
 
 
 def delay_ns(columns: TopicColumns, rows: Rows = slice(None)) -> Ints:
@@ -322,6 +347,26 @@ class _Drifts:
         return fitted.ahead_by(max(shift, 0)), middle
 
 
+    def place_commands(
+        self,
+        topics: Mapping[str, TopicColumns],
+        commands: frozenset[str],
+        inside: Mapping[str, Rows],
+        clock_map: ClockMap,
+    ) -> None:
+        """Note the commands whose stamps are of another clock than this segment's."""
+        for name in commands & topics.keys():
+            if name in self.report.by_reception or STAMP not in topics[name].fields:
+                continue
+            log = topics[name].log_time_ns[inside[name]]
+            stamp = np.asarray(topics[name].fields[STAMP], np.int64)[inside[name]]
+            if not stamp.any():
+                continue
+            ahead = -median(clock_map.stamped(log) - stamp)
+            if self.tolerance_ns < abs(ahead) <= round(self.clock.jump_s * NS):
+                self.report.by_reception[name] = ahead
+
+
 def _segment(
     topics: Mapping[str, TopicColumns],
     inside: Mapping[str, Rows],
@@ -338,7 +383,7 @@ def _segment(
     for name, rows in inside.items():
         columns, numbers = topics[name], every[rows]
         log_time = columns.log_time_ns[rows]
-        if STAMP not in columns.fields:
+        if STAMP not in columns.fields or name in report.by_reception:
             samples[name] = _ordered(clock_map.stamped(log_time), numbers)
             continue
         stamp = np.asarray(columns.fields[STAMP], np.int64)[rows]

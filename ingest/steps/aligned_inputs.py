@@ -219,6 +219,7 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
         edges.static.union(latched),
         frozenset(edges.topics)
         | frozenset(topics.keys() - without_cameras(profile, topics).keys()),
+        _command_topics(inputs),
         tolerance_s=profile.task.control_period_s / 2,
     )
     ticks, between = [], 0
@@ -236,6 +237,17 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
     notes = frame_notes(profile, inputs, edges)
     notes += sideways_notes(commanded, inputs.topics[commanded.topic].fields)
     return AlignedInputs(profile, inputs, segments, ticks, tree, report, between, notes)
+
+
+def _command_topics(inputs: InputColumns) -> frozenset[str]:
+    """The topics of which only commands are taken: they take effect when they are received."""
+    topics: dict[bool, set[str]] = {True: set(), False: set()}
+    for name, source in inputs.by_name.items():
+        asks = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(
+            f"{COMMAND_SOURCES}."
+        )
+        topics[asks].add(source.topic)
+    return frozenset(topics[True] - topics[False])
 
 
 def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict[str, str]:

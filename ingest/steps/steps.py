@@ -14,6 +14,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.align import ClockReport
 from restock.ingest.steps.aligned_inputs import align_inputs
 from restock.ingest.steps.clocks import TopicClock, topic_clocks
+from restock.ingest.steps.consistency import Finding, findings_of
 from restock.ingest.steps.custom_columns import Custom, custom_signals
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.routing import Routing
@@ -46,6 +47,7 @@ class Steps:
     custom: Custom  # the profile's own signals
     cameras: dict[str, CameraFrames] = field(default_factory=dict)
     clocks: list[TopicClock] = field(default_factory=list)  # of each topic that was read
+    findings: list[Finding] = field(default_factory=list)  # what contradicts itself
     notes: list[str] = field(default_factory=list)  # for people
     stand_ins: dict[str, str] = field(default_factory=dict)  # of inputs that measured nothing
 
@@ -113,6 +115,7 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         custom,
         aligned.camera_frames(),
         clocks,
+        findings_of(aligned, signals, filling.segment, list(filling.problem)),
         [*aligned.notes, *filling.notes, *custom.notes, *perturbed.notes],
         stand_ins=filling.stand_ins,
     )

@@ -74,6 +74,7 @@ def manifest_row(
         "label_scores": score_rows(scores),
         "label_counts": count_rows(scores),
         "clocks": [],
+        "findings": [],
         "signals": [],
         "cameras": [],
         "unknown_conditions": unknown_rows(profile.definitions, lidar=profile.task.lidar),
@@ -113,6 +114,7 @@ def recorded_facts(
         "topics": topic_rows(recording),
         "stand_ins": [{"input": name, "instead": how} for name, how in fallbacks.items()],
         "clocks": clock_rows(recording, steps),
+        "findings": [one.as_row() for one in steps.findings],
         "signals": steps.custom.rows(),
     }
 

@@ -269,6 +269,16 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         nullable=True,
     ),
     Column(
+        "findings",
+        _rows_of(
+            kind=pa.string(), topic=pa.string(), what=pa.string(), steps=pa.int64(),
+            cause=pa.string(), remedy=pa.string(), repaired=pa.bool_(),
+        ),
+        "topics that contradict the rest of the recording: how far, in how many steps, the likely "
+        "cause, what to do; null: from a Restock without this check",
+        nullable=True,
+    ),
+    Column(
         "signals",
         _rows_of(
             name=pa.string(), unit=pa.string(), type=pa.string(), topic=pa.string(),

@@ -108,7 +108,7 @@ def test_a_robot_without_odometry_is_read_and_said(tmp_path, capsys):
         tmp_path / "s",
     )
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert "# [inputs.wheels]  # no odometry seen; instead: speeds from poses" in file.read_text()
+    assert "# [inputs.wheels]  # no usable odometry; instead: speeds from poses" in file.read_text()
     assert "wheel_slip" not in load_profile(file).shipped_conditions
     assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
     assert "no wheels: speeds from the poses of the last" in capsys.readouterr().out

@@ -229,6 +229,12 @@ def by_poses(table: pa.Table, recordings: pa.Table) -> Tables:
     return table, replaced(recordings, "stand_ins", stand_ins)
 
 
+def two_clocks(table: pa.Table, recordings: pa.Table) -> Tables:
+    one = {"kind": "order", "topic": "/odom", "what": "too early", "steps": 9, "cause": "clock"}
+    found = [[one | {"remedy": "chrony", "repaired": again} for again in (True, False)], []]
+    return table, replaced(recordings, "findings", found)
+
+
 def without_lidar(table: pa.Table, recordings: pa.Table) -> Tables:
     lost = {"condition": "recovery", "kind": "outcome", "signals": ["clearance_m"]}
     unknown = [[lost | {"because": "no lidar"}], []]
@@ -375,6 +381,7 @@ PLANTS: list[tuple[str, Plant, int, dict[str, object]]] = [
     ("goals_by_hindsight", by_hindsight, 1, {"recording_id": f"{1:016x}"}),
     ("mixed_goal_sources", both_kinds_of_goals, 1, {"logged_episodes": 120}),
     ("speeds_from_poses", by_poses, 1, {"instead": "speeds from poses"}),
+    ("contradictions", two_clocks, 1, {"topic": "/odom", "remedy": "chrony"}),
     ("unknown_conditions", without_lidar, 1, {"condition": "recovery", "recordings": 1}),
     ("far_actions", far_operator, 1, {"behaviour_policy": "operator", "far_share": 1.0}),
     ("one_action", one_circle, 1, {"recording_id": f"{1:016x}", "action": 3, "share": 1.0}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -266,6 +267,21 @@ def _measured(
             f" {rule.values[0]} ({rule.words})"
         )
     return [], "; ".join(reasons)
+
+
+def with_other_wheels(seen: Evidence, why: str) -> Evidence | None:
+    """Without the odometry that the wheels' speeds were to come from: by the next topic that has
+    them, or by the poses. `why` is said in the profile. None where the poses are too few."""
+    roles = {**seen.roles, "wheels": seen.roles["wheels"][1:]}
+    if roles["wheels"]:
+        return replace(seen, roles=roles)
+    frames = seen.frames if seen.poses_from_frames else None
+    poses = pose_series(seen.recording, roles, frames, transform_edges(seen.recording))
+    motion = choose_motion(seen.recording, *poses)
+    if motion.problem:
+        return None
+    motion = replace(motion, comments=(*textwrap.wrap(why, 96), *motion.comments))
+    return replace(seen, roles=roles, motion=motion)
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:

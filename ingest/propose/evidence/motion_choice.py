@@ -40,8 +40,8 @@ class MotionChoice:
 
     def lines(self) -> list[str]:
         return [
-            "[motion]  # no odometry: speeds are the slope of the last poses; slip cannot be "
-            "detected",
+            "[motion]  # no usable odometry: speeds are the slope of the last poses; slip cannot"
+            " be detected",
             *(f"# {comment}" for comment in self.comments),
             f"window_s = {self.window_s:g}",
             "",

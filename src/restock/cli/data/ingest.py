@@ -303,6 +303,8 @@ def show(outcome: IngestResult) -> None:
         console.print(visible(note), markup=False, soft_wrap=True)
     for loss in outcome.lost_messages:
         console.print(visible(f"lost: {loss}"), markup=False, soft_wrap=True)
+    for contradiction in outcome.contradictions:
+        console.print(visible(contradiction), markup=False, soft_wrap=True)
     console.print()
 
 

@@ -160,6 +160,7 @@ class ProfileCommand:
                     "unread": [str(path) for path in unread],
                     "unreadable": [str(path) for path in unreadable],
                     "losses": losses,
+                    "findings": [one.as_row() for one in proposal.findings],
                 }
             )
         elif self.out is None:
@@ -168,13 +169,17 @@ class ProfileCommand:
             output.say(visible(str(each)))
         for loss in losses:
             output.say(f"lost: {loss}")
+        for finding in proposal.findings:
+            output.say(visible(finding.told))
         for problem in proposal.problems:
             names = visible(", ".join(self.paths))
             sys.stderr.write(f"restock: {names}: cannot be used yet: {problem}\n")
         if self.out is not None and not proposal.problems:
             checking = visible(shlex.join(["profile", "check", str(self.out), str(chosen[0])]))
             output.say(f"next: restock {checking}")
-        return ExitCode.LOSSY if proposal.problems or losses or unreadable else ExitCode.OK
+        kept = any(not finding.repaired for finding in proposal.findings)
+        lossy = proposal.problems or losses or unreadable or kept
+        return ExitCode.LOSSY if lossy else ExitCode.OK
 
     def _drives(self, paths: Sequence[Path]) -> tuple[Drives | None, list[Path]]:
         """Several recordings by their kind of robot, and those that cannot be read, which are

@@ -1,0 +1,250 @@
+"""Signals of one recording compared with each other: what contradicts itself, and what to do.
+
+Each check needs two independent sources of one quantity, and speaks only where most of the drive
+disagrees: slip, latency and noise differ for a while, a wrong unit or clock differs throughout.
+Ingest, `profile new` and `profile check` share these findings; the store keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from restock.arrays import F64, Bools, Ints
+from restock.ingest.steps.align import NS, ClockReport
+from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.task.signals import Signals, wrap_angle
+
+WINDOW_S = 3.0  # in which two sources of a speed are compared
+LEAST_WINDOWS = 5  # in which the robot moves; fewer say nothing
+APART = 1.25  # how many times the other one a speed is in three of four windows
+STILL = 0.05  # of the other one: less is standing
+MOVES = 0.2  # of the fastest command
+TURNS_RAD = 0.3  # in a window
+STEPS_PER_WINDOW = 2 / 3  # of its time that must be known
+BEYOND, BEYOND_MPS = 1.5, 0.1  # times the fastest command or wheels, and a margin
+OFTEN = 0.02  # of the steps
+LEAST_STEPS = 5
+LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
+MOST_LEAD_S = 2.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A contradiction between a topic and the rest of its recording."""
+
+    kind: str  # clock, sources, wheels, gyro or order
+    topic: str
+    what: str  # with its size
+    steps: int  # ticks concerned
+    cause: str  # the likely one
+    remedy: str
+    repaired: bool = False  # else the rows are as recorded
+
+    def __str__(self) -> str:
+        return f"{self.topic}: {self.what} ({self.steps:,} steps); {self.cause}; {self.remedy}"
+
+    @property
+    def told(self) -> str:
+        """As a line for people."""
+        return f"{'repaired' if self.repaired else 'contradicts itself'}: {self}"
+
+    def as_row(self) -> dict[str, str | int | bool]:
+        """Plain values, as `recordings.findings` holds them."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The T steps of a recording by what they can be compared in."""
+
+    signals: Signals
+    joined: Bools  # (T,) known, and so is the step before, in the same stretch
+    seconds: F64  # (T,) since the step before; 0 where it is not joined
+    window: Ints  # (T,) which stretch of WINDOW_S it is in
+
+    @classmethod
+    def of(cls, signals: Signals, segment: Ints, problem: Sequence[str], longest_s: float) -> Drive:
+        """The steps of `signals`; those further apart than `longest_s` are not joined."""
+        stamp = np.asarray(signals["stamp_ns"], np.int64)
+        usable = np.array([each == "" for each in problem], np.bool_)
+        gap_s = np.diff(stamp, prepend=stamp[:1]) / NS
+        joined = usable & np.roll(usable, 1) & (gap_s > 0) & (gap_s <= longest_s)
+        joined &= segment == np.roll(segment, 1)
+        joined[:1] = False
+        begins = np.diff(segment, prepend=-1) != 0
+        first = np.maximum.accumulate(np.where(begins, np.arange(len(stamp)), 0))
+        stretch = (stamp - stamp[first]) // round(WINDOW_S * NS)
+        window = np.cumsum(begins | (np.diff(stretch, prepend=0) != 0)) - 1
+        return cls(signals, joined, np.where(joined, gap_s, 0.0), window)
+
+    def sums(self, values: F64) -> F64:
+        """The sum of values (T,) in each window (W,), of joined steps."""
+        known = np.where(self.joined, np.nan_to_num(values), 0.0)
+        return np.asarray(np.bincount(self.window, known), np.float64)
+
+    def driven(self, name: str) -> F64:
+        """What a speed (T,) integrates to in each window (W,), with its sign."""
+        speed = np.asarray(self.signals[name], np.float64)
+        return self.sums((speed + np.roll(speed, 1)) / 2 * self.seconds)
+
+    def full(self) -> Bools:
+        """The windows (W,) of which enough is known."""
+        return np.asarray(self.sums(self.seconds) > STEPS_PER_WINDOW * WINDOW_S)
+
+
+def findings_of(
+    aligned: AlignedInputs, signals: Signals, segment: Ints, problem: Sequence[str]
+) -> list[Finding]:
+    """What in a recording contradicts itself, of its steps' signals (T,)."""
+    profile = aligned.profile
+    found = clock_findings(aligned.clock, len(problem))
+    if not len(problem):
+        return found
+    period_s = profile.task.control_period_s
+    drive = Drive.of(signals, segment, problem, 3 * period_s)
+    topics = {name: source.topic for name, source in aligned.inputs.by_name.items()}
+    topics.setdefault("pose", profile.frames.topic if profile.frames else "")
+    fastest_mps = float(np.abs(signals["command_speed_mps"]).max(initial=0.0))
+    noise_mps = 2 * profile.noise.localiser_m / period_s
+    jumps = _jumping_poses(drive, topics["pose"], fastest_mps, noise_mps)
+    found += jumps
+    if profile.motion is None and not jumps:
+        found += _wheels(drive, topics["wheels"], topics["pose"], fastest_mps)
+    if "imu" in topics and not jumps:
+        turned = _windows_of_turns(drive, "gyro_yaw_rate_radps")
+        found += _compared(
+            turned, ("gyro", topics["imu"], "its yaw rate", topics["pose"]), len(problem)
+        )
+    return found + _order(drive, topics["command"], topics.get("wheels", topics["pose"]), period_s)
+
+
+def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
+    """The topics whose stamps are of another clock than the others', and were not used."""
+    found = []
+    for topic, ahead_ns in clock.by_reception.items():
+        where = "ahead of" if ahead_ns > 0 else "behind"
+        what = (
+            f"its stamps are {abs(ahead_ns) / NS:.2f} s {where} the clock of the other topics; its"
+            " messages count from their reception"
+        )
+        cause = "the clock of the computer that stamps them is another one"
+        remedy = "synchronise the clocks (chrony, PTP)"
+        found.append(Finding("clock", topic, what, steps, cause, remedy, repaired=True))
+    return found
+
+
+def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: float) -> list[Finding]:
+    """Poses that step further than anything drove."""
+    signals, joined = drive.signals, drive.joined
+    wheels = np.abs(signals["wheel_speed_mps"])[joined]
+    most = max(fastest_mps, float(np.percentile(wheels, 99)) if len(wheels) else 0.0)
+    limit = BEYOND * most + BEYOND_MPS + noise_mps
+    beyond = joined & (np.abs(signals["localised_speed_mps"]) > limit)
+    count = int(beyond.sum())
+    if count < max(LEAST_STEPS, OFTEN * joined.sum()):
+        return []
+    speed = float(np.median(np.abs(signals["localised_speed_mps"][beyond])))
+    return [
+        Finding(
+            "sources",
+            topic,
+            f"its poses step at {speed:.2g} m/s (median) where neither commands nor wheels exceed"
+            f" {most:.2g} m/s",
+            count,
+            "two publishers on one topic, or a localiser that jumps",
+            "record each publisher on a topic of its own, or name another pose in [inputs.pose]",
+        )
+    ]
+
+
+def _wheels(drive: Drive, topic: str, poses: str, fastest_mps: float) -> list[Finding]:
+    """Wheels whose speed or yaw rate is another one than that of the poses."""
+    wheels = drive.driven("wheel_speed_mps")
+    along = drive.driven("localised_speed_mps")
+    path = np.maximum(np.abs(wheels), np.abs(along))
+    moved = drive.full() & (path > MOVES * fastest_mps * WINDOW_S)
+    steps = len(drive.joined)
+    found = _compared((wheels[moved], along[moved]), ("wheels", topic, "its speed", poses), steps)
+    if found:
+        return found
+    turned = _windows_of_turns(drive, "wheel_yaw_rate_radps")
+    return _compared(turned, ("wheels", topic, "its yaw rate", poses), steps)
+
+
+def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
+    """The angles by a yaw rate and by the poses, of the windows in which the robot turned."""
+    yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
+    by_rate, by_pose = drive.driven(name), drive.sums(wrap_angle(yaw - np.roll(yaw, 1)))
+    turned = drive.full() & (np.maximum(np.abs(by_rate), np.abs(by_pose)) > TURNS_RAD)
+    if not np.isfinite(drive.signals[name]).any():
+        turned[:] = False
+    return by_rate[turned], by_pose[turned]
+
+
+def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: int) -> list[Finding]:
+    """A finding where a source is off from the poses in one direction in three of four windows.
+
+    `of`: the finding's kind, its topic, what is compared, and the poses' topic.
+    """
+    source, poses = windows
+    kind, topic, what, pose_topic = of
+    if len(source) < LEAST_WINDOWS:
+        return []
+    ratio = source / np.where(poses == 0, 1e-9, poses)
+    low, middle, high = np.percentile(ratio, [25, 50, 75])
+    size, cause = f"is {middle:.2g} times", "another unit, scale or frame, or slip throughout"
+    if np.percentile(np.abs(ratio), 90) < STILL:
+        size, cause = "stays at 0 beside", "it is not measured"
+    elif high < 0:
+        cause = "another sign, or another frame"
+    elif high >= 1 / APART and low <= APART:
+        return []
+    said = f"{what} {size} that of the poses of {pose_topic}, in {len(ratio)} stretches of 3 s"
+    remedy = {
+        "wheels": "take the speeds from the poses ([motion] instead of [inputs.wheels]), or"
+        " correct what publishes it",
+        "gyro": "leave out [inputs.imu], or correct what publishes it",
+    }[kind]
+    return [Finding(kind, topic, said, steps, cause, remedy)]
+
+
+def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:
+    """Motion that comes before the command that it follows."""
+    most = max(1, round(MOST_LEAD_S / period_s))
+    for name in ("speed_mps", "yaw_rate_radps"):
+        asked, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
+        by_lag = [_correlation(asked, did, drive.joined, lag) for lag in range(-most, most + 1)]
+        best = int(np.argmax(by_lag))
+        lead = most - best  # steps by which the motion comes before
+        if lead >= 1 and by_lag[best] > max(SURE, by_lag[most] + LEADS):
+            return [
+                Finding(
+                    "order",
+                    wheels,
+                    f"its motion comes {lead * period_s:.1f} s before the commands of {command}"
+                    f" that it follows (correlation {by_lag[best]:.2f}, {by_lag[most]:.2f} as"
+                    " stamped)",
+                    len(asked),
+                    "one of the two has the times of another clock",
+                    'set [clock] alignment = "log_time" in the profile, and synchronise the clocks',
+                )
+            ]
+    return []
+
+
+def _correlation(asked: F64, did: F64, joined: Bools, lag: int) -> float:
+    """How well a motion (T,) follows a command (T,) `lag` steps later; -1 if little is known."""
+    if lag > 0:
+        asked, did, joined = asked[:-lag], did[lag:], joined[:-lag] & joined[lag:]
+    elif lag < 0:
+        asked, did, joined = asked[-lag:], did[:lag], joined[-lag:] & joined[:lag]
+    asked, did = asked[joined], did[joined]
+    if len(asked) < 10 * LEAST_STEPS or asked.std() < 1e-3 or did.std() < 1e-3:
+        return -1.0
+    return float(np.corrcoef(asked, did)[0, 1])
+
+
+__all__ = ["Finding", "clock_findings", "findings_of"]

@@ -1,0 +1,248 @@
+"""Recordings whose signals contradict each other: what is found, repaired, or kept and said."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.driven_robot import (
+    BEAMS,
+    FREE_M,
+    START_NS,
+    columns,
+    scans,
+    write_topics,
+)
+
+from restock.cli import main
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.profile.profile import Profile, parse_profile
+from restock.ingest.propose.propose import propose_profile
+from restock.ingest.steps.consistency import Finding
+from restock.ingest.steps.needs import read_topics
+from restock.ingest.steps.steps import steps_of
+
+NS = 10**9
+DURATION_S = 45.0
+TYPES = {
+    "/cmd_vel": "geometry_msgs/msg/TwistStamped",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/imu": "sensor_msgs/msg/Imu",
+    "/scan": "sensor_msgs/msg/LaserScan",
+}
+Topics = dict[str, TopicColumns]
+
+
+def motion(time_s: Any) -> tuple[Any, Any]:
+    """Speed and yaw rate of a robot that winds through a hall, in m/s and rad/s."""
+    return 0.35 + 0.2 * np.sin(time_s), 0.7 * np.sin(0.6 * time_s) + 0.1
+
+
+def poses(time_s: Any) -> tuple[Any, Any, Any]:
+    """Where that robot is: x, y and yaw."""
+    fine = np.arange(0, DURATION_S + 1, 0.001)
+    speed, rate = motion(fine)
+    yaw = np.cumsum(rate) * 0.001
+    x, y = (np.cumsum(speed * turn(yaw)) * 0.001 for turn in (np.cos, np.sin))
+    return tuple(np.interp(time_s, fine, column) for column in (x, y, yaw))
+
+
+def winding() -> Topics:
+    """What it records, all clocks right."""
+    fast, tenth = np.arange(0, DURATION_S, 0.05), np.arange(0, DURATION_S, 0.1)
+    (speed, rate), (asked, turned) = motion(fast), motion(tenth)
+    x, y, yaw = poses(fast)
+    odom = {"pose.pose.position.x": x, "pose.pose.position.y": y}
+    odom |= {"pose.pose.orientation.z": np.sin(yaw / 2), "pose.pose.orientation.w": np.cos(yaw / 2)}
+    odom |= {"twist.twist.linear.x": speed, "twist.twist.angular.z": rate}
+    imu = {"angular_velocity.z": rate, "linear_acceleration.x": np.gradient(speed, fast)}
+    return {
+        "/cmd_vel": columns(tenth, {"twist.linear.x": asked, "twist.angular.z": turned}),
+        "/odom": columns(fast, odom),
+        "/imu": columns(fast, imu),
+        "/scan": columns(tenth, scans(np.full((len(tenth), BEAMS), FREE_M)) | _ranges(len(tenth))),
+    }
+
+
+def _ranges(count: int) -> dict[str, Any]:
+    return {"range_min": np.full(count, 0.1), "range_max": np.full(count, 10.0)}
+
+
+def shifted(topics: Topics, name: str, seconds: float) -> Topics:
+    """The same, with the stamps of a topic ahead by so much."""
+    one = topics[name]
+    stamp = np.asarray(one.fields["header.stamp"]) + round(seconds * NS)
+    return {**topics, name: replace(one, fields={**one.fields, "header.stamp": stamp})}
+
+
+def scaled(topics: Topics, name: str, factor: float, *paths: str) -> Topics:
+    """The same, with fields of a topic multiplied."""
+    one = topics[name]
+    fields = {path: np.asarray(one.fields[path]) * factor for path in paths}
+    return {**topics, name: replace(one, fields={**one.fields, **fields})}
+
+
+def two_publishers(topics: Topics) -> Topics:
+    """The same, with every third message of the odometry from another frame."""
+    one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    fields = dict(one.fields)
+    for axis, moved in (("x", 7.0), ("y", 2.0)):
+        path = f"pose.pose.position.{axis}"
+        fields[path] = np.asarray(fields[path]) + 0.1 * moved * third
+    return {**topics, "/odom": replace(one, fields=fields)}
+
+
+def slipping(topics: Topics) -> Topics:
+    """The same, with wheels that turn twice as fast for a third of the time."""
+    one = topics["/odom"]
+    time_s = (np.asarray(one.fields["header.stamp"]) - START_NS) / NS
+    factor = np.where(time_s % 15 < 5, 2.0, 1.0)
+    path = "twist.twist.linear.x"
+    return {
+        **topics,
+        "/odom": replace(one, fields={**one.fields, path: np.asarray(one.fields[path]) * factor}),
+    }
+
+
+def written(topics: Topics, folder: Path) -> Path:
+    return write_topics({name: (TYPES[name], one) for name, one in topics.items()}, folder)
+
+
+@pytest.fixture(scope="module")
+def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
+    """That of the clean drive."""
+    bag = written(winding(), tmp_path_factory.mktemp("clean") / "bag")
+    with open_recording(bag) as recording:
+        return parse_profile(propose_profile(recording, "r", hindsight_goals=True).toml, where="t")
+
+
+def found_in(topics: Topics, profile: Profile, folder: Path) -> tuple[list[Finding], Any]:
+    """The findings, and each step's stamp, pose and command."""
+    with open_recording(written(topics, folder / "bag")) as recording:
+        steps = steps_of(profile, read_topics(recording, profile))
+    names = ("stamp_ns", "pose_x_m", "pose_y_m", "command_speed_mps", "command_yaw_rate_radps")
+    return steps.findings, {name: steps.signals[name] for name in names}
+
+
+@pytest.mark.parametrize("change", [lambda topics: topics, slipping], ids=["clean", "slip"])
+def test_a_robot_that_slips_or_not_does_not_contradict_itself(profile, tmp_path, change):
+    assert found_in(change(winding()), profile, tmp_path)[0] == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "ahead_s"),
+    [("/cmd_vel", 0.4), ("/cmd_vel", -0.4), ("/cmd_vel", -0.7), ("/scan", 0.8), ("/imu", 0.5)],
+)
+def test_a_topic_of_another_clock_counts_from_its_reception(profile, tmp_path, topic, ahead_s):
+    topics = shifted(winding(), topic, ahead_s)
+    found, steps = found_in(topics, profile, tmp_path)
+    ((kind, name, repaired),) = [(one.kind, one.topic, one.repaired) for one in found]
+    assert (kind, name, repaired) == ("clock", topic, True)
+    assert f"{abs(ahead_s):.2f} s {'ahead of' if ahead_s > 0 else 'behind'}" in str(found[0])
+    # The command of each step is the one in force where its pose was measured.
+    time_s = _times(steps)
+    asked, turned = motion(np.floor(time_s / 0.1 + 1e-3) * 0.1)
+    known = np.abs(steps["command_speed_mps"]) > 0
+    assert known.mean() > 0.95
+    off = np.abs(steps["command_speed_mps"] - asked) + np.abs(
+        steps["command_yaw_rate_radps"] - turned
+    )
+    assert np.percentile(off[known], 95) < 0.08  # a step of .1 s changes them by less
+
+
+def _times(steps: Any) -> Any:
+    """When the robot was at the pose of each step."""
+    fine = np.arange(0, DURATION_S, 0.01)
+    x, y, _ = poses(fine)
+    away = np.hypot(
+        steps["pose_x_m"][:, None] - x[None, :], steps["pose_y_m"][:, None] - y[None, :]
+    )
+    return fine[np.argmin(away, axis=1)]
+
+
+def test_a_clock_of_the_recorder_alone_is_no_contradiction(profile, tmp_path):
+    topics = winding()
+    for name in topics:
+        topics = shifted(topics, name, 3.0)
+    assert found_in(topics, profile, tmp_path)[0] == []
+
+
+SPEED, RATE = "twist.twist.linear.x", "twist.twist.angular.z"
+GYRO = "angular_velocity.z"
+WRONG = {
+    "two publishers": (two_publishers, "sources", "/odom", "two publishers"),
+    "no speed": (lambda t: scaled(t, "/odom", 0, SPEED, RATE), "wheels", "/odom", "stays at 0"),
+    "km/h": (lambda t: scaled(t, "/odom", 3.6, SPEED), "wheels", "/odom", "is 3.6 times"),
+    "sign": (lambda t: scaled(t, "/odom", -1, SPEED), "wheels", "/odom", "another sign"),
+    "rate": (lambda t: scaled(t, "/odom", -1, RATE), "wheels", "/odom", "its yaw rate is -1"),
+    "degrees": (
+        lambda t: scaled(t, "/imu", 57.3, GYRO),
+        "gyro",
+        "/imu",
+        "57 times",
+    ),
+    "no gyro": (lambda t: scaled(t, "/imu", 0, GYRO), "gyro", "/imu", "stays at 0"),
+    "late odometry": (lambda t: shifted(t, "/odom", -0.6), "order", "/odom", "before the commands"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_contradicts_itself_is_kept_and_said(profile, tmp_path, case):
+    change, kind, topic, words = WRONG[case]
+    found, steps = found_in(change(winding()), profile, tmp_path)
+    assert kind in {one.kind for one in found}, found
+    one = next(one for one in found if one.kind == kind)
+    assert (one.topic, one.repaired) == (topic, False)
+    assert words in str(one)
+    assert 0 < one.steps <= len(steps["stamp_ns"])
+
+
+def test_ingest_says_it_stores_it_and_exits_with_3(tmp_path, capsys):
+    clean, wrong = (
+        written(one, tmp_path / name)
+        for name, one in (("clean", winding()), ("wrong", two_publishers(winding())))
+    )
+    file, store = tmp_path / "p.toml", tmp_path / "store"
+    assert main(["profile", "new", str(clean), "--out", str(file), "--hindsight-goals"]) == 0
+    capsys.readouterr()
+    assert main(["profile", "check", str(file), str(wrong)]) == 3
+    assert "contradicts itself: /odom: its poses step at" in capsys.readouterr().out
+    ingest = ["ingest", str(clean), str(wrong), "--profile", str(file), "--store", str(store)]
+    assert main(ingest) == 3
+    assert capsys.readouterr().out.count("contradicts itself: /odom") == 1
+    query = "SELECT kind, topic, repaired FROM (SELECT unnest(findings, recursive := true)"
+    assert main(["sql", str(store), f"{query} FROM recordings)", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row == {"kind": "sources", "topic": "/odom", "repaired": False}
+    main(["audit", str(store), "--json"])
+    said = json.loads(capsys.readouterr().out)["audits"]
+    (audit,) = [each for each in said if each["audit"] == "contradictions"]
+    assert (audit["status"], audit["rows"]) == ("warn", 1)
+
+
+def test_profile_new_does_not_use_wheels_that_are_none(tmp_path, capsys):
+    bag = written(scaled(winding(), "/odom", 0, SPEED, RATE), tmp_path / "bag")
+    file = tmp_path / "p.toml"
+    assert main(["profile", "new", str(bag), "--out", str(file), "--hindsight-goals"]) == 0
+    text = file.read_text()
+    assert "# /odom is not used: its speed stays at 0 beside that of the poses of /odom" in text
+    assert "[motion]" in text
+    assert "localiser_m" not in text
+    assert "[inputs.wheels]\n" not in text
+    store = tmp_path / "store"
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    capsys.readouterr()
+    query = "SELECT avg(wheel_speed_mps) AS mean FROM transitions"
+    assert main(["sql", str(store), query, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["mean"] == pytest.approx(motion(np.arange(0, DURATION_S, 0.1))[0].mean(), abs=0.02)
+    wrong = written(two_publishers(winding()), tmp_path / "wrong")
+    other = tmp_path / "other.toml"
+    assert main(["profile", "new", str(wrong), "--out", str(other), "--hindsight-goals"]) == 3
+    assert "localiser_m" not in other.read_text()
+    assert "# CONTRADICTS ITSELF: /odom: its poses step" in other.read_text()
