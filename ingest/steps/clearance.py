@@ -19,6 +19,7 @@ from restock.ingest.task.task import Task
 # What is made of a scan, beside the message's own fields (whose names hold no space).
 SECTORS = "clearance of each sector"  # (N, sectors) float64, m
 BEAMS = "number of beams"  # (N,) int64
+CLOSE = "whether a beam is too close to be measured"  # (N,) bool: -inf (REP 117)
 BLIND = "whether no beam has a valid range"  # (N,) bool; inf is one: nothing was hit
 UNAIMED = "whether its angles say where no beam points"  # (N,) bool
 
@@ -28,7 +29,7 @@ _TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
 def scan_reduction(task: Task, source: Input) -> Reduction:
-    """What makes SECTORS, BEAMS, BLIND and UNAIMED of the scans of a profile's input.
+    """What makes SECTORS, BEAMS, CLOSE, BLIND and UNAIMED of the scans of a profile's input.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
@@ -68,29 +69,37 @@ class _ScanReducer:
             beams = np.full(len(ranges), ranges.shape[1] if ranges.ndim > 1 else 1, np.int64)
         first, increment = beam_angles(self.source, first, last, beams)
         clearance = np.full((len(beams), self.task.sectors), float(self.task.range_max_m))
-        blind = np.zeros(len(beams), np.bool_)
+        close, blind = np.zeros((2, len(beams)), np.bool_)
         with np.errstate(invalid="ignore", over="ignore"):
             angles = np.maximum(np.abs(first), np.abs(first + increment * (beams - 1)))
         unaimed = (beams > 0) & ~(angles <= _TURNS_RAD)  # so is NaN
         unaimed |= (beams > 1) & (increment == 0)
         geometry = np.stack([first, increment, np.where(unaimed, 0, beams)], axis=1)
         if len(geometry) and (geometry == geometry[0]).all():
-            self._fill(clearance, blind, ranges, None, geometry[0])
+            self._fill(clearance, close, blind, ranges, None, geometry[0])
         else:
             kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
             for index, one in enumerate(kinds):
-                self._fill(clearance, blind, ranges, np.flatnonzero(kind == index), one)
-        return {SECTORS: clearance, BEAMS: beams, BLIND: blind, UNAIMED: unaimed}
+                rows = np.flatnonzero(kind == index)
+                self._fill(clearance, close, blind, ranges, rows, one)
+        return {
+            SECTORS: clearance,
+            BEAMS: beams,
+            CLOSE: close,
+            BLIND: blind,
+            UNAIMED: unaimed,
+        }
 
     def _fill(
         self,
         clearance: NDArray[np.float64],
+        close: NDArray[np.bool_],
         blind: NDArray[np.bool_],
         ranges: FieldColumn,
         rows: NDArray[np.intp] | None,
         geometry: NDArray[np.float64],
     ) -> None:
-        """Clearance and blindness of these rows (None: of all), which have one geometry."""
+        """Write what is made of these rows (None: of all), which have one geometry."""
         first, increment, beams = float(geometry[0]), float(geometry[1]), int(geometry[2])
         if not beams:
             return
@@ -109,9 +118,9 @@ class _ScanReducer:
             table = np.asarray(values).reshape(stop - start, beams)
             found = sectors.clearance(table, task.range_min_m, task.range_max_m)
             clearance[here] = found
-            free = np.flatnonzero(
-                ~(found < task.range_max_m).any(axis=1)
-            )  # NaN: no beam ends there
+            close[here] = np.isneginf(table).any(axis=1)
+            seen = (found < task.range_max_m).any(axis=1)  # False for NaN: no beam ends there
+            free = np.flatnonzero(~seen | close[here])
             if len(free):
                 blind[start + free if rows is None else rows[start + free]] = ~(
                     table[free] >= task.range_min_m  # False for NaN

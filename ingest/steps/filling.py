@@ -20,7 +20,7 @@ from restock.ingest.containers.topic_reading import Fields
 from restock.ingest.profile.inputs import Input
 from restock.ingest.steps.align import NS, LatestMessages, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clearance import BEAMS, BLIND, SECTORS, UNAIMED, scan_reduction
+from restock.ingest.steps.clearance import BEAMS, BLIND, CLOSE, SECTORS, UNAIMED, scan_reduction
 from restock.ingest.steps.motion import motion_at
 from restock.ingest.steps.routing import (
     LARGEST,
@@ -279,6 +279,11 @@ class Filling:
         fields: Fields = self.inputs.topics[source.topic].fields
         if SECTORS not in fields:  # columns of whole scans, as no recording's reader gives them
             fields = scan_reduction(self.task, source).apply(fields)
+        if near := int(np.asarray(fields[CLOSE]).sum()):
+            self.notes.append(
+                f"{name}: {near:,} of {len(fields[CLOSE]):,} messages of {source.topic} have beams"
+                " of -inf, too close to be measured: clearance 0 there"
+            )
         fresh, rows = latest.fresh, latest.row[latest.fresh]
         if not len(rows):
             return

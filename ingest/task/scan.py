@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from restock.arrays import F64, Bools
 from restock.toml import Checked
 
 
@@ -21,6 +22,7 @@ class Body(Checked, frozen=True):
     lidar_yaw_rad: float = 0.0  # angle of the scan's zero to the robot's forward axis
 
 
+_AWAY_M = 1e-3  # along a beam, so that what is too close is in that beam's direction
 UNSEEN_SECTORS = 3  # at most, that are taken to lie behind what is beside them
 
 
@@ -54,11 +56,12 @@ class SectorMap:
         """Ranges (N, B) to clearance per sector (N, K), in [0, range_max_m].
 
         inf, NaN, and readings below `range_min_m` (the driver's "no valid return") or above
-        `range_max_m` count as free up to `range_max_m`; so does a sector without beams.
+        `range_max_m` count as free up to `range_max_m`; so does a sector without beams. -inf is
+        too close to be measured (REP 117): clearance 0.
         """
         with np.errstate(invalid="ignore"):  # a damaged range may be a NaN that signals
             ranges = np.asarray(ranges_m, np.float64)
-        valid = (ranges >= range_min_m) & (ranges <= range_max_m)  # False for NaN and inf
+        valid = returned(ranges, range_min_m, range_max_m)
         near = ranges - self.reach_m
         np.copyto(near, range_max_m, where=~valid)
         clearance = np.full((len(ranges), self.sectors), float(range_max_m))
@@ -96,12 +99,14 @@ class MovedMap:
         with np.errstate(invalid="ignore"):
             ranges = np.asarray(ranges_m, np.float64)
         farthest_m = range_max_m + float(np.hypot(*self.from_m))
-        valid = (ranges >= range_min_m) & (ranges <= farthest_m)
-        reached = np.where(valid, ranges, farthest_m)
+        valid = returned(ranges, range_min_m, farthest_m)
+        close = np.isneginf(ranges)
+        reached = np.where(valid, np.maximum(ranges, max(range_min_m, _AWAY_M)), farthest_m)
         x, y = (reached * way + start for way, start in zip(self.ways, self.from_m, strict=True))
         bearing = np.arctan2(y, x)
         near = np.clip(np.hypot(x, y) - outline_reach(bearing, self.body), 0.0, range_max_m)
         np.copyto(near, range_max_m, where=~valid)
+        np.copyto(near, 0.0, where=close)
         turn = (bearing + np.pi) * (self.sectors / (2 * np.pi))
         sector = np.minimum(turn.astype(np.intp), self.sectors - 1)
         clearance = np.full((len(ranges), self.sectors), np.inf)
@@ -109,6 +114,12 @@ class MovedMap:
         np.minimum.at(clearance, (row, sector), near)
         clearance[np.isinf(clearance)] = np.nan
         return clearance
+
+
+def returned(ranges_m: F64, range_min_m: float, range_max_m: float) -> Bools:
+    """Return which ranges mean that something is there: False for NaN and inf, True for -inf."""
+    inside = (ranges_m >= range_min_m) | np.isneginf(ranges_m)
+    return np.asarray(inside & (ranges_m <= range_max_m), np.bool_)
 
 
 def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.driven_robot import Drive, columns, ragged, typed_topics, write_topics
+from support.driven_robot import BEAMS, Drive, columns, ragged, scans, typed_topics, write_topics
 from support.profile_texts import WAREHOUSE
 
 from restock.cli import main
@@ -167,11 +167,32 @@ def test_signals_are_null_where_their_messages_say_so(tmp_path: Path) -> None:
     assert found["sonar"][-1] is None
     assert {round(beam, 3) for beam in found["beam"]} <= {0.1, 2.0}
     notes = "\n".join(steps.notes)
-    assert (
-        "signals.share: 30 of 60 messages of /battery say that it was not measured" in notes
-    )
+    assert "signals.share: 30 of 60 messages of /battery say that it was not measured" in notes
     assert "signals.sonar: 20 of 60 messages of /sonar say" in notes
     assert "signals.voltage" not in notes
+
+
+def test_a_scan_of_a_wall_that_is_too_close_is_near(tmp_path: Path) -> None:
+    """The same drive with what is nearer than .3 m measured, and as -inf."""
+    tenth = np.arange(0, SECONDS, 0.1)
+    found = []
+    for name, too_close in (("measured", 0.25), ("reported", -np.inf)):
+        ranges = np.full((len(tenth), BEAMS), 3.0, np.float32)
+        ranges[20:40, BEAMS // 2 - 3 : BEAMS // 2 + 3] = too_close  # ahead, within the outline
+        ranges[50] = -np.inf if name == "reported" else 0.0  # covered: it knows of nothing
+        topics = drive()
+        topics["/scan"] = ("sensor_msgs/msg/LaserScan", columns(tenth, scans(ranges)))
+        found.append(steps_in(topics, tmp_path / name))
+    measured, reported = found
+    usable = np.array(measured.problem) == ""
+    assert reported.problem == measured.problem
+    expected, near = (one.signals["clearance_m"][usable] for one in found)
+    assert near == pytest.approx(expected)
+    assert (near == 0).sum() == pytest.approx(10, abs=1)
+    assert reported.problem.count("scan: no beam has a valid range") == 1
+    told = "scan: 21 of 60 messages of /scan have beams of -inf, too close to be measured"
+    assert any(note.startswith(told) for note in reported.notes)
+    assert not any("-inf" in note for note in measured.notes)
 
 
 def test_a_robot_sees_what_its_recordings_say() -> None:

@@ -98,7 +98,7 @@ def cast(moved_m: float, place: Place, bearing: Any) -> Any:
     x, y = 1.0 + moved_m + place[0], 1.0 + place[1]
     way = np.stack([np.cos(bearing + place[2]), np.sin(bearing + place[2])])
     with np.errstate(divide="ignore"):
-        ranges = np.where(way[1] > 0, (LEFT_M - y) / way[1], (RIGHT_M - y) / way[1])
+        ranges = np.abs(np.where(way[1] > 0, LEFT_M - y, RIGHT_M - y) / way[1])
     for post in ((5.0, 1.7), (0.1, 0.95)):
         to = np.array([post[0] - x, post[1] - y])
         along = to @ way

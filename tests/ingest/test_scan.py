@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.ingest.task.scan import Body, SectorMap, outline_reach
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.task.limiter import Limits, limit
+from restock.ingest.task.scan import Body, MovedMap, SectorMap, outline_reach
 
 BODY = Body(length_m=0.7, width_m=0.5)
 POINT = Body(length_m=1e-9, width_m=1e-9)
@@ -49,6 +51,35 @@ def test_a_lidar_that_looks_backward():
 def test_no_valid_return_counts_as_free(nothing):
     sectors = SectorMap.build(CIRCLE, 36, BODY)
     assert (sectors.clearance(np.full((2, 360), nothing), 0.05, 4.0) == 4.0).all()
+
+
+@pytest.mark.parametrize("at_m", [None, (0.0, 0.0), (0.2, 0.15)])
+def test_too_close_to_be_measured_is_no_clearance(at_m: tuple[float, float] | None):
+    """-inf (REP 117), in the sector of its beam: of a lidar in the middle, and of one beside it."""
+    ranges = np.full((2, 360), 2.0)
+    ranges[1, 265:275] = -np.inf  # on its left
+    if at_m is None:
+        found = SectorMap.build(CIRCLE, 36, BODY).clearance(ranges, 0.3, 4.0)
+    else:
+        found = MovedMap.build(CIRCLE, 36, BODY, at_m).clearance(ranges, 0.3, 4.0)
+    left = np.flatnonzero(found[1] != found[0])
+    assert found[0].min() > 1.0
+    assert (found[1, left] == 0).all()
+    assert set(left) <= set(range(22, 30))
+    assert len(left)
+
+
+def test_the_limiter_does_not_drive_at_what_is_too_close():
+    task = load_profile("warehouse_amr").task
+    limits = Limits.of(task)
+    ranges = np.full((3, 360), np.inf)
+    ranges[1, 170:190] = -np.inf  # ahead
+    ranges[2, 170:190] = task.range_min_m  # the nearest that it can measure
+    seen = SectorMap.build(CIRCLE, task.sectors, task.body)
+    clearance = seen.clearance(ranges, task.range_min_m, task.range_max_m)
+    ahead, still = np.tile([0.3, 0.0], (3, 1)), np.zeros((3, 2))
+    assert limit(limits, ahead, clearance, still).command[:, 0].tolist() == [0.3, 0.0, 0.0]
+    assert (limit(limits, -ahead, clearance, still).command[:, 0] == -0.3).all()  # away from it
 
 
 def test_a_sector_without_beams_is_free():
