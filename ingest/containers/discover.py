@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import filecmp
 import glob
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -28,6 +30,8 @@ LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
 LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
+_PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
+_ZSTD = re.compile(r"\.zstd?$")
 ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
 
@@ -168,8 +172,9 @@ class BagMetadata:
     custom_data: Metadata | None = None
 
 
-def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str]]:
-    """A bag's storage files in order, and the names that its metadata lists but are missing."""
+def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str], list[str]]:
+    """Return a bag's storage files in order, the names that its metadata lists but that are
+    missing, and in words, which files are copies of others: their messages would count twice."""
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
     storages = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
@@ -182,9 +187,38 @@ def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str
             missing.append(name)
         elif match not in order:
             order.append(match)
-    stems = {re.sub(r"\.zstd?$", "", name) for name in order}
-    rest = [name for name in storages if re.sub(r"\.zstd?$", "", name) not in stems]
-    return [present[name] for name in (*order, *sorted(rest, key=_natural))], missing
+    rest = sorted(storages.keys() - set(order), key=_natural)
+    files: dict[str, Path] = {}  # by name without the ending of compression
+    copies = []
+    for name in (*order, *rest):
+        file, stem = present[name], _ZSTD.sub("", name)
+        same = files.get(stem) or next((one for one in files.values() if _equal(one, file)), None)
+        if same is None:
+            files[stem] = file
+        else:
+            copies.append(f"{name} is a copy of {same.name}: read once")
+    return [*files.values()], missing, copies
+
+
+def _equal(one: Path, other: Path) -> bool:
+    size = one.stat().st_size
+    return 0 < size == other.stat().st_size and filecmp.cmp(one, other, shallow=False)
+
+
+def holes(files: Sequence[Path], *, from_zero: bool) -> list[str]:
+    """Return the names that a bag's files lack by their numbers (`run_0.db3`, `run_2.db3`), which
+    rosbag2 counts from 0. It leaves out the first files if it was told to keep only the last."""
+    series: dict[str, dict[int, str]] = {}
+    for file in files:
+        if part := _PART.fullmatch(file.name):
+            series.setdefault(part[1], {})[int(part[2])] = part[3]
+    return [
+        f"{name}{number}{ending}"
+        for name, parts in series.items()
+        for number in range(0 if from_zero else min(parts), max(parts))
+        for ending in [parts[max(parts)]]
+        if number not in parts
+    ]
 
 
 def _natural(name: str) -> list[int | str]:
@@ -254,7 +288,11 @@ def kind_of(path: Path) -> Kind | Literal["zstd"]:
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", where=where) from error
     if not head:
-        raise RecordingError("an empty file", where=where, remedy="was its copy interrupted?")
+        raise RecordingError(
+            "an empty file",
+            where=where,
+            remedy="was its copy interrupted? `--salvage` reads the other files of a bag",
+        )
     if head.startswith(LFS_MAGIC):
         raise RecordingError(
             "a Git LFS pointer, not the recording itself",

@@ -89,6 +89,7 @@ class _Opening:
         self.storages: list[Storage] = []
         self.kinds: list[str] = []
         self.damage: list[Damage] = []
+        self.missing: list[str] = []  # files that metadata.yaml lists
         self.notes: list[str] = []
         self.cleanup: list[Callable[[], None]] = []
 
@@ -125,10 +126,9 @@ class _Opening:
 
     def _open(self) -> Recording:
         files, metadata = self._files()
-        for file in files:
-            self._open_file(file)
+        files = self._opened(files)
         self._refuse_serialisation(metadata)
-        self._compare(metadata)
+        self._compare(metadata, files)
         recording = Recording(
             *(self.path, self._format(), files, self.storages, self.distro),
             *(self.damage, self.notes, self.cleanup),
@@ -136,6 +136,22 @@ class _Opening:
         )
         recording.watch = self.watch
         return recording
+
+    def _opened(self, files: list[Path]) -> list[Path]:
+        """Open these files; with `salvage`, one of several that cannot be opened is damage."""
+        opened, refused = [], []
+        for file in files:
+            try:
+                self._open_file(file)
+                opened.append(file)
+            except RecordingError as error:
+                if not self.salvage:
+                    raise
+                self.damage.append(Damage(f"{file.name}: {error.what}"))
+                refused.append(error)
+        if not opened:
+            raise refused[0]
+        return opened
 
     def _bag(self) -> tuple[list[Path], BagMetadata]:
         if not discover.is_bag(self.path):
@@ -147,7 +163,7 @@ class _Opening:
         metadata, problem = discover.read_metadata(self.path)
         if problem:
             self.notes.append(problem)
-        files, missing = discover.bag_files(self.path, metadata)
+        files, missing, copies = discover.bag_files(self.path, metadata)
         if not files:
             listed = f"; {METADATA} lists {', '.join(missing)}" if missing else ""
             raise RecordingError(
@@ -155,8 +171,14 @@ class _Opening:
                 where=str(self.path),
                 remedy="copy the whole folder",
             )
-        for name in missing:
-            self.damage.append(Damage(f"{METADATA} lists {name}, which is missing"))
+        self.missing, self.notes = missing, [*self.notes, *copies]
+        lacking = discover.holes(files, from_zero=not metadata.files)
+        if names := [name for name in lacking if name not in missing]:
+            more = f" and {len(names) - 10:,} more" if len(names) > 10 else ""
+            are = "is" if len(names) == 1 else "are"
+            self.damage.append(
+                Damage(f"{', '.join(names[:10])}{more} {are} missing, by the numbers of its files")
+            )
         return files, metadata
 
     def _open_file(self, file: Path, *, inner: bool = False) -> None:
@@ -222,13 +244,26 @@ class _Opening:
                     remedy="`ros2 bag convert` with that middleware installed rewrites it as cdr",
                 )
 
-    def _compare(self, metadata: BagMetadata) -> None:
-        """metadata.yaml's counts are a claim about the files: what it counts and they do not hold
-        is lost; what they hold beyond it is noted."""
+    def _compare(self, metadata: BagMetadata, files: list[Path]) -> None:
+        """Compare metadata.yaml with the files: what it counts and they do not hold is lost, and
+        what they hold beyond it is noted. Names that it lists do not matter if every message is
+        there."""
         counts = Counter[str]()
         for storage in self.storages:
             for channel in storage.channels.values():
                 counts[channel.topic] += storage.counts.get(channel.id, 0)
+        claimed = {visible(t.name): t.messages or 0 for t in metadata.topics if t.name}
+        whole = any(claimed.values()) and all(counts[name] == claimed[name] for name in claimed)
+        for name in self.missing:
+            what = f"{METADATA} lists {name}, which is missing"
+            if whole:
+                self.notes.append(f"{what}; every message that it counts is in the other files")
+            else:
+                self.damage.append(Damage(what))
+        held = [sum(storage.counts.values()) for storage in self.storages]
+        for file, here, later in zip(files, held, range(1, len(held) + 1), strict=True):
+            if not here and any(held[later:]) and not whole:  # rosbag2 begins a file by a message
+                self.damage.append(Damage(f"{file.name} holds no message"))
         for topic in metadata.topics:
             if topic.name is None or topic.messages is None:
                 continue

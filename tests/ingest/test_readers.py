@@ -217,7 +217,7 @@ def test_split_files_are_one_recording(tmp_path: Path) -> None:
     bag = tmp_path / "split"
     bag.mkdir()
     for part in range(3):
-        shutil.copy(write_mcap(tmp_path / "part.mcap", 5), bag / f"split_{part}.mcap")
+        write_mcap(bag / f"split_{part}.mcap", 4 + part)
     assert recordings_in(tmp_path / "split") == [bag]
     with open_recording(bag) as recording:
         assert recording.topics["/odom"].expected == 15
@@ -438,6 +438,10 @@ def test_metadata_is_not_believed(tmp_path: Path) -> None:
     metadata.write_text(text.replace("run.db3", str(outside)))
     with open_recording(bag) as recording:
         assert [file.parent for file in recording.files] == [bag]
+        assert any("secret.db3, which is missing" in note for note in recording.notes)
+        assert not recording.lost_messages
+    metadata.write_text(text.replace("run.db3", str(outside)).replace("count: 20", "count: 21"))
+    with open_recording(bag) as recording:
         assert any(
             "secret.db3, which is missing" in loss.reason for loss in recording.lost_messages
         )
