@@ -23,6 +23,7 @@ from restock.ingest.camera.frames import OFF_CLOCK
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.storage import Watch
+from restock.ingest.lidar_direction import unknown_directions
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
@@ -346,6 +347,7 @@ class _Ingest:
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
         notes = [*self.recording.notes, *self.told.notes, *steps.notes]
+        notes += unknown_directions(self.recording, self.profile)
         notes += [one.told for one in steps.findings if one.repaired]
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(

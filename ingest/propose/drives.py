@@ -178,9 +178,15 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max(drives, key=lambda one: len(one.robot.values))
     clocks = [one.clock for one in driven]
-    # A measured outline before a guess, of guesses the smallest: it had the nearest return.
+    # A measured outline before a guess, then one whose lidar is placed; of guesses the smallest: it
+    # had the nearest return.
     outlined = min(
-        (base, *drives), key=lambda one: (not one.footprint.measured, one.footprint.length_m)
+        (base, *drives),
+        key=lambda one: (
+            not one.footprint.measured,
+            bool(one.footprint.lidar_unplaced or not one.roles["scan"]),
+            one.footprint.length_m,
+        ),
     )
     turned = DriveEvidence.joined([one.turned for one in drives])
     described = base if len(base.robot.values) >= len(described.robot.values) else described

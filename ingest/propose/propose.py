@@ -26,6 +26,7 @@ from restock.ingest.propose.evidence.roles import (
 )
 from restock.ingest.propose.kinds import no_wheeled_robot
 from restock.ingest.propose.proposal_lines import in_one_recording, profile_lines, steered_by
+from restock.ingest.propose.task_lines import lidar_guess
 from restock.ingest.propose.trial import GAIN, UNEVEN, Advice, Trial, try_profile
 from restock.ingest.steps.align import BY_LOG_TIME
 from restock.ingest.steps.aligned_inputs import sideways_notes, sideways_path
@@ -158,6 +159,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
+    if told := lidar_guess(seen.footprint):
+        advice.append(Advice("task.body.lidar_yaw_rad", told.replace("A GUESS", "a guess")))
     if len(seen.lidars) > 1:
         scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)
         advice.append(Advice("inputs.scan", f"the lidars of {scans} are put together"))

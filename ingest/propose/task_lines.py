@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import textwrap
 
 import msgspec
 import numpy as np
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS
+from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, Footprint
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
@@ -138,10 +139,22 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
             else []
         ),
         *(["# Clearance is as from the middle: lidar_at_m of the inputs."] if seen.lidars else []),
+        *(f"# {line}" for line in textwrap.wrap(lidar_guess(footprint), 96)),
         *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
         "",
         *_reward_lines(footprint.width_m),
     ]
+
+
+def lidar_guess(footprint: Footprint) -> str:
+    """Say that the direction of the lidar is a guess; "" where something says which it is."""
+    if not footprint.lidar_unplaced:
+        return ""
+    return (
+        "A GUESS: that the lidar's zero points straight ahead, as no transform places its frame,"
+        f" {footprint.lidar_unplaced}. If it does not, distances ahead are those of another side:"
+        " look at a scan and set lidar_yaw_rad (1.5708: its zero points left)"
+    )
 
 
 def _reward_lines(width_m: float) -> list[str]:

@@ -23,7 +23,7 @@ SHARED = {
     *("state", "stats", "toml", "toml_schema", "words"),
 }
 MAY_IMPORT = {
-    "ingest": "camera containers profile steps store task",
+    "ingest": "camera containers decoding profile steps store task urdf",
     "ingest/decoding": "",
     "ingest/containers": "containers/formats decoding",
     "ingest/containers/formats": "decoding",

@@ -48,6 +48,7 @@ class Footprint:
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
     upside_down: bool = False  # the lidar
+    lidar_unplaced: str = ""  # the frame of its scans, where nothing says which way it points
     measured: bool = True  # False: a guess, though with a reason
     middle_m: tuple[float, float] = (0.0, 0.0)  # of the outline, in the base frame
 

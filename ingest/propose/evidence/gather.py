@@ -81,8 +81,10 @@ from restock.ingest.propose.evidence.scanned_outline import (
     with_lidar,
 )
 from restock.ingest.steps.clocks import STAMP
+from restock.ingest.steps.frames import plain
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.urdf.description import BASE_FRAMES
 
 # Input -> the field without which a topic is of no use for it.
 MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}
@@ -173,6 +175,8 @@ def gather(
         footprint = (outline.footprint(GUESS) if outline else None) or GUESS
     if footprint.lidar_x_m is None and scan is not None:
         footprint = with_lidar(footprint, lidar_place(recording, edges, frame))
+    if footprint.lidar_yaw_rad is None and plain(frame).split("/")[-1] not in BASE_FRAMES:
+        footprint = replace(footprint, lidar_unplaced=plain(frame))
     if scan is not None:
         footprint = moved_in_frame(footprint, scanned[scan])
     lidars = lidars_of(recording, roles["scan"], scanned, edges, footprint)

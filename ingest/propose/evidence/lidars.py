@@ -180,6 +180,7 @@ def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Fo
         lidar_y_m=0.0,
         lidar_yaw_rad=0.0,
         upside_down=False,
+        lidar_unplaced=footprint.lidar_unplaced if len(lidars) == 1 else "",
     )
 
 
