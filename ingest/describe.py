@@ -42,6 +42,7 @@ def describe_recording(
         RecordingError: it cannot be opened; see `open_recording`.
     """
     with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
+        topics = recording.topics  # notes which have several types
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)
@@ -70,7 +71,7 @@ def describe_recording(
                     "qos": offered(recording.qos(topic.name)),
                     **({"clock": compared.get(topic.name)} if clocks else {}),
                 }
-                for topic in recording.topics.values()
+                for topic in topics.values()
             },
             "chunks": [packed._asdict() for packed in recording.packed],
             "attachments": [

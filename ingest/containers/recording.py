@@ -127,8 +127,10 @@ class Recording:
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
-        """Every topic by name, in alphabetical order."""
-        return {name: self._info(name) for name in sorted(self._streams)}
+        """Every topic by name, in alphabetical order. Those of several types are noted."""
+        topics = {name: self._info(name) for name in sorted(self._streams)}
+        self.notes += [note for name in topics if (note := self._several_types(name))]
+        return topics
 
     def _info(self, name: str) -> TopicInfo:
         streams = self._streams[name]
@@ -139,6 +141,34 @@ class Recording:
         except CannotDecode as reason:
             source, skipped = "", str(reason)
         return TopicInfo(name, first.type, expected, first.encoding, source, skipped)
+
+    def _several_types(self, topic: str) -> str | None:
+        """Return which types a topic's messages have, and which are read, if there are several."""
+        counts, read = Counter[str](), set[str]()
+        for stream in self._streams[topic]:
+            name = stream.channel.type
+            counts[name] += stream.storage.counts.get(stream.channel.id, 0)
+            if self._alike(stream, self._streams[topic][0]):
+                read.add(name)
+        if len(counts := +counts) < 2:
+            return None
+        of = [f"{count:,} of {name}" for name, count in counts.items()]
+        of[0] = of[0].replace(" of ", " messages of ", 1)
+        said = f"{topic} has {len(counts)} types: {', '.join(of)}"
+        if counts.keys() <= read:
+            return said
+        return f"{said}: only those of {', '.join(sorted(read))} are read"
+
+    def _alike(self, one: _Stream, other: _Stream) -> bool:
+        """Whether messages of both have the same type, or types of the same fields: ROS 1 has
+        tf/tfMessage and tf2_msgs/TFMessage."""
+        if one.channel.type == other.channel.type:
+            return True
+        try:
+            left, right = self._type(one).leaves(), self._type(other).leaves()
+        except CannotDecode:
+            return False
+        return one.channel.encoding == other.channel.encoding and left == right
 
     def _type(self, stream: _Stream) -> MessageType:
         key = self._storages.index(stream.storage), stream.channel.id
@@ -338,6 +368,7 @@ class Recording:
             for stream in self._streams[topic]:
                 if stream.storage is not storage:
                     continue
+                reading.interleaved |= topic in topics.values()
                 topics[stream.channel.id] = topic
                 try:
                     decoder = self._decoder(topic, stream, reading.paths)
@@ -352,7 +383,7 @@ class Recording:
 
     def _decoder(self, topic: str, stream: _Stream, paths: Sequence[str]) -> Decoder:
         channel, kind = stream.channel, self._type(stream)
-        if channel.type != self.topics[topic].type:
+        if not self._alike(stream, self._streams[topic][0]):
             raise CannotDecode(f"it carries both {self.topics[topic].type} and {channel.type}")
         try:
             leaves = [kind.leaf(path) for path in paths]

@@ -97,6 +97,7 @@ class TopicReading:
         self._publish: GrowingArray | None = None  # None while all are sent when they are logged
         self._fields: dict[str, GrowingArray | GrowingRagged] = {}
         self.decodable = False
+        self.interleaved = False  # channels of one file: each batch has one, the file mixes them
 
     @property
     def paths(self) -> list[str]:
@@ -170,8 +171,9 @@ class TopicReading:
         log = self._log.column()
         fields: dict[str, FieldColumn] = {}
         order = None
-        self._account.log_backsteps = int((log[1:] < log[:-1]).sum())
-        if self._account.log_backsteps:
+        backsteps = int((log[1:] < log[:-1]).sum())
+        self._account.log_backsteps = 0 if self.interleaved else backsteps
+        if backsteps:
             order = np.argsort(log, kind="stable")
             log = log[order]
         publish = log
