@@ -23,7 +23,7 @@ SANDBOX: dict[str, str | bool | int | float | list[str]] = {
     "autoload_known_extensions": False,
     "autoinstall_known_extensions": False,
     "allow_community_extensions": False,
-    "memory_limit": "4GB",
+    "memory_limit": "1GB",
 }
 _REFUSED = {
     "SUBQUERY": "it contains a query: a condition must be one expression over the steps",
@@ -43,7 +43,9 @@ _MORE_MACROS = {
 _GROWING = {
     *("repeat", "list_repeat", "array_repeat", "range", "generate_series", "generate_subscripts"),
     *("lpad", "rpad", "bar", "list_resize", "array_resize", "printf", "format", "factorial"),
+    "bitstring",
 }
+_MORE_ROWS = {"unnest", "unlist"}
 # Of a zone that is given, or fixed as it is here.
 _OF_ZONES = {"timezone", "make_timestamptz"}
 _ZONED = {"TIMESTAMP WITH TIME ZONE", "TIMESTAMPTZ_NS"}
@@ -139,6 +141,8 @@ def _refuse(part: dict[str, Any], timing: str) -> str | None:
         return _REFUSED[kind]
     if kind == "FUNCTION" and part["function_name"].lower() in _GROWING:
         return f"{part['function_name']}() can use unlimited memory: it is not allowed here"
+    if kind == "FUNCTION" and part["function_name"].lower() in _MORE_ROWS:
+        return f"{part['function_name']}() makes several rows of one: it is not allowed here"
     if kind in ("FUNCTION", "WINDOW") and part["function_name"].lower() in _outside():
         return f"{part['function_name']}() reads data other than the steps: it is not allowed here"
     if kind == "COLUMN_REF" and part["column_names"][-1].lower() in _outside():

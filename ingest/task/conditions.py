@@ -35,9 +35,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
-from typing import Any, Literal
+import threading
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, Literal, NoReturn
 
 import duckdb
 import msgspec
@@ -46,7 +48,7 @@ import pyarrow as pa
 
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
-from restock.ingest.task.condition_sql import WINDOW, refusal, sandbox, select_of
+from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, sandbox, select_of
 from restock.ingest.task.signals import LIDAR_SIGNALS
 from restock.toml import Checked
 
@@ -56,6 +58,8 @@ Expression = Literal["sql", "probability"]  # of a condition
 Columns = dict[tuple[str, Expression], pa.ChunkedArray]  # by the condition's name
 NOMINAL = "nominal"
 _LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
+# What conditions may take on a recording: those that Restock brings take a thirtieth of it a step.
+LIMIT_S, LIMIT_S_PER_STEP = 60.0, 0.001
 NO_LIDAR = "no lidar"  # why a condition is unknown
 
 
@@ -298,21 +302,43 @@ def _evaluate(
     with sandbox().cursor() as connection:
         numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
         connection.register("steps", numbered)
+        limit_s = LIMIT_S + len(steps) * LIMIT_S_PER_STEP
+        began = time.monotonic()
         for several in together.values():
+            left_s = max(limit_s - (time.monotonic() - began), 0.0)
             try:
-                columns |= _query(connection, several)
-            except duckdb.Error:
+                columns |= _query(connection, several, len(steps), left_s)
+            except duckdb.Error as together_error:
                 for condition, part in several:  # again one by one, to say which
                     try:
-                        _query(connection, [(condition, part)])
+                        _query(connection, [(condition, part)], len(steps), limit_s / len(asked))
                     except duckdb.Error as error:
-                        raise ConfigError(
-                            f"its SQL fails on the steps: {_first_line(error)}",
-                            where=_where(condition, part),
-                            remedy=f"the steps have the columns {', '.join(steps.column_names)}",
-                        ) from error
-                raise
+                        _say_why(error, steps, _where(condition, part), limit_s)
+                names = ", ".join(repr(condition.name) for condition, _ in several)
+                _say_why(together_error, steps, f"the conditions {names}", limit_s)
     return columns
+
+
+def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -> NoReturn:
+    """Raise what DuckDB says of a condition's SQL as a ConfigError."""
+    if isinstance(error, duckdb.InterruptException):
+        raise ConfigError(
+            f"its SQL takes too long: the conditions may take {limit_s:.0f} s on"
+            f" {len(steps):,} steps",
+            where=where,
+            remedy="make it simpler, or shorten what its windows look at",
+        ) from error
+    if isinstance(error, duckdb.OutOfMemoryException):
+        raise ConfigError(
+            f"its SQL takes more memory than conditions may ({SANDBOX['memory_limit']})",
+            where=where,
+            remedy="make the values that it computes smaller, or shorten what its windows look at",
+        ) from error
+    raise ConfigError(
+        f"its SQL fails on the steps: {_first_line(error)}",
+        where=where,
+        remedy=f"the steps have the columns {', '.join(steps.column_names)}",
+    ) from error
 
 
 def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> None:
@@ -359,15 +385,48 @@ def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition
 
 
 def _query(
-    connection: duckdb.DuckDBPyConnection, asked: Sequence[tuple[Condition, Expression]]
+    connection: duckdb.DuckDBPyConnection,
+    asked: Sequence[tuple[Condition, Expression]],
+    count: int,
+    limit_s: float,
 ) -> Columns:
-    """Expressions of conditions that select from the same."""
+    """Expressions of conditions that select from the same, one value for each of `count` steps.
+
+    Raises:
+        duckdb.Error: they do not run, give another number of values, or take longer than they may.
+    """
     columns = ",\n".join(
         f"({getattr(condition, part)}\n) AS column_{place}"
         for place, (condition, part) in enumerate(asked)
     )
-    rows = connection.sql(select_of(columns, _source(asked[0][0]))).to_arrow_table()
+    query = select_of(f"{columns},\nrow_", _source(asked[0][0]))
+    with _interrupted_after(connection, limit_s):
+        rows = connection.sql(query).to_arrow_table()
+    if not np.array_equal(rows["row_"].to_numpy(), np.arange(count)):
+        raise duckdb.InvalidInputException(
+            f"it gives {len(rows):,} values, not one for each of the {count:,} steps"
+        )
     return {(c.name, part): rows.column(place) for place, (c, part) in enumerate(asked)}
+
+
+@contextmanager
+def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) -> Iterator[None]:
+    """Interrupt what the connection does in the block once it takes longer."""
+    done = threading.Event()
+
+    def interrupt() -> None:
+        wait_s = limit_s
+        while not done.wait(wait_s):
+            connection.interrupt()  # again and again: an idle connection takes no notice
+            wait_s = 0.1
+
+    thread = threading.Thread(target=interrupt, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()  # or it would interrupt the query after this one
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:

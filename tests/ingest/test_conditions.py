@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
+from restock.ingest.task import condition_sql, conditions
 from restock.ingest.task.condition_files import shipped
+from restock.ingest.task.condition_sql import refusal
 from restock.ingest.task.conditions import Condition, label, labels_version, let_values, primary
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Noise
@@ -291,6 +293,49 @@ def test_a_condition_that_does_not_run_is_named():
     assert "clearance_m" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "sql",
+    ["unnest([true, false])", "unnest(if(step_index = 1, [true, false], if(bumped, [], [true])))"],
+)
+@pytest.mark.parametrize("let", [False, True])
+def test_a_condition_gives_one_value_a_step_in_their_order(monkeypatch, sql, let):
+    """Whatever functions DuckDB has that make several rows of one, or none."""
+    monkeypatch.setattr(condition_sql, "_MORE_ROWS", set())
+    refusal.cache_clear()
+    bumped = [False, False, True, False]  # so that the second one gives as many values as steps
+    good = Condition("good", "pre", "bumped")
+    bad = Condition("bad", "pre", "made" if let else sql, let={"made": sql} if let else {})
+    table = steps(4, bumped=np.array(bumped))
+    assert label(table, [good])["good"].tolist() == bumped
+    with pytest.raises(ConfigError, match="condition 'bad'.*gives .* for each of the 4 steps"):
+        label(table, [good, bad])
+    refusal.cache_clear()
+
+
+def doubled(times: int) -> dict[str, str]:
+    """A text that gets twice as long with each name."""
+    first = {"text_0": "'x' || clearance_m::VARCHAR"}
+    return first | {f"text_{n + 1}": f"text_{n} || text_{n}" for n in range(times)}
+
+
+def test_a_condition_that_takes_too_long_is_stopped_and_named(monkeypatch):
+    monkeypatch.setattr(conditions, "LIMIT_S", 0.5)
+    monkeypatch.setattr(conditions, "LIMIT_S_PER_STEP", 0.0)
+    sql = "length(regexp_replace(text_11, '[0-9]+', 'y', 'g')) < 0"
+    slow = Condition("slow", "pre", sql, let=doubled(11))
+    with pytest.raises(
+        ConfigError, match="condition 'slow': its SQL takes too long.* 20,000 steps"
+    ):
+        label(steps(20_000), [Condition("good", "pre", "true"), slow])
+    assert label(steps(3), [slow])["slow"].tolist() == [False] * 3
+
+
+def test_a_condition_that_takes_too_much_memory_is_named():
+    large = Condition("large", "pre", "length(text_26) > 1", let=doubled(26))
+    with pytest.raises(ConfigError, match=r"condition 'large': its SQL takes more memory .*1GB"):
+        label(steps(200), [Condition("good", "pre", "true"), large])
+
+
 REFUSED = {
     "(SELECT count(*) FROM read_text('/etc/passwd')) > 0": "it contains a query",
     "EXISTS (FROM duckdb_settings())": "it contains a query",
@@ -305,6 +350,9 @@ REFUSED = {
     "sleep_ms(100000) IS NULL": "reads data other than the steps",
     "length(repeat('x', 4000000000)) > 1": "can use unlimited memory",
     "len(range(3000000000)) > 1": "can use unlimited memory",
+    "bit_count(bitstring('1', 2000000000)) > 1": "can use unlimited memory",
+    "unnest([true, false, true])": "makes several rows of one",
+    "UNLIST([clearance_m > 1])": "makes several rows of one",
     "pg_get_viewdef('x') = 'x'": "reads data other than the steps",
     "ATTACH 'x.db'": "fails on the steps",
     "COPY steps TO 'x.csv'": "syntax error",
