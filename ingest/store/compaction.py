@@ -9,7 +9,7 @@ same files for no conflict, and a replaced recording's rows would be there twice
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ import pyarrow as pa
 from restock.errors import StoreError
 from restock.ingest.store.commits import ATTEMPTS, delta_columns, recording_columns
 from restock.ingest.store.data_files import merge, parquet_options, written_whole
-from restock.ingest.store.lineage import Ingest, StoredFile, own_path
+from restock.ingest.store.lineage import Ingest, StoredFile, changed_by_others, own_path
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.summary import VERSION, summarised
 from restock.ingest.store.writer import StoreWriter
@@ -40,7 +40,7 @@ class Compacted:
     files_after: int = 0  # of those: what other writers added meanwhile is not counted
     manifests_before: int = 0  # files of manifests
     manifests_after: int = 0
-    summaries: int = 0  # of recordings that had none, or an older Restock's
+    summaries: int = 0  # of recordings that had none, an older Restock's, or one of other rows
     changed_meanwhile: int = 0  # files that another writer replaced before they were done
     version: int | None = None  # of the store's transitions, where they were written
 
@@ -54,21 +54,27 @@ def compact(store: StoreWriter, *, dry_run: bool = False) -> Compacted:
     store.expect_store()
     done = Compacted()
     groups = list(_groups(store))
-    done.files_before = done.files_after = len(store.files(TRANSITIONS))
+    files = store.files(TRANSITIONS)
+    done.files_before = done.files_after = len(files)
+    changed = _changed(store, files)
     if dry_run:
         done.rows = sum(file.rows for group in groups for file in group)
         done.files_after -= sum(len(group) - 1 for group in groups)
         if store.path.has_table(RECORDINGS):
-            _Fold.of(store).count(done)
+            _Fold.of(store, changed).count(done)
         return done
-    for group in groups:  # first: where one is damaged, the manifests stay as they are
+    if changed:  # first: once their files are Restock's own, the summaries are taken for true
+        fold(store, done, changed)
+    for group in groups:  # else first: where one is damaged, the manifests stay as they are
         _merge_rows(store, group, done)
-    fold(store, done)
+    if not changed:
+        fold(store, done)
     return done
 
 
-def fold(store: StoreWriter, done: Compacted | None = None) -> None:
-    """Make one file of the manifests of all recordings, with summaries of those that lack them.
+def fold(store: StoreWriter, done: Compacted | None = None, changed: Collection[str] = ()) -> None:
+    """Make one file of the manifests of all recordings, with summaries of those that lack them, and
+    of the ingests whose rows another tool `changed`.
 
     Manifests whose rows are not there yet, those of replaced rows, and files that have many already
     stay as they are.
@@ -79,7 +85,7 @@ def fold(store: StoreWriter, done: Compacted | None = None) -> None:
         return
     store.create(RECORDINGS, recording_columns())
     for _ in range(ATTEMPTS):
-        plan = _Fold.of(store)
+        plan = _Fold.of(store, changed)
         if not plan.worth_it:
             break
         _summarise(store, [one for one in plan.lacking if one.ingest_id not in made], made)
@@ -88,7 +94,9 @@ def fold(store: StoreWriter, done: Compacted | None = None) -> None:
         plain = [one for one in plan.live if one.ingest_id not in made]
         live = {one.ingest_id for one in plan.live}
         extra = [manifest for ingest_id, manifest in made.items() if ingest_id in live]
-        one = merge(store.path, RECORDINGS, plan.chosen, plain, schema, extra=extra)
+        one = merge(
+            store.path, RECORDINGS, plan.chosen, plain, schema, extra=extra, summarised=True
+        )
         paths = {file.path for file in plan.chosen}
         if store.replace_files(RECORDINGS, paths, [one], OPERATION) is not None:
             break
@@ -117,16 +125,17 @@ class _Fold:
     files: int
     chosen: list[StoredFile]
     live: list[Ingest]
-    lacking: list[Ingest]  # of these, those that have no summary of this version
+    lacking: list[Ingest]  # of these, those that have no summary of this version, and true
 
     @classmethod
-    def of(cls, store: StoreWriter) -> _Fold:
+    def of(cls, store: StoreWriter, changed: Collection[str]) -> _Fold:
         shown = {one.ingest_id for one in store.shown()}
         files = store.files(RECORDINGS)
         live = [one for file in files for one in file.ingests if one.ingest_id in shown]
         names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
         told = store.manifests(live, names).to_pylist()
         current = {one["ingest_id"] for one in told if one["summary_version"] == VERSION}
+        current -= set(changed)
 
         chosen = []
         for file in files:
@@ -179,9 +188,19 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
             store.path.write(kept, path, **parquet_options(kept.schema))
 
 
+def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
+    """The ingests of these files whose rows are not those that their manifests describe."""
+    names = pa.schema([("ingest_id", pa.string()), ("transitions", pa.int64())])
+    told = store.manifests([one for file in files for one in file.ingests], names)
+    written = dict(zip(*(told[name].to_pylist() for name in names.names), strict=True))
+    return set(changed_by_others(files, written))
+
+
 def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
-    """Files of transitions to make one of, robot by robot in the order of their time."""
-    small = [file for file in store.files(TRANSITIONS) if file.rows < FILE_ROWS / 2]
+    """Files of transitions to make one of, robot by robot in the order of their time; one that
+    another tool wrote may be alone."""
+    files = store.files(TRANSITIONS)
+    small = [file for file in files if file.rows < FILE_ROWS / 2 or not file.listed]
     names = ("ingest_id", "tags", "start_stamp_ns")
     schema = pa.schema([field for field in recording_schema() if field.name in names])
     told = store.manifests([one for file in small for one in file.ingests], schema)
@@ -195,12 +214,16 @@ def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
         key=lambda f: min((driven.get(i.ingest_id, ("", 0)) for i in f.ingests), default=("", 0)),
     ):
         if group and sum(one.rows for one in group) + file.rows > FILE_ROWS:
-            if len(group) >= LEAST_FILES:
+            if _worth_it(group):
                 yield group
             group = []
         group.append(file)
-    if len(group) >= LEAST_FILES:
+    if _worth_it(group):
         yield group
+
+
+def _worth_it(group: Sequence[StoredFile]) -> bool:
+    return len(group) >= LEAST_FILES or any(not file.listed for file in group)
 
 
 def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted) -> None:
@@ -210,7 +233,7 @@ def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted
         before = held.get(one.ingest_id)
         held[one.ingest_id] = one._replace(rows=one.rows + (before.rows if before else 0))
     schema = pa.schema(store.path.open_table(TRANSITIONS).schema().to_arrow())
-    made = merge(store.path, TRANSITIONS, group, list(held.values()), schema)
+    made = merge(store.path, TRANSITIONS, group, list(held.values()), schema, summarised=True)
     paths = {file.path for file in group}
     version = store.replace_files(TRANSITIONS, paths, [made], OPERATION)
     if version is None:

@@ -83,12 +83,14 @@ def merge(
     schema: pa.Schema,
     *,
     extra: Sequence[pa.Table] = (),
+    summarised: bool = False,
 ) -> AddedFile:
     """One file of what these files of a table hold of some ingests, in their order, and of `extra`
     manifests.
 
-    A row group at a time is in memory. Columns of `schema` that a file lacks are null. What is
-    written is deleted where that fails.
+    What it holds is listed in it if the manifests describe these rows: Restock wrote the files, or
+    all that others changed in them is `summarised` again. A row group at a time is in memory.
+    Columns of `schema` that a file lacks are null. What is written is deleted where that fails.
 
     Raises:
         StoreError: a file is missing or damaged, or it cannot be written.
@@ -96,7 +98,8 @@ def merge(
     wanted = pa.array([one.ingest_id for one in kept], pa.string())
     rows = [(one["recording_id"][0].as_py(), one["ingest_id"][0].as_py()) for one in extra]
     held = [*kept, *(Ingest(*ids, 1) for ids in rows)]
-    schema = schema.with_metadata({INGESTS: packed_ingests(held)})
+    listed = summarised or all(file.listed for file in files)
+    schema = schema.with_metadata({INGESTS: packed_ingests(held)} if listed else None)
     made = AddedFile("", compacted_name(), 0)
     with (
         written_whole(place, f"{name}/{made.path}"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -49,6 +49,7 @@ class StoredFile:
     bytes: int
     added_ms: int
     ingests: tuple[Ingest, ...]
+    listed: bool = True  # whether Restock wrote it, and says in it or by its name what it holds
 
     @property
     def own(self) -> bool:
@@ -70,14 +71,39 @@ def stored_files(
         StoreError: one is of another kind, or it cannot be read.
     """
     adds = [one for one in active_files(table) if one[0] not in without]
-    held = {path: one for path, rows, *_ in adds if (one := _named(path, rows))}
+    held: dict[str, tuple[tuple[Ingest, ...], bool]] = {
+        path: (one, True) for path, rows, *_ in adds if (one := _named(path, rows))
+    }
     others = [path for path, *_ in adds if path not in held]
     with ThreadPoolExecutor(READERS) as pool:
         held |= zip(others, pool.map(lambda path: _read(place, name, path), others), strict=True)
     return [
-        StoredFile(path, sum(one.rows for one in held[path]), size or 0, added_ms or 0, held[path])
+        StoredFile(
+            path, sum(one.rows for one in ingests), size or 0, added_ms or 0, ingests, listed
+        )
         for path, _, size, added_ms in adds
+        for ingests, listed in (held[path],)
     ]
+
+
+def changed_by_others(files: Iterable[StoredFile], written: Mapping[str, int]) -> dict[str, int]:
+    """How many rows each ingest has whose rows need not be those that Restock wrote, which its
+    manifest describes: another tool wrote their file, or their number is another.
+
+    `written` is the number of rows by ingest, as the manifests say.
+    """
+    rows: Counter[str] = Counter()
+    others: set[str] = set()
+    for file in files:
+        for one in file.ingests:
+            rows[one.ingest_id] += one.rows
+            if not file.listed:
+                others.add(one.ingest_id)
+    return {
+        ingest_id: count
+        for ingest_id, count in rows.items()
+        if ingest_id in others or count != written.get(ingest_id, count)
+    }
 
 
 def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, int | None]]:
@@ -94,7 +120,9 @@ def held_by(place: Location, name: str, path: str) -> StoredFile:
     """A file of a table that need not be active, with what it holds. Raises as `stored_files`."""
     with damage_named(place, f"{name}/{path}"), place.reading(f"{name}/{path}") as source:
         rows = open_parquet(source).metadata.num_rows
-    return StoredFile(path, rows, 0, 0, _named(path, rows) or _read(place, name, path))
+    if own := _named(path, rows):
+        return StoredFile(path, rows, 0, 0, own)
+    return StoredFile(path, rows, 0, 0, *_read(place, name, path))
 
 
 @contextmanager
@@ -161,12 +189,15 @@ def _named(path: str, rows: int | None) -> tuple[Ingest, ...] | None:
 
 
 @lru_cache(maxsize=4096)  # files never change
-def _read(place: Location, name: str, path: str) -> tuple[Ingest, ...]:
+def _read(place: Location, name: str, path: str) -> tuple[tuple[Ingest, ...], bool]:
+    """What a file holds, and whether Restock listed it there."""
     where = f"{name}/{path}"
     with damage_named(place, where), place.reading(where) as source:
         file = open_parquet(source)
         if said := (file.schema_arrow.metadata or {}).get(INGESTS):
-            return tuple(Ingest(*one) for one in json.loads(said))
+            listed = tuple(Ingest(*one) for one in json.loads(said))
+            if sum(one.rows for one in listed) == file.metadata.num_rows:
+                return listed, True
         counts: Counter[tuple[str | None, str | None]] = Counter()
         if set(_COLUMNS) <= set(file.schema_arrow.names):
             for batch in file.iter_batches(columns=list(_COLUMNS)):
@@ -184,4 +215,4 @@ def _read(place: Location, name: str, path: str) -> tuple[Ingest, ...]:
             where=str(place),
             remedy="restore the version before it was added",
         )
-    return tuple(held)
+    return tuple(held), False

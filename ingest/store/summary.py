@@ -117,7 +117,10 @@ SUMMARY_SCHEMA = pa.schema(
 
 
 def summarised(manifest: pa.Table, rows: pa.Table) -> pa.Table:
-    """A manifest row with the summary of its recording's rows."""
+    """A manifest row with the summary of its recording's rows, and their number."""
+    place = manifest.schema.get_field_index("transitions")
+    count = pa.array([len(rows)], manifest.schema.field(place).type)
+    manifest = manifest.set_column(place, manifest.schema.field(place), count)
     hashes, at = distinctive(rows)
     values: dict[str, Any] = {
         "summary_version": VERSION,

@@ -21,7 +21,13 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import QueryError, StoreError, expect
-from restock.ingest.store.lineage import Ingest, ingests_table, stored_files
+from restock.ingest.store.lineage import (
+    Ingest,
+    StoredFile,
+    changed_by_others,
+    ingests_table,
+    stored_files,
+)
 from restock.ingest.store.location import FRAMES, RECORDINGS, TRANSITIONS, Location
 from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.summary import VERSION as SUMMARY_VERSION
@@ -65,7 +71,8 @@ class Store:
         memory_limit: what DuckDB may hold in memory, e.g. "4GB"; default DuckDB's own (80 %).
 
     `version` is of the transitions table, `files` the Parquet files of each table, `bare` the
-    connection with those views only that a query has named.
+    connection with those views only that a query has named, `changed_by_others` the ingests whose
+    rows another tool may have changed: while there are any, no summary is used.
 
     Raises:
         StoreError: nothing there, not a store, no such version, or it cannot be reached.
@@ -111,6 +118,7 @@ class Store:
             )
             self.files = {one.view: one.addresses for one in (self._recordings, self._transitions)}
             self._manifests = self._recordings.read()
+            self.changed_by_others = self._count_changed(held)
             self._present_all(self.bare, "main")
             self._frames().present(self.bare)
         except StoreError as error:
@@ -294,13 +302,26 @@ class Store:
         finally:
             connection.execute("USE main")
 
+    def _count_changed(self, held: Sequence[StoredFile]) -> list[str]:
+        """The ingests whose rows are not known to be those that their manifests describe, which
+        get the number of rows that Delta's log says."""
+        ids, place = self._manifests["ingest_id"], self._manifests.column_names.index("transitions")
+        written = dict(zip(ids.to_pylist(), self._manifests[place].to_pylist(), strict=True))
+        changed = changed_by_others(held, written)
+        if changed:
+            counts = [(written | changed)[one] for one in ids.to_pylist()]
+            column = pa.array(counts, self._manifests[place].type)
+            self._manifests = self._manifests.set_column(place, "transitions", column)
+        return sorted(changed)
+
     def _present_summaries(self) -> bool:
-        """`stored_summaries`, where every manifest has one; else rows are scanned."""
+        """`stored_summaries`, where every manifest has one and no other tool changed rows; else
+        rows are scanned."""
         versions = self._manifests["summary_version"].to_pylist()
         told = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
         summarised = {ingest_id for ingest_id, version in told if version == SUMMARY_VERSION}
         held = self._ingests["ingest_id"].to_pylist()
-        if not held or not summarised.issuperset(held):
+        if not held or self.changed_by_others or not summarised.issuperset(held):
             return False
         self._summaries.present(self.bare)
         return True

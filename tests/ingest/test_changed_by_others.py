@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -160,8 +161,51 @@ def test_rows_that_another_tool_changed_are_read_replaced_and_joined(store, way)
     writer.write(*one(1, "b"))  # writes the others of its file again
     compact(writer)
     assert writer.rows(f"{2:016x}", f"{2:016x}-a").equals(kept)
+    with Store(store) as opened:
+        assert opened.changed_by_others == []
     writer.remove_recordings({f"{3:016x}": f"{3:016x}-a"}, "remove")
     assert shown(store) == {
         f"{1:016x}-b": len(one(1, "b")[1]),
         f"{2:016x}-a": expected[f"{2:016x}-a"],
     }
+
+
+def same_as_rows(store: Path) -> None:
+    """Views that may come from summaries say what DuckDB finds in the table's active files."""
+    files = DeltaTable(str(store / TRANSITIONS)).file_uris()
+    rows, rewards, zones = duckdb.sql(
+        "SELECT count(*), sum(reward), list(DISTINCT zone ORDER BY zone)"
+        f" FROM read_parquet({files}, union_by_name = true)"
+    ).fetchall()[0]
+    with Store(store) as opened:
+        said = opened.sql(
+            "SELECT sum(primary_rows), (SELECT sum(steps) FROM episodes),"
+            " (SELECT sum(transitions) FROM recordings), list(DISTINCT zone ORDER BY zone)"
+            " FROM coverage"
+        ).fetchall()
+        returns = opened.sql("SELECT sum(return) FROM episodes").fetchall()[0][0]
+    assert said == [(rows, rows, rows, zones)]
+    assert returns == pytest.approx(rewards)
+
+
+@pytest.mark.parametrize("way", ["deleted", "updated", "merged"])
+def test_summaries_never_outvote_the_rows(store, capsys, way):
+    """An update changes no number of rows."""
+    changed(store, way)
+    if way == "updated":
+        table = DeltaTable(str(store / TRANSITIONS))
+        table.update(updates={"reward": "-1.0", "zone": "'moved'"}, predicate="action = 2")
+    same_as_rows(store)
+    with Store(store) as opened:
+        changes = len(opened.changed_by_others)
+    assert changes == (1 if way == "merged" else 2)
+    assert cli.main(["doctor", str(store), "--json"]) == 0
+    assert f"not used: another tool may have changed {changes} recording" in capsys.readouterr().out
+    StoreWriter(store).write(*one(1, "b"))  # of a file that has another recording's, too
+    same_as_rows(store)
+    assert compact(StoreWriter(store)).summaries == (0 if way == "merged" else 1)
+    with Store(store) as opened:
+        assert opened.changed_by_others == []
+        assert "cells" in str(opened.sql("EXPLAIN FROM coverage").fetchall())
+    same_as_rows(store)
+    assert not compact(StoreWriter(store)).summaries

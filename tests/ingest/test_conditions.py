@@ -307,7 +307,7 @@ def test_a_condition_gives_one_value_a_step_in_their_order(monkeypatch, sql, let
     bad = Condition("bad", "pre", "made" if let else sql, let={"made": sql} if let else {})
     table = steps(4, bumped=np.array(bumped))
     assert label(table, [good])["good"].tolist() == bumped
-    with pytest.raises(ConfigError, match="condition 'bad'.*gives .* for each of the 4 steps"):
+    with pytest.raises(ConfigError, match=r"condition 'bad'.*gives .* for each of the 4 steps"):
         label(table, [good, bad])
     refusal.cache_clear()
 
@@ -324,7 +324,7 @@ def test_a_condition_that_takes_too_long_is_stopped_and_named(monkeypatch):
     sql = "length(regexp_replace(text_11, '[0-9]+', 'y', 'g')) < 0"
     slow = Condition("slow", "pre", sql, let=doubled(11))
     with pytest.raises(
-        ConfigError, match="condition 'slow': its SQL takes too long.* 20,000 steps"
+        ConfigError, match=r"condition 'slow': its SQL takes too long.* 20,000 steps"
     ):
         label(steps(20_000), [Condition("good", "pre", "true"), slow])
     assert label(steps(3), [slow])["slow"].tolist() == [False] * 3

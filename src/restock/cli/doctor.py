@@ -21,6 +21,7 @@ from restock.cli.failures import GL, NO_GL
 from restock.errors import ExitCode, RestockError
 from restock.files import cores
 from restock.imports import install_command
+from restock.words import counted, quoted
 
 EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 FOR_DEVELOPERS = {"dev", "test", "site", "fuzz", "bench"}
@@ -175,9 +176,16 @@ def _store(path: str) -> list[Finding]:
             files = len(store.files["stored_transitions"])
             holds = f"{counts['transitions']:,} transitions of {counts['recordings']:,} recordings"
             files_are = f"{files:,} Parquet files"
-            return [
+            found = [
                 Finding("store", "version", "ok", f"{store.version}, opened in {opened:.2f} s"),
                 Finding("store", "rows", "ok", f"{holds} in {files_are}"),
             ]
+            if changed := len(store.changed_by_others):
+                what = f"not used: another tool may have changed {counted(changed, 'recording')}"
+                remedy = (
+                    f"rows are counted instead; `restock compact {quoted(path)}` makes new ones"
+                )
+                found.append(Finding("store", "summaries", "ok", what, remedy))
+            return found
     except RestockError as error:
         return [Finding("store", "rows", "wrong", error.what, error.remedy or "")]

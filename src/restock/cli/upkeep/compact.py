@@ -75,7 +75,10 @@ class CompactCommand:
             output.say(f"manifests: {manifests}")
         if done.summaries:
             get = "would get" if self.dry_run else "got"
-            output.say(f"{counted(done.summaries, 'recording')} {get} a summary, having none yet")
+            output.say(
+                f"{counted(done.summaries, 'recording')} {get} a summary, having none of the rows"
+                " as they are"
+            )
         if done.changed_meanwhile:
             output.say(
                 f"{done.changed_meanwhile:,} files stayed as they were: other writers changed some"
