@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib.resources import files
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import duckdb
 
@@ -78,7 +78,8 @@ _VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 class Definitions:
     """The views and macros of one connection over `stored_transitions`, `stored_recordings` and
-    `stored_ingests`: which ingests there are, so that no row is scanned for it.
+    `stored_ingests`: which ingests there are, so that no row is scanned for it. They last for as
+    long as the object does.
 
     Args:
         connection: that of a store.
@@ -107,7 +108,7 @@ class Definitions:
         self._replaced[("same_drives",)] = partial(install_same_drives, connection)
         self._made: set[str] = set()
         self._held: list[str] = []
-        _OF[connection] = self
+        _OF[connection] = ref(self)
 
     def make(self, text: str) -> None:
         """Those that a text names, or all of them where it asks what there is."""
@@ -173,19 +174,25 @@ class Definitions:
             )
 
 
-_OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, Definitions] = WeakKeyDictionary()
+# Weakly both ways: they hold their store, and with it the connection.
+_OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDictionary()
+
+
+def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
+    made = _OF.get(connection)
+    return made and made()
 
 
 def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
     """Make what a text names, on a store's connection; a run's or a panel's has all it has."""
-    if (made := _OF.get(connection)) is not None:
+    if (made := _of(connection)) is not None:
         made.make(text)
 
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
     """Views of a store as tables in memory, for as long as these queries follow."""
-    made = _OF.get(connection)
+    made = _of(connection)
     if made is None:
         yield
         return
@@ -223,7 +230,7 @@ def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
 
 def install_every(connection: duckdb.DuckDBPyConnection) -> bool:
     """Make all there are; False for a connection that is not a store's."""
-    made = _OF.get(connection)
+    made = _of(connection)
     if made is not None:
         made.make_all()
     return made is not None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -470,3 +472,16 @@ def test_a_store_may_lie_in_a_folder_with_spaces_and_umlauts(tmp_path: Path) -> 
     with Store(path) as store:
         ((rows,),) = store.sql("SELECT count(*) FROM transitions").fetchall()
     assert rows > 0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_store_is_freed_with_its_threads(tmp_path, closed):
+    StoreWriter(tmp_path / "s").write(*one(1))
+    store = Store(tmp_path / "s")
+    store.sql("SHOW TABLES").fetchall()  # makes every view, macro and function
+    if closed:
+        store.close()
+    left = [weakref.ref(store), weakref.ref(store.bare)]
+    del store
+    gc.collect()
+    assert [one_left() for one_left in left] == [None, None]

@@ -25,6 +25,7 @@ from restock.replay.store.definitions import Definitions
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 
+_kept: list[Definitions] = []
 _summaries: dict[bytes, pa.Table] = {}  # manifests with their summaries, of `summarised_once`
 
 TASK = Task(
@@ -68,6 +69,7 @@ def recording_transitions(
         "episode_id": [f"{recording_id}/{index}" for index in episode],
         "episode_index": episode,
         "step_index": step,
+        "logged_ns": pa.nulls(rows, pa.int64()),
         "observation": list(observation),
         "next_observation": list(after.astype(np.float32)),
         "action": rng.integers(0, len(task.actions), rows),
@@ -201,7 +203,9 @@ def views_over(
             " CREATE TABLE stored_ingests AS SELECT recording_id, ingest_id, count(*) AS rows,"
             " recording_id || '/' || ingest_id || '.parquet' AS file FROM given GROUP BY ALL"
         )
-    return Definitions(connection, observation_type)
+    made = Definitions(connection, observation_type)
+    _kept.append(made)  # as a store keeps its own
+    return made
 
 
 @lru_cache(64)
