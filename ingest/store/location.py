@@ -51,6 +51,7 @@ DEFAULT_REGION = "us-east-1"  # servers that are not Amazon's have none, and are
 # pathlib folds the two slashes of an address into one.
 _S3 = re.compile(r"s3a?:/{1,2}(?P<bucket>[^/]+)/?(?P<prefix>.*)")
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/")
+_SECRET = re.compile(r"(?s)[A-Za-z][A-Za-z0-9+.-]+:/{1,2}[^/@]*:.*@")
 _ENCODED = re.compile(r"%[0-9A-Fa-f]{2}")
 _DENIED = re.compile(r"(?s)(?:operation on (?P<file>/[^\n\x1b]*).*)?Permission denied")  # delta-rs
 # What a server or a client says -> what it means, and what to do.
@@ -87,7 +88,8 @@ class Location:
         """The place that a path or an address names.
 
         Raises:
-            StoreError: an address of another kind, or a path where Delta cannot have a table.
+            StoreError: an address of another kind or with a secret in it, or a path where Delta
+                cannot have a table.
         """
         if isinstance(place, Location):
             return place
@@ -97,6 +99,13 @@ class Location:
             raise StoreError(
                 "the name of the store is empty",
                 remedy="give a folder, or s3://bucket/prefix: is a variable not set?",
+            )
+        if _SECRET.match(text):
+            raise StoreError(
+                "a store's address must not hold a key and its secret",
+                where=f"{text.partition(':')[0]}://***:***@{text.rpartition('@')[2]}",
+                remedy="give the address without them, and set AWS_ACCESS_KEY_ID and"
+                " AWS_SECRET_ACCESS_KEY; make a new secret if others can read this line",
             )
         on_s3 = _S3.fullmatch(text)
         if not on_s3 and (scheme := _SCHEME.match(text)):

@@ -27,6 +27,10 @@ T = TypeVar("T")
 _STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # of a message's path, and what follows it
 
 
+MAX_DEPTH = 64  # of tables and arrays in each other
+_DEEP_KEY = re.compile(rf"""(?<![\w"'.-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_DEPTH},}}""")
+
+
 class ValueRefused(ConfigError, ValueError):
     """A value that a struct refuses. A ValueError too, which msgspec gives the key in a file."""
 
@@ -73,12 +77,24 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
     """The values of a TOML text; `where` names it in errors.
 
     Raises:
-        ConfigError: it is not TOML.
+        ConfigError: it is not TOML, or nested too deep for what reads its values.
     """
+    too_deep = ConfigError(f"is nested more than {MAX_DEPTH} levels deep", where=where)
+    if _DEEP_KEY.search(text):  # which takes tomllib the square of its length
+        raise too_deep
     try:
-        return tomllib.loads(text.removeprefix("\ufeff"))  # which some editors put before UTF-8
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        values = tomllib.loads(text.removeprefix("\ufeff"))  # which some editors put before UTF-8
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"is not TOML: {error}", where=where) from error
+    except RecursionError as error:
+        raise too_deep from error
+    level: list[Any] = [values]
+    for _ in range(MAX_DEPTH):
+        inner = (one.values() if isinstance(one, dict) else one for one in level)
+        level = [one for several in inner for one in several if isinstance(one, dict | list)]
+    if level:
+        raise too_deep
+    return values
 
 
 def typed(

@@ -372,3 +372,18 @@ def test_a_store_that_may_not_be_read_is_not_called_damaged(tmp_path: Path) -> N
     own = PermissionError(13, "Permission denied", "/s/x")
     with pytest.raises(PermissionError), Location.of(tmp_path).translate_errors():
         raise own
+
+
+@pytest.mark.parametrize("scheme", ["s3", "s3a", "https"])
+@pytest.mark.parametrize("secret", ["hush", "hu/sh", "hu@sh"])
+def test_a_secret_in_an_address_is_refused_and_not_repeated(scheme, secret):
+    with pytest.raises(StoreError, match="must not hold a key and its secret") as caught:
+        Location.of(f"{scheme}://AKIA:{secret}@bucket/store")
+    said = str(caught.value)
+    assert f"{scheme}://***:***@bucket/store" in said
+    assert "hu" not in said
+    assert "AKIA:" not in said
+
+
+def test_a_version_of_a_store_on_s3_is_no_secret():
+    assert str(Location.of("s3://bucket/a@2026-11-01T08:00Z")) == "s3://bucket/a@2026-11-01T08:00Z"

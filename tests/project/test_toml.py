@@ -341,3 +341,25 @@ def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "mix.toml"
     path.write_text('name = "a"\n', encoding="utf-8-sig")
     assert read_toml(path) == {"name": "a"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a = " + "[" * 50_000 + "]" * 50_000,
+        "a = " + "{a = " * 50_000 + "1" + "}" * 50_000,
+        "a." * 50_000 + "b = 1",
+        "[" + "a . " * 50_000 + "b]",
+        "a = " + "[" * 200 + "]" * 200,
+        ".".join('"a"' for _ in range(200)) + " = 1",
+    ],
+)
+def test_deep_nesting_is_refused(text):
+    with pytest.raises(ConfigError, match=r"^a\.toml: is nested more than 64 levels deep$"):
+        parse_toml(text, where="a.toml")
+
+
+def test_many_dots_are_not_deep_nesting():
+    values = ", ".join(["1.5"] * 1000)
+    text = f"""a = [{values}]\nb = "{"." * 1000}"\nc = "{"x" * 100_000}"\n"""
+    assert len(parse_toml(text, where="a.toml")["a"]) == 1000
