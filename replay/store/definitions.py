@@ -180,7 +180,7 @@ _OF: WeakKeyDictionary[duckdb.DuckDBPyConnection, ref[Definitions]] = WeakKeyDic
 
 def _of(connection: duckdb.DuckDBPyConnection) -> Definitions | None:
     made = _OF.get(connection)
-    return made and made()
+    return None if made is None else made()
 
 
 def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
