@@ -45,6 +45,9 @@ class TopicInfo:
     skipped: str | None  # why it cannot be decoded, or None
 
 
+FAR_BACK_NS = 100_000_000  # between two messages of a topic, as they lie in the file
+
+
 @dataclass
 class Account:
     """What became of a topic's messages: expected = decoded + lost, always."""
@@ -170,11 +173,14 @@ class TopicReading:
         """All of it, in the order of log time."""
         log = self._log.column()
         fields: dict[str, FieldColumn] = {}
-        order = None
+        order = lap = None
         backsteps = int((log[1:] < log[:-1]).sum())
         self._account.log_backsteps = 0 if self.interleaved else backsteps
         if backsteps:
             order = np.argsort(log, kind="stable")
+            set_back = np.diff(log, prepend=log[:1]) < -FAR_BACK_NS
+            far = set_back.any() and not self.interleaved
+            lap = np.cumsum(set_back)[order] if far else None
             log = log[order]
         publish = log
         if self._publish is not None:
@@ -182,7 +188,7 @@ class TopicReading:
         for path in list(self._fields):  # one by one: the unordered column is freed first
             column = self._fields.pop(path).column()
             fields[path] = column if order is None else take(column, order)
-        return TopicColumns(log, publish, fields)
+        return TopicColumns(log, publish, fields, lap)
 
 
 def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:

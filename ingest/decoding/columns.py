@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from restock.arrays import Ints
+from restock.arrays import F64, Ints
 
 # The number of messages to come is the file's claim: no more than this is allocated for them.
 # Memory that is allocated and not yet written to costs nothing.
@@ -123,9 +123,21 @@ class TopicColumns:
     log_time_ns: Ints  # (N,) when the recorder received it
     publish_time_ns: Ints  # (N,) when the sender sent it; the log time where that is not kept
     fields: dict[str, FieldColumn] = field(default_factory=dict)  # by field path
+    lap: Ints | None = None  # (N,) how often log time had gone far back before each; None: never
 
     def __len__(self) -> int:
         return len(self.log_time_ns)
+
+    def laps(self) -> int:
+        """How often log time goes far back in the file."""
+        return 0 if self.lap is None else int(self.lap.max(initial=0))
+
+    def gaps_s(self) -> F64:
+        """Seconds from each message to the next; none across a time that log time goes back."""
+        if self.lap is None:
+            return np.asarray(np.diff(self.log_time_ns) * 1e-9, np.float64)
+        laps = [self.log_time_ns[self.lap == lap] for lap in range(self.laps() + 1)]
+        return np.concatenate([np.diff(lap) for lap in laps]) * 1e-9
 
     def times(self, start: int, stop: int) -> TopicColumns:
         """When messages `start` to `stop` came, without their fields, copied."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.errors import RecordingError
-from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.steps.clock_map import ClockMap, drift_ns, residual_ns, spread_ns
 from restock.ingest.steps.clocks import STAMP, jumps, median
 
@@ -41,6 +41,7 @@ CLOCK_TOPIC, CLOCK_FIELD = "/clock", "clock"  # what a simulation says the time 
 BY_LOG_TIME = 'set [clock] alignment = "log_time" in the profile'
 TOLERANCE_S = 0.1  # half a control period
 IMPOSSIBLE_S = 0.25  # by which a stamp is after the reception, of a clock of its own
+OFTEN = 20  # messages: a topic with so many was there before and after a clock was set
 LATENCY_S = 1.0  # of a topic that is stamped by the recorder's clock, at most
 MOST_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
@@ -87,7 +88,7 @@ class ClockSegment:
     """A stretch of a recording in which the alignment clock does not jump."""
 
     topics: Mapping[str, Samples]
-    offset_ns: int  # log time - alignment clock
+    clock_map: ClockMap  # log time to the alignment clock
 
 
 @dataclass
@@ -102,6 +103,7 @@ class ClockReport:
     jumps: int = 0
     off_clock: dict[str, int] = field(default_factory=dict)  # messages left out, per topic
     restamped: dict[str, int] = field(default_factory=dict)  # latched ones put at their log time
+    set_back: int = 0  # of them, times that the recorder's clock was set back
     by_reception: dict[str, int] = field(default_factory=dict)  # topic -> how far ahead it is, ns
 
 
@@ -131,6 +133,64 @@ def align(
             `tolerance_s`.
     """
     report = ClockReport(clock.alignment)
+    segments: list[ClockSegment] = []
+    parts = _laps(topics)
+    for rows in parts:
+        part = {name: _part(one, rows[name]) for name, one in topics.items()} if rows else topics
+        for segment in _align(part, clock, latched, transforms, commands, tolerance_s, report):
+            samples = {
+                name: Samples(one.stamp_ns, rows[name][one.row]) if rows else one
+                for name, one in segment.topics.items()
+            }
+            segments.append(ClockSegment(samples, segment.clock_map))
+    report.set_back = len(parts) - 1
+    report.jumps += report.set_back
+    report.offset_ns = segments[0].clock_map.offset_ns
+    _carry_latched(segments, latched)
+    return segments, report
+
+
+def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
+    """The messages of each topic before and after each time at which the recorder's clock was set
+    back: that log time goes back on every frequent topic, by about as much, and over what was
+    recorded. One empty part where it was not."""
+    laps = {name: one.laps() for name, one in topics.items() if len(one) >= OFTEN}
+    if not laps or len(set(laps.values())) > 1 or not max(laps.values()):
+        return [{}]
+    count = max(laps.values())
+    for lap in range(count):
+        gone_ns = []
+        for name in laps:
+            of = topics[name].lap
+            before, after = (topics[name].log_time_ns[of == lap + late] for late in (0, 1))
+            gone_ns.append(int(before.max() - after.min()))
+        if min(gone_ns) <= 0 or max(gone_ns) - min(gone_ns) > round(LATENCY_S * NS):
+            return [{}]
+    whole = {name: np.zeros(len(one), np.int64) for name, one in topics.items()}
+    whole |= {name: one.lap for name, one in topics.items() if one.lap is not None}
+    return [
+        {name: np.flatnonzero(lap == number) for name, lap in whole.items()}
+        for number in range(count + 1)
+    ]
+
+
+def _part(columns: TopicColumns, rows: NDArray[np.intp]) -> TopicColumns:
+    """The times of some messages of a topic."""
+    kept = columns.fields.keys() & {STAMP, CLOCK_FIELD}
+    fields: dict[str, FieldColumn] = {n: np.asarray(columns.fields[n])[rows] for n in kept}
+    return TopicColumns(columns.log_time_ns[rows], columns.publish_time_ns[rows], fields)
+
+
+def _align(
+    topics: Mapping[str, TopicColumns],
+    clock: Clock,
+    latched: frozenset[str],
+    transforms: frozenset[str],
+    commands: frozenset[str],
+    tolerance_s: float,
+    report: ClockReport,
+) -> list[ClockSegment]:
+    """The segments of topics whose log time is never set back."""
     simulated = topics.get(CLOCK_TOPIC)
     if simulated is not None and CLOCK_FIELD in simulated.fields:
         topics = {name: columns for name, columns in topics.items() if name != CLOCK_TOPIC}
@@ -139,7 +199,7 @@ def align(
     every = np.arange(max(map(len, topics.values()), default=0))  # shared by all topics
     if clock.alignment == "log_time":
         samples = {name: _ordered(c.log_time_ns, every[: len(c)]) for name, c in topics.items()}
-        return [ClockSegment(samples, 0)], report
+        return [ClockSegment(samples, ClockMap.constant(0))]
     stamped = stamped_topics(topics, latched | transforms)
     if not stamped:
         raise RecordingError(
@@ -154,7 +214,7 @@ def align(
     if np.ptp(np.asarray(stamped[reference].fields[STAMP], np.int64)) > clock.jump_s * NS:
         refuse_still_log_time(reference, stamped[reference])
     edges = _edges(stamped[reference], round(clock.jump_s * NS))
-    report.jumps = len(edges)
+    report.jumps += len(edges)
     drifts = _Drifts(clock, round(tolerance_s * NS), simulated, report)
     segments = []
     for index in range(len(edges) + 1):
@@ -164,11 +224,9 @@ def align(
         segments.append(
             _segment(topics, inside, every, clock_map, middle, clock, latched, transforms, report)
         )
-    report.offset_ns = segments[0].offset_ns
     if report.mapped_by is None:
-        report.spread_ns = spread_ns(delay_ns(topics[reference]))
-    _carry_latched(segments, latched)
-    return segments, report
+        report.spread_ns = max(report.spread_ns, spread_ns(delay_ns(topics[reference])))
+    return segments
 
 
 def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
@@ -346,7 +404,6 @@ class _Drifts:
         report.pace = fitted.pace if report.pace is None else report.pace
         return fitted.ahead_by(max(shift, 0)), middle
 
-
     def place_commands(
         self,
         topics: Mapping[str, TopicColumns],
@@ -401,7 +458,7 @@ def _segment(
             report.off_clock[name] = report.off_clock.get(name, 0) + int(off.sum())
             stamp, numbers = stamp[~off], numbers[~off]
         samples[name] = _ordered(stamp, numbers)
-    return ClockSegment(samples, clock_map.offset_ns)
+    return ClockSegment(samples, clock_map)
 
 
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
@@ -414,7 +471,7 @@ def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> Non
             if len(before.row):
                 stamp = np.concatenate([[start], now.stamp_ns]).astype(np.int64)
                 topics[name] = Samples(stamp, np.concatenate([before.row[-1:], now.row]))
-        segments[index] = ClockSegment(topics, segments[index].offset_ns)
+        segments[index] = ClockSegment(topics, segments[index].clock_map)
 
 
 __all__ = [

@@ -16,6 +16,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.steps.align import NS, ClockReport
 from restock.ingest.steps.aligned_inputs import AlignedInputs
 from restock.ingest.task.signals import Signals, wrap_angle
+from restock.words import counted
 
 WINDOW_S = 3.0  # in which two sources of a speed are compared
 LEAST_WINDOWS = 5  # in which the robot moves; fewer say nothing
@@ -122,8 +123,16 @@ def findings_of(
 
 
 def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
-    """The topics whose stamps are of another clock than the others', and were not used."""
+    """Where the recorder's clock was set back, and the topics whose stamps are of another clock
+    than the others', and were not used."""
     found = []
+    if clock.set_back:
+        what = (
+            f"log time goes back {counted(clock.set_back, 'time')} on every topic; an episode ends,"
+            " and a new one begins, there"
+        )
+        cause, remedy = "the recorder's clock was set back", "set its clock before a drive"
+        found.append(Finding("clock", "all topics", what, steps, cause, remedy, repaired=True))
     for topic, ahead_ns in clock.by_reception.items():
         where = "ahead of" if ahead_ns > 0 else "behind"
         what = (

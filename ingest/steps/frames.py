@@ -144,7 +144,10 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
             **{part: values[rows] for part, values in transform.items()},
         }
         edges[name] = TopicColumns(
-            topic.log_time_ns[message[rows]], topic.publish_time_ns[message[rows]], fields
+            topic.log_time_ns[message[rows]],
+            topic.publish_time_ns[message[rows]],
+            fields,
+            None if topic.lap is None else topic.lap[message[rows]],
         )
     return edges
 

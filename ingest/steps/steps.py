@@ -42,6 +42,7 @@ class Steps:
     truth: list[str | None]  # (T,) true condition, where a simulator published it
     true_exposure: list[str | None]  # (T,) the same of exposures
     perturbed: Perturbed  # (T,) a simulator's parameters in force
+    logged_ns: Ints  # (T,) log time
     clock: ClockReport
     commands_between: int  # commands that got no tick of their own
     custom: Custom  # the profile's own signals
@@ -75,6 +76,7 @@ class Steps:
             truth=[],
             true_exposure=[],
             perturbed=Perturbed.unknown(0),
+            logged_ns=ticks,
         )
 
 
@@ -110,6 +112,12 @@ def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
         filling.texts("true_condition"),
         filling.texts("true_exposure"),
         perturbed,
+        np.concatenate(
+            [
+                segment.clock_map.logged(stamps)
+                for segment, stamps in zip(aligned.segments, aligned.ticks, strict=True)
+            ]
+        ),
         aligned.clock,
         aligned.commands_between,
         custom,

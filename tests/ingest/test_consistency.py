@@ -15,6 +15,7 @@ from support.driven_robot import (
     START_NS,
     columns,
     scans,
+    without,
     write_topics,
 )
 
@@ -166,10 +167,52 @@ def _times(steps: Any) -> Any:
 
 
 def test_a_clock_of_the_recorder_alone_is_no_contradiction(profile, tmp_path):
-    topics = winding()
+    assert found_in(shifted_all(winding(), 3.0), profile, tmp_path)[0] == []
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("back_s", [0.6, 10.0])
+def test_a_recorders_clock_that_is_set_back_begins_a_segment(profile, tmp_path, back_s, storage):
+    topics, middle = winding(), START_NS + 20 * NS
+    before = {n: without(one, one.log_time_ns < middle) for n, one in topics.items()}
+    after = {
+        name: replace(one, log_time_ns=one.log_time_ns - round(back_s * NS))
+        for name, one in shifted_all(topics, -back_s).items()
+    }
+    after = {name: without(one, topics[name].log_time_ns >= middle) for name, one in after.items()}
+    bag = write_topics(
+        {name: (TYPES[name], one) for name, one in before.items()},
+        tmp_path / "bag",
+        after,
+        storage=storage,
+    )
+    with open_recording(bag) as recording:
+        proposed = propose_profile(recording, "r", hindsight_goals=True)
+        steps = steps_of(profile, read_topics(recording, profile))
+    assert parse_profile(proposed.toml, where="t").task.control_period_s == 0.1
+    (found,) = steps.findings
+    assert (found.kind, found.topic, found.repaired) == ("clock", "all topics", True)
+    assert len(steps) == len(topics["/cmd_vel"])  # no driving is lost
+    assert steps.segment.max() == 1
+    assert np.abs(steps.signals["localised_speed_mps"]).max() < 0.7
+
+
+def test_a_topic_that_alone_lies_out_of_order_is_no_set_back(profile, tmp_path):
+    topics, middle = winding(), START_NS + 20 * NS
+    late = without(topics["/imu"], topics["/imu"].log_time_ns < middle)
+    rest = without(topics["/imu"], topics["/imu"].log_time_ns >= middle)
+    typed = {name: (TYPES[name], one) for name, one in (topics | {"/imu": rest}).items()}
+    with open_recording(write_topics(typed, tmp_path / "bag", {"/imu": late})) as recording:
+        steps = steps_of(profile, read_topics(recording, profile))
+    assert steps.findings == []
+    assert steps.segment.max() == 0
+
+
+def shifted_all(topics: Topics, seconds: float) -> Topics:
+    """The same, with all stamps ahead by so much."""
     for name in topics:
-        topics = shifted(topics, name, 3.0)
-    assert found_in(topics, profile, tmp_path)[0] == []
+        topics = shifted(topics, name, seconds)
+    return topics
 
 
 SPEED, RATE = "twist.twist.linear.x", "twist.twist.angular.z"

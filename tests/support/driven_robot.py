@@ -190,25 +190,36 @@ def typed_topics(drive: Drive) -> dict[str, tuple[str, TopicColumns]]:
 
 
 def write_topics(
-    topics: Mapping[str, tuple[str, TopicColumns]], folder: Path, *, storage: str = "sqlite3"
+    topics: Mapping[str, tuple[str, TopicColumns]],
+    folder: Path,
+    *then: Mapping[str, TopicColumns],
+    storage: str = "sqlite3",
 ) -> Path:
-    """Topics as (message type, columns), as a rosbag2 folder; other fields are zero or empty."""
+    """Topics as (message type, columns), as a rosbag2 folder; other fields are zero or empty.
+
+    Messages lie in the order of their log time; after them those of each of `then`.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     types = _humble()
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
-        lines = []
-        for topic, (name, messages) in topics.items():
-            connection = writer.add_connection(topic, name, typestore=types)
-            for row in range(len(messages)):
-                message = _blank(types, name)
-                for path, column in messages.fields.items():
-                    _set(types, message, path, column[row])
-                data = types.serialize_cdr(message, name)
-                lines.append((int(messages.log_time_ns[row]), connection, data))
-        for log_time_ns, connection, data in sorted(lines, key=lambda line: line[0]):
-            writer.write(connection, log_time_ns, data)
+        connections = {
+            topic: writer.add_connection(topic, name, typestore=types)
+            for topic, (name, _) in topics.items()
+        }
+        for part in ({topic: one for topic, (_, one) in topics.items()}, *then):
+            lines = []
+            for topic, messages in part.items():
+                name = topics[topic][0]
+                for row in range(len(messages)):
+                    message = _blank(types, name)
+                    for path, column in messages.fields.items():
+                        _set(types, message, path, column[row])
+                    data = types.serialize_cdr(message, name)
+                    lines.append((int(messages.log_time_ns[row]), connections[topic], data))
+            for log_time_ns, connection, data in sorted(lines, key=lambda line: line[0]):
+                writer.write(connection, log_time_ns, data)
     return folder
 
 

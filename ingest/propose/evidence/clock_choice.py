@@ -42,7 +42,7 @@ class Gaps:
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Gaps:
-        gaps = np.asarray(np.diff(np.sort(columns.log_time_ns)), np.float64) * 1e-9
+        gaps = columns.gaps_s()
         if not len(gaps):
             return cls(len(columns))
         period = float(np.median(gaps))

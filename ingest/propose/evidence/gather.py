@@ -293,7 +293,7 @@ def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
     names = {fitting[0][0].name for fitting in roles.values() if fitting}
     found = {}
     for name, columns in recording.read({name: [] for name in sorted(names)}).items():
-        gaps = np.diff(np.sort(columns.log_time_ns)) * 1e-9
+        gaps = columns.gaps_s()
         if len(gaps) > 1:
             # The median, or the mean of half of them where messages come in bursts.
             found[name] = max(float(np.median(gaps)), float(np.percentile(gaps, 90)) / 2)
@@ -328,8 +328,7 @@ def _recorded_s(recording: Recording, roles: Roles) -> float:
     if not filling:
         return whole
     busiest = max(filling, key=lambda topic: topic.expected).name
-    times = np.sort(recording.read({busiest: []})[busiest].log_time_ns)
-    gaps = np.asarray(np.diff(times), np.float64) * 1e-9
+    gaps = recording.read({busiest: []})[busiest].gaps_s()
     if len(gaps) < 2:
         return whole
     recorded = float(gaps[gaps <= PAUSE * max(float(np.median(gaps)), 0.02)].sum())
