@@ -20,6 +20,7 @@ from restock.ingest.propose.evidence.roles import (
     LATCHED,
     REQUIRED,
     Kind,
+    clouds_alone,
     robots_in,
 )
 from restock.ingest.propose.node_lines import node_lines
@@ -125,7 +126,12 @@ def _unknown_lines(seen: Evidence) -> list[str]:
         return []
     known = shipped()
     names = unseen([known[name] for name in _conditions(seen)])
-    return [f"# No lidar: {', '.join(names)} are unknown (null, neither true nor false)."]
+    clouds = clouds_alone(seen.recording, seen.roles)
+    return [
+        f"# No {'laser scan' if clouds else 'lidar'}: {', '.join(names)} are unknown (null, neither"
+        " true nor false).",
+        *(f"# {line}" for line in textwrap.wrap(clouds, 96)),
+    ]
 
 
 def _exposures(seen: Evidence) -> list[str]:

@@ -21,6 +21,7 @@ from restock.ingest.propose.evidence.gather import Evidence, gather, with_other_
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.roles import (
     REQUIRED,
+    clouds_alone,
     robots_in,
     several_commands,
 )
@@ -159,6 +160,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
+    if clouds := clouds_alone(recording, seen.roles):
+        advice.append(Advice("inputs.scan", clouds))
     if told := lidar_guess(seen.footprint):
         advice.append(Advice("task.body.lidar_yaw_rad", told.replace("A GUESS", "a guess")))
     if len(seen.lidars) > 1:

@@ -302,3 +302,24 @@ def test_a_husky_with_odometry_alone(tmp_path, capsys):
     assert [one["condition"] for one in outcome.manifest["unknown_conditions"]] == [
         *("recovery", "near_collision", "blocked_aisle")
     ]
+
+
+def test_a_robot_with_a_point_cloud_alone_is_told_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from support.driven_robot import columns, typed_topics, write_topics
+
+    topics = typed_topics(Drive(6.0))
+    scan = topics.pop("/scan")
+    topics["/points"] = (
+        "sensor_msgs/msg/PointCloud2",
+        columns(np.arange(0, 6.0, 0.1), {"header.frame_id": np.full(60, "velodyne", object)}),
+    )
+    for name, more, hinted in (("cloud", {}, True), ("both", {"/scan": scan}, False)):
+        bag = write_topics(topics | more, tmp_path / name, storage="mcap")
+        assert main(["profile", "new", str(bag), "--out", str(tmp_path / f"{name}.toml")]) == 0
+        said = capsys.readouterr().err
+        text = " ".join((tmp_path / f"{name}.toml").read_text().replace("\n# ", " ").split())
+        for where in (said, text):
+            assert ("/points is a point cloud" in where) == hinted
+            assert ("pointcloud_to_laserscan (cloud_in:=/points" in where) == hinted

@@ -82,6 +82,7 @@ _MEASURED = (
     ),
 )
 
+CLOUDS = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointCloud", "foxglove.PointCloud")
 MUCH = 0.1  # of the messages of the topic that is taken: another one with as many may be it
 
 # Best first.
@@ -380,6 +381,21 @@ def topics_for(
                 place = min(named, default=len(kind.words))
                 fitting.append(((later, rank, place, -topic.expected, topic.name), topic, kind))
     return [(topic, kind) for _, topic, kind in sorted(fitting, key=lambda item: item[0])]
+
+
+def clouds_alone(recording: Recording, roles: Roles) -> str:
+    """Say what to do about the point clouds of a robot without a laser scan; "" if it has none."""
+    clouds = [one for one in usable_topics(recording).values() if one.type in CLOUDS]
+    if roles["scan"] or not clouds:
+        return ""
+    first, *others = (one.name for one in clouds)
+    also = f" (or {', '.join(others[:2])})" if others else ""
+    return (
+        f"{first}{also} is a point cloud, and clearance is taken from laser scans alone: make a"
+        f" scan of it with pointcloud_to_laserscan (cloud_in:={first}, min_height and max_height of"
+        " what the robot can run into), as the robot drives or while you replay the recording, and"
+        " record that with the other topics"
+    )
 
 
 def several_commands(recording: Recording) -> list[str]:
