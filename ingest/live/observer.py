@@ -25,6 +25,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.steps.clock_map import ClockMap
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths
@@ -152,7 +153,7 @@ class LiveObserver:
         if silent:
             return self._unknown(stamp_ns, f"nothing received yet on {', '.join(sorted(silent))}")
         inputs = InputColumns(self.profile, topics)
-        segment = ClockSegment(samples, offset_ns)
+        segment = ClockSegment(samples, ClockMap.constant(offset_ns))
         at = [np.array(ticks, np.int64)]
         filling = Filling(AlignedInputs(self.profile, inputs, [segment], at))
         signals = filling.fill()

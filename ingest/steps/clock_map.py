@@ -62,6 +62,13 @@ class ClockMap:
         inside += outside * self.pace
         return np.rint(inside).astype(np.int64) + start
 
+    def logged(self, stamp_ns: Ints) -> Ints:
+        """Log times (N,) of stamped times (N,): the inverse of `stamped`."""
+        if self.is_constant or not self.pace:
+            return stamp_ns + self.offset_ns
+        last = np.append(np.diff(self.stamp_ns) > 0, True)  # stamps that stand still: the latest
+        return ClockMap(self.stamp_ns[last], self.log_ns[last]).stamped(stamp_ns)
+
     def ahead_by(self, shift_ns: int) -> ClockMap:
         """The same map with stamps that much later."""
         return ClockMap(self.log_ns, self.stamp_ns + shift_ns)

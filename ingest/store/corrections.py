@@ -49,6 +49,8 @@ class Moments:
     def of(cls, rows: pa.Table, clock_offset_ns: int | None) -> Moments:
         """`clock_offset_ns` is the manifest's: log time less alignment clock."""
         logged = rows["stamp_ns"].to_numpy() + (clock_offset_ns or 0)
+        if "logged_ns" in rows.column_names and not rows["logged_ns"].null_count:
+            logged = rows["logged_ns"].to_numpy()
         return cls(rows["episode_index"].to_numpy(), logged)
 
     def covered(self, correction: Correction) -> Bools:

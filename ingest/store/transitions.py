@@ -64,6 +64,7 @@ class TransitionValues:
     perturbation: tuple[pa.Array, pa.Array]  # (N,) its name and its values
     true_exposure: Sequence[str | None] | None = None  # (N,); None: not known of any
     goal_source: str | None = None  # of all; None: there is no goal
+    logged_ns: Ints | None = None  # (N,); None: as far from the stamps as the manifest says
 
 
 def recording_table(
@@ -166,6 +167,7 @@ def transitions(
         perturbation=steps.perturbed.columns(tick),
         true_exposure=[_sorted_truth(steps.true_exposure[index]) for index in tick],
         goal_source=profile.goal_source,
+        logged_ns=steps.logged_ns[tick],
     )
     return transition_table(profile, rows, values, provenance)
 
@@ -197,6 +199,7 @@ def transition_table(
         "episode_id": [f"{provenance.recording_id}/{e}" for e in rows.episode[begin]],
         "episode_index": rows.episode[begin],
         "step_index": rows.step[begin],
+        "logged_ns": pa.nulls(count, pa.int64()) if values.logged_ns is None else values.logged_ns,
         "observation": observation,
         "action": values.action,
         "reward": values.reward,

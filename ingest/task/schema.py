@@ -43,6 +43,12 @@ IDENTITY: tuple[Column, ...] = (
     Column("episode_id", pa.string(), "<recording_id>/<episode_index>"),
     Column("episode_index", pa.int32(), "number of the episode in its recording, from 0"),
     Column("step_index", pa.int32(), "number of the step in its episode, from 0"),
+    Column(
+        "logged_ns",
+        pa.int64(),
+        "time of the step as log time; null: stamp_ns + the recording's clock_offset_ns",
+        nullable=True,
+    ),
 )
 TRANSITION: tuple[Column, ...] = (
     Column(

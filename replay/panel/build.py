@@ -98,10 +98,12 @@ def open_source(
     with duckdb.connect() as connection:
         _register(connection, transitions)
         # A store's Parquet and `transition_schema` say `condition`, its view `primary_condition`.
-        as_stored = "primary_condition" not in map(str.casefold, connection.table("given").columns)
-        renamed = "RENAME (condition AS primary_condition)" if as_stored else ""
+        has = [*map(str.casefold, connection.table("given").columns)]
+        renamed = "" if "primary_condition" in has else "RENAME (condition AS primary_condition)"
+        known, logged = ("EXCLUDE (logged_ns)", "logged_ns, ") if "logged_ns" in has else ("", "")
         connection.execute(
-            f"CREATE VIEW transitions AS SELECT * {renamed}, stamp_ns AS logged_ns FROM given"
+            f"CREATE VIEW transitions AS SELECT * {known} {renamed},"
+            f" coalesce({logged}stamp_ns) AS logged_ns FROM given"
         )
         if conditions is None:
             conditions = _named_conditions(connection)

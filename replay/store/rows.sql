@@ -44,12 +44,14 @@ WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
 -- hold the condition beside one of higher priority, so here its name says what it is.
 CREATE OR REPLACE VIEW transitions AS
 SELECT
-    stored.*
+    stored.* EXCLUDE (logged_ns)
     REPLACE (observation::FLOAT[] AS observation, next_observation::FLOAT[] AS next_observation)
     RENAME (condition AS primary_condition),
-    stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns,
+    coalesce(stored.logged_ns, stamp_ns + coalesce(clock_offset_ns, 0)) AS logged_ns,
     make_timestamp(stamp_ns // 1000) AS stamp_time,
-    make_timestamp((stamp_ns + coalesce(clock_offset_ns, 0)) // 1000) AS logged_time,
+    make_timestamp(
+        coalesce(stored.logged_ns, stamp_ns + coalesce(clock_offset_ns, 0)) // 1000
+    ) AS logged_time,
     make_timestamp(pose_stamp_ns // 1000) AS pose_stamp_time,
     told.robot AS robot,
     told.site AS site,
@@ -61,6 +63,7 @@ FROM (
     FROM stored_transitions
     UNION ALL BY NAME
     SELECT
+        NULL::BIGINT AS logged_ns,
         NULL::MAP(VARCHAR, FLOAT) AS probabilities,
         NULL::VARCHAR[] AS uncertain,
         NULL::VARCHAR[] AS exposures,

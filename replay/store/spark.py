@@ -40,9 +40,9 @@ WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions)""",
 CREATE OR REPLACE TEMPORARY VIEW transitions AS
 SELECT
     stored_transitions.*,
-    stamp_ns + coalesce(clock_offset_ns, 0) AS logged_ns,
+    coalesce(logged_ns, stamp_ns + coalesce(clock_offset_ns, 0)) AS logged_ns,
     {_moment("stamp_ns")} AS stamp_time,
-    {_moment("stamp_ns + coalesce(clock_offset_ns, 0)")} AS logged_time,
+    {_moment("coalesce(logged_ns, stamp_ns + coalesce(clock_offset_ns, 0))")} AS logged_time,
     {_moment("pose_stamp_ns")} AS pose_stamp_time,
     {", ".join(NAMED)},
     tags
@@ -81,6 +81,7 @@ _RULES = (
 )
 _LATER = {
     TRANSITIONS: {
+        "logged_ns": "CAST(NULL AS BIGINT) AS logged_ns",
         "probabilities": "CAST(NULL AS MAP<STRING, FLOAT>) AS probabilities",
         "uncertain": "CAST(NULL AS ARRAY<STRING>) AS uncertain",
         "exposures": "CAST(NULL AS ARRAY<STRING>) AS exposures",
@@ -145,8 +146,11 @@ def install_views(session: SparkSession | Any, store: str | Path, *, scheme: str
         table = table.selectExpr(*(kept if len(kept) < len(table.columns) else "*"), *later)
         table = table.withColumnRenamed("condition", "primary_condition")  # as rows.sql does
         table.createOrReplaceTempView(f"stored_{name}")
+        if name == TRANSITIONS:  # rows.sql leaves logged_ns out; Sail has no `* EXCEPT`
+            stored = [f"stored_transitions.`{c}`" for c in table.columns if c != "logged_ns"]
+
     for statement in statements():
-        session.sql(statement)
+        session.sql(statement.replace("stored_transitions.*", ", ".join(stored)))
 
 
 def statements() -> Iterator[str]:

@@ -33,7 +33,7 @@ class Moment:
     at: dict[str, Any]  # the transition that it is about
     steps: list[dict[str, Any]]  # T
     task: Task
-    log_offset_ns: int  # log time less the clock of the steps' stamps
+    log_offset_ns: int  # log time less the clock of the steps' stamps, at that transition
     window_ns: tuple[int, int]  # by log time
     seen: Seen | None = None  # at the recording's own ticks, where the recording was given
     messages: list[RawMessage] = field(default_factory=list)  # of the recording, every topic
@@ -115,11 +115,15 @@ def find_moment(
             remedy="ingest the recording again",
         )
     manifest = manifests[0]
+    if (logged := row.get("logged_ns")) is not None:  # the clocks may drift: as far apart as here
+        offset = int(logged) - int(row["stamp_ns"])
+    else:
+        offset = int(manifest["clock_offset_ns"] or 0)
     moment = Moment(
         at=row,
         steps=steps,
         task=msgspec.json.decode(manifest["task_json"], type=Task),
-        log_offset_ns=(offset := int(manifest["clock_offset_ns"] or 0)),
+        log_offset_ns=offset,
         window_ns=(low + offset, high + offset),
     )
     if recording is None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
-from support.driven_robot import SPEED_MPS, START_NS, Drive, write_bag
+from support.driven_robot import LATENCY_NS, SPEED_MPS, START_NS, Drive, write_bag
 from support.paths import SHARED
 
 from restock import cli
@@ -20,6 +20,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.steps import steps_of
+from restock.replay.store.store import Store
 
 PACES = [0.5, 0.9, 0.97, 1.0, 1.1]
 WARM_UP_S = 1.0
@@ -66,6 +67,51 @@ def test_command_and_state_of_a_row_are_within_one_hold_of_each_other(pace: floa
         assert steps.clock.pace == pytest.approx(pace, abs=1e-3)
     else:
         assert steps.clock.pace is None
+
+
+def logged_s(stamp_ns: np.ndarray, pace: float) -> np.ndarray:
+    """When what is stamped so was received, in seconds from the start, with the drive's latency."""
+    return ((stamp_ns - START_NS) + LATENCY_NS) * 1e-9 / pace
+
+
+@pytest.mark.parametrize("pace", [*PACES, 0.3])
+def test_the_log_time_of_a_tick_is_that_of_messages_stamped_then(pace: float) -> None:
+    steps = steps_of(load_profile("warehouse_amr"), at_pace(turning(), pace))
+    stamp_ns = steps.signals["stamp_ns"]
+    seen_s = (steps.logged_ns - START_NS) * 1e-9
+    assert seen_s == pytest.approx(logged_s(stamp_ns, pace), abs=0.02)
+
+
+def test_a_clock_that_was_set_has_the_log_times_of_each_part() -> None:
+    topics = turning()
+    for columns in topics.values():
+        late = columns.log_time_ns >= START_NS + 15 * NS
+        if "header.stamp" in columns.fields:
+            columns.fields["header.stamp"] = columns.fields["header.stamp"] + late * 3600 * NS
+    steps = steps_of(load_profile("warehouse_amr"), topics)
+    assert steps.clock.jumps == 1
+    assert np.diff(steps.logged_ns).max() < NS
+    assert np.ptp(steps.logged_ns) * 1e-9 == pytest.approx(29.8, abs=0.5)
+
+
+class Slow(Drive):
+    """A drive in a simulation at .3 of real time."""
+
+    def topics(self) -> dict[str, TopicColumns]:
+        return at_pace(super().topics(), 0.3)
+
+
+def test_rows_have_their_log_time_in_sql(tmp_path: Path) -> None:
+    bag = write_bag(Slow(12.0), tmp_path / "bag")
+    store = tmp_path / "s"
+    assert cli.main(["ingest", str(bag), "--profile", "warehouse_amr", "--store", str(store)]) == 0
+    query = "SELECT stamp_ns, logged_ns, epoch_ns(logged_time) AS at_ns FROM transitions"
+    with Store(store) as opened:
+        rows = opened.sql(query).fetchnumpy()
+    assert np.ptp(rows["logged_ns"]) * 1e-9 > 30
+    seen_s = (rows["logged_ns"] - START_NS) * 1e-9
+    assert seen_s == pytest.approx(logged_s(rows["stamp_ns"], 0.3), abs=0.02)
+    assert np.abs(rows["logged_ns"] - rows["at_ns"]).max() < 1000
 
 
 @pytest.mark.parametrize("pace", PACES)
@@ -253,8 +299,8 @@ def test_rows_of_slow_simulations_are_those_of_plain_loops(
     arguments = ["--profile", str(profile), "--store", str(tmp_path / "s"), "--json"]
     code = cli.main(["ingest", str(SHARED / bag), *arguments])
     (report,) = json.loads(capsys.readouterr().out)["recordings"]
-    # robot-kf's metadata names a file that is not there: that is what its exit code says.
-    assert (code, len(report["losses"])) == ((3, 1) if bag == "sim-time-robot-kf" else (0, 0))
+    # robot-kf's metadata names its file otherwise: no message is lost by that.
+    assert (code, len(report["losses"])) == (0, 0)
     columns = "stamp_ns, pose_x_m, pose_y_m, command_speed_mps"
     query = f"SELECT {columns} FROM transitions ORDER BY stamp_ns"
     assert cli.main(["sql", str(tmp_path / "s"), query, "--json"]) == 0
