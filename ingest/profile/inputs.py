@@ -9,6 +9,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.ingest.profile.signal_paths import PathProblem, pressed_paths
 from restock.toml import Checked
 
 COMMAND_SOURCES = "command_sources"
@@ -183,6 +184,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         elif not {"angle_increment_rad", "angle_max_rad"} & source.fields.keys():
             missing.append("angle_increment_rad")
     _check_wheelbase(f"inputs.{name}", source, where)
+    _check_pressed(f"inputs.{name}", source, where)
     if unknown or missing:
         problems = [f"unknown {key!r}" for key in unknown] + [f"missing {key!r}" for key in missing]
         raise ConfigError(
@@ -251,6 +253,17 @@ def check_scans(scans: Mapping[str, Input], where: str) -> None:
         )
 
 
+def _check_pressed(key: str, source: Input, where: str) -> None:
+    try:
+        pressed_paths(source.fields.get("pressed", "data"))
+    except PathProblem as problem:
+        raise ConfigError(
+            f"`{key}.fields.pressed`: {source.fields['pressed']!r} {problem}",
+            where=where,
+            remedy='give a field, or several: "is_left_pressed or is_right_pressed"',
+        ) from None
+
+
 def _check_wheelbase(key: str, source: Input, where: str) -> None:
     if ("steering_rad" in source.fields) != (source.wheelbase_m is not None):
         raise ConfigError(
@@ -304,4 +317,5 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             remedy="leave out both: a recording may always lack a source of commands",
         )
     _check_wheelbase(key, source, where)
+    _check_pressed(key, source, where)
     _check_scan_settings(key, source, where)

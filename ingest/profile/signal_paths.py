@@ -186,6 +186,33 @@ class SignalPath:
         return PathValues(message, np.asarray(column))
 
 
+ANY = " or "  # between the paths of what may be pressed
+
+
+def pressed_paths(text: str) -> list[SignalPath]:
+    """Read the paths of a `pressed`: what is pressed if any value at any of them is above 0.
+
+    Raises:
+        PathProblem: one of them is not written as a path.
+    """
+    return [SignalPath.read(part.strip()) for part in text.split(ANY)]
+
+
+def pressed_in(columns: Mapping[str, FieldColumn], text: str, count: int) -> NDArray[np.bool_]:
+    """Return which of so many messages say that it is pressed.
+
+    Raises:
+        PathProblem: a value is not a number.
+    """
+    found = np.zeros(count, np.bool_)
+    for path in pressed_paths(text):
+        read = path.find(columns)
+        if read.values.dtype.kind not in "biuf":
+            raise PathProblem("is not a number")
+        found[read.message[read.values > 0]] = True
+    return found
+
+
 def _choice(text: str) -> Choice:
     """What stands between brackets."""
     text = text.strip()

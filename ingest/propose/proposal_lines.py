@@ -336,7 +336,12 @@ def _input_lines(
         hangs = seen.lidars[role].upside_down
     if hangs:
         lines.append("upside_down = true  # by its frame; not if its driver turns the scans over")
-    if role not in LATCHED:
+    if kind.at_changes:
+        lines += [
+            "# A message comes when it changes: the last one holds, and there is no max_age_s.",
+            "# Where several bumpers are pressed, the release of one counts as that of all.",
+        ]
+    elif role not in LATCHED:
         pace_s = seen.paces_s.get(topic.name, 0.25)
         age = float(np.clip(round(seen.clock.pace * 4 * pace_s, 2), 0.2, 1.0))
         if role == "command":

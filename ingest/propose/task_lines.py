@@ -6,9 +6,10 @@ import math
 import textwrap
 
 import msgspec
-import numpy as np
 
 from restock.ingest.containers.recording import Recording
+from restock.ingest.profile.inputs import Input
+from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.propose.evidence.commands import Commands
 from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, Footprint
 from restock.ingest.propose.evidence.gather import Evidence
@@ -16,6 +17,7 @@ from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
 from restock.ingest.propose.evidence.scanned_outline import range_lines
 from restock.ingest.propose.trial import Trial
+from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.task import Rewards, Task
 
@@ -107,9 +109,11 @@ def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
     if not roles["bumper"]:
         return ["bump_terminates = true  # no bumper seen: in the twin, a contact ends the episode"]
     topic, kind = roles["bumper"][0]
-    fields = recording.read({topic.name: [kind.fields["pressed"]]})[topic.name].fields
-    pressed = np.asarray(fields[kind.fields["pressed"]], np.float64) > 0
-    if len(pressed) and pressed.mean() > MOSTLY_FREE:
+    path = kind.fields["pressed"]
+    wanted = field_paths(Input(topic.name, topic.type, kind.fields))
+    columns = recording.read({topic.name: wanted})[topic.name]
+    pressed = pressed_in(columns.fields, path, len(columns))
+    if len(pressed) and pressed.mean() > MOSTLY_FREE and not kind.at_changes:
         return [
             f"# {topic.name} is pressed in {pressed.mean():.0%} of its messages: CHECK its meaning",
             "# bump_terminates = true  # a protective stop; what follows is another episode",

@@ -300,7 +300,8 @@ class Filling:
         bumped = [np.zeros(len(self.tick_ns), np.bool_)]
         source = self.inputs.by_name.get("bumper")
         if source is not None:
-            self._required("bumper")
+            if source.max_age_s is not None:  # else it speaks only when it changes
+                self._required("bumper")
             pressed = self.inputs.numbers("bumper", "pressed") > 0
             bumped = [
                 pressed_since(segment.topics[source.topic], pressed, ticks)

@@ -19,7 +19,7 @@ from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.profile.conventions import Convention, conventions_of, said_in
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.signal_paths import element_of
+from restock.ingest.profile.signal_paths import PathProblem, element_of, pressed_in
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.fixes import FixedPoses, fixes_of
 from restock.ingest.steps.frames import Placement, frame_path, plain
@@ -54,6 +54,8 @@ class InputColumns:
         if key == "yaw_rate_radps" and self.by_name[name].wheelbase_m is not None:
             turn = np.tan(self.numbers(name, "steering_rad")) / self.by_name[name].wheelbase_m
             return self.numbers(name, "speed_mps") * turn
+        if key == "pressed":
+            return self._pressed(name)
         column = self.column(name, key)
         if isinstance(column, Ragged) or column.ndim != 1 or column.dtype.kind not in "biuf":
             source = self.by_name[name]
@@ -63,6 +65,18 @@ class InputColumns:
             )
         none = self.no_estimate(name, key)
         return np.where(none, np.nan, column) if none.any() else np.asarray(column, np.float64)
+
+    def _pressed(self, name: str) -> F64:
+        source = self.by_name[name]
+        columns = self.topics[source.topic]
+        try:
+            found = pressed_in(columns.fields, source.fields["pressed"], len(columns))
+        except PathProblem as problem:
+            raise RecordingError(
+                f"{source.fields['pressed']!r} of {source.topic} {problem}",
+                remedy=f"correct `inputs.{name}.fields.pressed` in the profile",
+            ) from None
+        return np.asarray(found, np.float64)
 
     def no_estimate(self, name: str, key: str) -> Bools:
         """Which messages (N,) say themselves that they have no estimate of this field."""

@@ -18,7 +18,7 @@ from restock.ingest.decoding.columns import FieldColumn, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import SCANS, Input
 from restock.ingest.profile.profile import Profile, without_lidar
-from restock.ingest.profile.signal_paths import element_of, offer
+from restock.ingest.profile.signal_paths import element_of, offer, pressed_paths
 from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, clock_drifts
 from restock.ingest.steps.aligned_inputs import sideways_path, without_cameras
 from restock.ingest.steps.clearance import scan_reduction
@@ -183,6 +183,9 @@ def field_paths(source: Input) -> list[str]:
     """The field paths that an input reads."""
     paths: list[str] = []
     for key, field in source.fields.items():
+        if key == "pressed":
+            paths += [path for read in pressed_paths(field) for path in read.wanted()]
+            continue
         field, _ = element_of(field)
         paths += [f"{field}.{axis}" for axis in "xyzw"] if key == "orientation" else [field]
     return paths

@@ -36,6 +36,7 @@ class Kind:
     must: bool = False  # … and without one of them it is not taken
     never: tuple[str, ...] = ()  # in the topic's name, they speak against it
     rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
+    at_changes: bool = False  # messages come when something changes, and hold until then
     origin: str = ""  # of scans: the field that says where in their frame the lidar is
 
     @property
@@ -183,7 +184,25 @@ KINDS: dict[str, tuple[Kind, ...]] = {
         Kind("nav_msgs/msg/Path", _under("poses[].pose", _PLACE), _PATHS, never=_NEAR_PATHS),
         Kind("foxglove.PosesInFrame", _under("poses[]", _PLACE), _PATHS, True, _NEAR_PATHS),
     ),
-    "bumper": (Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),),
+    "bumper": (
+        Kind("std_msgs/msg/Bool", {"pressed": "data"}, ("bump", "contact"), must=True),
+        *(
+            Kind(f"{package}/msg/Bumper", {"pressed": "is_left_pressed or is_right_pressed"})
+            for package in ("create_msgs", "ca_msgs")
+        ),
+        Kind(  # irobot_create_msgs/HazardDetection: BUMP = 1
+            "irobot_create_msgs/msg/HazardDetectionVector", {"pressed": "detections[type=1].type"}
+        ),
+        # Bits, or 0: nothing is pressed.
+        *(
+            Kind(f"{package}/msg/SensorState", {"pressed": "bumper"})
+            for package in ("kobuki_ros_interfaces", "kobuki_msgs", "turtlebot3_msgs")
+        ),
+        *(
+            Kind(f"{package}/msg/BumperEvent", {"pressed": "state"}, at_changes=True)
+            for package in ("kobuki_ros_interfaces", "kobuki_msgs")
+        ),
+    ),
     "nav_command": (
         Kind("geometry_msgs/msg/Twist", _TWIST, NAVIGATION, must=True, never=BY_HAND),
         Kind(
@@ -356,12 +375,14 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
 
 def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
     """Whether a topic's messages are of this type. JSON and protobuf have ROS's types, too, in
-    namespaces of any name (`ros.geometry_msgs.Twist`, `Twist`): of these, by the fields as well."""
-    if topic.encoding not in _OTHER_ENCODINGS:
-        return topic.type == kind.type
+    namespaces of any name (`ros.geometry_msgs.Twist`, `Twist`): of these, by the fields as well; so
+    of bumpers, whose packages no distribution has."""
+    other = topic.encoding in _OTHER_ENCODINGS
     of_ros = "/" in kind.type and last_part(topic.type) == last_part(kind.type)
-    if not of_ros and topic.type != kind.type:
+    if topic.type != kind.type and not (other and of_ros):
         return False
+    if not other and "pressed" not in kind.fields:
+        return True
     paths = field_paths(Input(topic.name, topic.type, kind.fields))
     return set(paths) <= set(recording.leaves(topic.name))
 
