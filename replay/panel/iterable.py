@@ -6,8 +6,9 @@
 Batches are those that `sampler_for` draws. Every worker draws the same sequence of row numbers,
 which is cheap, and gathers only its own batches of it, which is not. So however many workers there
 are, the loader gives the same batches in the same order, exact in their quotas, and no row comes
-twice because of them. What a loop with a DataLoader cannot tell its dataset, TD errors and
-environment steps, is refused where the mixture asks for it.
+twice because of them. Ranks of `torch.distributed` share one sequence in the same way. What a loop
+with a DataLoader cannot tell its dataset, TD errors and environment steps, is refused where the
+mixture asks for it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 from torch.utils.data import IterableDataset, get_worker_info
 
 from restock.errors import MixtureError
@@ -52,6 +53,9 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
     pass is the same. Where the mixture has a `max_replays_per_row`, it is of all passes together:
     pass n goes on where pass n - 1 ended, and none is given twice.
 
+    Each of R ranks of `torch.distributed` gets `batches` batches of its own, every R-th of the one
+    sequence that all ranks draw: give every rank the same arguments.
+
     Raises:
         MixtureError: `batch_size` or `batches` below 1; a mixture whose draws follow TD errors or
             environment steps; while iterating, rows that were all drawn as often as they may be.
@@ -68,31 +72,51 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self.panel = panel if isinstance(panel, Panel) else Panel.open(panel)
         self.batch_size, self.batches, self.seed, self.epoch = batch_size, batches, seed, 0
         self._limit = self.panel.header.mixture.most_draws
-        # Passes begun by each worker, in memory that the workers of every pass share.
-        self._begun = torch.zeros(_MOST_WORKERS, dtype=torch.int16).share_memory_()  # type: ignore[no-untyped-call]
+        # In memory that workers share: passes begun by each, and the next one, since persistent
+        # workers keep a copy of this from before the first.
+        self._begun = _shared(_MOST_WORKERS)
+        self._next = _shared(1)
+        self._persists = False  # this is a worker's copy, and had its first pass
+        self._sent_by = (0, 1)  # the rank that sent this copy to a worker, and how many there are
         self._check()
 
     def set_epoch(self, epoch: int) -> None:
         """Which pass comes next; call it before iterating, on the loader's own dataset."""
         self.epoch = epoch
+        self._next[0] = epoch
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
-        number, of = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        sampler = self._sampler()
+        if worker is None:
+            return self._pass(self.epoch, 0, 1)
+        epoch = int(self._next[0]) if self._persists else self.epoch
+        self._persists = True
+        return self._pass(epoch, worker.id, worker.num_workers)
+
+    def _pass(self, epoch: int, number: int, of: int) -> Iterator[dict[str, Tensor]]:
+        """The batches of worker `number` of so many."""
+        rank, ranks = self._rank()
+        sampler = self._sampler(epoch)
         try:
             if self._limit is not None:
-                self._pass_on(sampler, number)
-            for batch in count() if self.batches is None else range(self.batches):
+                self._pass_on(sampler, epoch, number, ranks)
+            for turn in count() if self.batches is None else range(self.batches * ranks):
                 draw = self._draw(sampler)
-                if batch % of == number:
+                batch, whose = divmod(turn, ranks)
+                if whose == rank and batch % of == number:
                     yield self._gather(sampler, draw)
         finally:
             sampler.close()
 
-    def _sampler(self) -> LoggedSampler:
-        epoch = self.epoch if self._limit is None else 0
-        return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, epoch))
+    def _rank(self) -> tuple[int, int]:
+        """This process's rank, and how many there are; a worker that was spawned is told."""
+        if distributed.is_available() and distributed.is_initialized():
+            return distributed.get_rank(), distributed.get_world_size()
+        return self._sent_by
+
+    def _sampler(self, epoch: int) -> LoggedSampler:
+        of_pass = epoch if self._limit is None else 0
+        return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, of_pass))
 
     def _check(self) -> None:
         """Raises MixtureError where draws follow what a data set does not receive."""
@@ -105,23 +129,23 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
                 remedy="draw with `sampler_for(panel, …)`, which has `update` and `move_to`",
             )
 
-    def _pass_on(self, sampler: LoggedSampler, number: int) -> None:
-        """Let the draws of the passes before go by: they count towards the limit."""
-        if self.epoch and self.batches is None:
+    def _pass_on(self, sampler: LoggedSampler, epoch: int, number: int, ranks: int) -> None:
+        """Skip the draws of earlier passes, which count towards the limit."""
+        if epoch and self.batches is None:
             raise MixtureError(
                 "an endless pass has no next one where max_replays_per_row is of all passes",
                 where=str(self.path),
                 remedy="give `batches`",
             )
-        if self.epoch < int(self._begun[number % _MOST_WORKERS]):
+        if epoch < int(self._begun[number % _MOST_WORKERS]):
             raise MixtureError(
-                f"pass {self.epoch} was given already, and its rows may be drawn"
+                f"pass {epoch} was given already, and its rows may be drawn"
                 f" {self._limit:g} times in all",
                 where=str(self.path),
-                remedy=f"go on with set_epoch({self.epoch + 1})",
+                remedy=f"go on with set_epoch({epoch + 1})",
             )
-        self._begun[number % _MOST_WORKERS] = self.epoch + 1
-        for _ in range(self.epoch * (self.batches or 0)):
+        self._begun[number % _MOST_WORKERS] = epoch + 1
+        for _ in range(epoch * ranks * (self.batches or 0)):
             self._draw(sampler)
 
     def _draw(self, sampler: LoggedSampler) -> BatchDraw:
@@ -155,8 +179,16 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
 
     def __getstate__(self) -> dict[str, object]:
         """Workers open the panel themselves: its rows are mapped, not copied."""
-        return {name: value for name, value in self.__dict__.items() if name != "panel"}
+        state = {name: value for name, value in self.__dict__.items() if name != "panel"}
+        return state | {"_sent_by": self._rank()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
         self.panel = Panel.open(self.path)
+
+
+def _shared(size: int) -> Tensor:
+    """Zeros (size,) that processes with a copy of the dataset share."""
+    zeros = torch.zeros(size, dtype=torch.int64)
+    zeros.share_memory_()  # type: ignore[no-untyped-call]
+    return zeros

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,12 @@ MIXTURE = parse_mixture(
 @pytest.fixture(scope="module")
 def panel(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Panel:
     return panel_of(store_path, MIXTURE, tmp_path_factory.mktemp("iterable") / "panel")
+
+
+@pytest.fixture(scope="module")
+def limited_panel(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Panel:
+    mixture = parse_mixture('max_replays_per_row = 3\n[each_condition]\nshare = "natural"\n')
+    return panel_of(store_path, mixture, tmp_path_factory.mktemp("iterable") / "limited")
 
 
 def batches(dataset: PanelDataset, workers: int) -> list[dict[str, torch.Tensor]]:
@@ -77,6 +84,52 @@ def test_passes_are_repeated_or_renewed_by_epoch_and_seed(panel: Panel) -> None:
     assert [batch["row"].tolist() for batch in batches(dataset, 2)] != first
     other = PanelDataset(panel, 40, batches=3, seed=2)
     assert [batch["row"].tolist() for batch in batches(other, 0)] != first
+
+
+def passes(dataset: PanelDataset, count: int, **options: Any) -> list[list[list[int]]]:
+    """The row numbers of every batch of so many passes of one loader."""
+    loader = DataLoader(dataset, batch_size=None, **options)
+    found = []
+    for epoch in range(count):
+        dataset.set_epoch(epoch)
+        found.append([batch["row"].tolist() for batch in loader])
+    return found
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("limited", [False, True])
+def test_persistent_workers_are_told_of_the_epoch(
+    panel: Panel, limited_panel: Panel, method: str, limited: bool
+) -> None:
+    used = limited_panel if limited else panel
+    alone = passes(PanelDataset(used, 20, batches=3, seed=1), 3)
+    assert alone[0] != alone[1] != alone[2]
+    persistent = passes(
+        PanelDataset(used, 20, batches=3, seed=1),
+        3,
+        num_workers=2,
+        persistent_workers=True,
+        multiprocessing_context=method,
+    )
+    assert persistent == alone
+
+
+@pytest.mark.parametrize("method", [None, "fork", "spawn"])
+def test_ranks_share_one_sequence(panel: Panel, limited_panel: Panel, method: str | None) -> None:
+    from torch.testing._internal.distributed.fake_pg import FakeStore
+
+    options = {} if method is None else {"num_workers": 2, "multiprocessing_context": method}
+    for used in (panel, limited_panel):
+        (whole,) = passes(PanelDataset(used, 20, batches=6, seed=1), 1)
+        of_rank = []
+        for rank in range(2):
+            dataset = PanelDataset(used, 20, batches=3, seed=1)  # before there are ranks
+            torch.distributed.init_process_group("fake", rank=rank, world_size=2, store=FakeStore())
+            try:
+                of_rank.append(passes(dataset, 1, **options)[0])
+            finally:
+                torch.distributed.destroy_process_group()
+        assert of_rank == [whole[0::2], whole[1::2]]
 
 
 def test_an_endless_pass_goes_on(panel: Panel) -> None:
