@@ -46,7 +46,7 @@ IDENTITY: tuple[Column, ...] = (
     Column(
         "logged_ns",
         pa.int64(),
-        "time of the step as log time; null: stamp_ns + the recording's clock_offset_ns",
+        "the time stamp_ns as log time; ages are computed from it",  # null: by clock_offset_ns
         nullable=True,
     ),
 )
