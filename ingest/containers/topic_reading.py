@@ -173,14 +173,14 @@ class TopicReading:
         """All of it, in the order of log time."""
         log = self._log.column()
         fields: dict[str, FieldColumn] = {}
-        order = lap = None
+        order, lap = None, None
         backsteps = int((log[1:] < log[:-1]).sum())
         self._account.log_backsteps = 0 if self.interleaved else backsteps
         if backsteps:
             order = np.argsort(log, kind="stable")
             set_back = np.diff(log, prepend=log[:1]) < -FAR_BACK_NS
-            far = set_back.any() and not self.interleaved
-            lap = np.cumsum(set_back)[order] if far else None
+            if set_back.any() and not self.interleaved:
+                lap = np.cumsum(set_back, dtype=np.int64)[order]
             log = log[order]
         publish = log
         if self._publish is not None:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.ingest.steps.align import NS, TOLERANCE_S
-from restock.ingest.steps.clock_map import WINDOW_NS
-from restock.ingest.steps.clocks import median
+from restock.ingest.steps.clocks import WINDOW_NS, median
 
 _DELAYS = 200  # of each topic, of which the median counts
 _MINUTES = 10  # over which drift is looked for

@@ -25,7 +25,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.signal_paths import element_of
 from restock.ingest.steps.align import NS, ClockSegment, Samples
 from restock.ingest.steps.aligned_inputs import AlignedInputs
-from restock.ingest.steps.clock_map import ClockMap
+from restock.ingest.steps.clocks import ClockMap
 from restock.ingest.steps.filling import Filling
 from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.steps.needs import field_paths

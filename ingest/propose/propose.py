@@ -17,7 +17,7 @@ from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
 from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
-from restock.ingest.propose.evidence.gather import Evidence, gather, with_other_wheels
+from restock.ingest.propose.evidence.gather import Evidence, gather, without_first
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.roles import (
     REQUIRED,
@@ -68,9 +68,7 @@ class Proposal:
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
     commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
     kinds: list[RobotKind] = field(default_factory=list)  # where there are several: its own first
-    findings: list[Finding] = field(
-        default_factory=list
-    )  # where it contradicts itself
+    findings: list[Finding] = field(default_factory=list)  # where it contradicts itself
     wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 
@@ -136,7 +134,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         if trial.problem and BY_LOG_TIME in trial.problem and seen.clock.alignment == STAMP:
             seen = replace(seen, clock=by_log_time(seen.clock, seen.gaps, trial.problem))
             trial = tried(recording, "\n".join(profile_lines(seen, name, problems)))
-        seen, trial = _by_other_wheels(seen, name, trial)
+        seen, trial = _without_odd(seen, name, trial)
         seen, trial = _by_rate(recording, seen, name, trial)
         goal = seen.goal.tried(trial.transitions, trial.dropped)
         if goal != seen.goal and not goal_decided:
@@ -213,10 +211,12 @@ def _odd_commands(seen: Evidence) -> list[Advice]:
     return found
 
 
-def _by_other_wheels(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Trial]:
-    """Without odometry whose speed is another one than that of the poses."""
-    while off := [one for one in trial.findings if one.kind == "wheels"]:
-        other = with_other_wheels(seen, f"{off[0].topic} is not used: {off[0].what}.")
+def _without_odd(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Trial]:
+    """Without odometry and gyros whose speeds are other ones than those of the poses."""
+    roles = {"wheels": "wheels", "gyro": "imu"}
+    while off := [one for one in trial.findings if one.kind in roles]:
+        why = f"{off[0].topic} is not used, as {off[0].what}"
+        other = without_first(seen, roles[off[0].kind], why)
         if other is None:
             break
         seen = other

@@ -10,7 +10,7 @@ of another clock have no say in it, and count from their reception: commands (th
 they arrive) whose delay is another one, and what is stamped later than it was received while others
 are not. The offset is one
 constant a clock segment, unless it drifts by more than the tolerance, as it does where a simulation
-runs slower than real time: then log time is mapped piece by piece (`clock_map`). Either is measured
+runs slower than real time: then log time is mapped piece by piece (`ClockMap`). Either is measured
 over the whole segment, so it uses later messages' clocks, but never their values.
 
 Where the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and no
@@ -29,8 +29,15 @@ from numpy.typing import NDArray
 from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.decoding.columns import FieldColumn, TopicColumns
-from restock.ingest.steps.clock_map import ClockMap, drift_ns, residual_ns, spread_ns
-from restock.ingest.steps.clocks import STAMP, jumps, median
+from restock.ingest.steps.clocks import (
+    STAMP,
+    ClockMap,
+    drift_ns,
+    jumps,
+    median,
+    residual_ns,
+    spread_ns,
+)
 
 if TYPE_CHECKING:
     from restock.ingest.profile.tables import Clock

@@ -211,8 +211,8 @@ class Custom:
                 if column.unmeasured
             ]
             + [
-                f"signals.{name}: {count:,} of {len(column.values):,} messages do not have the length "
-                f"{column.signal.length}: null"
+                f"signals.{name}: {count:,} of {len(column.values):,} messages do not have the"
+                f" length {column.signal.length}: null"
                 for name, column in self.columns.items()
                 if (count := column.of_other_length)
             ]

@@ -24,9 +24,9 @@ from restock.files import first_line
 from restock.ingest.store.data_files import AddedFile, add_action, rewrite, unwritten
 from restock.ingest.store.lineage import StoredFile, active_files, own_path, stored_files
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
-from restock.ingest.store.protocol import expect_writable
 from restock.ingest.store.reader import StoreReader
 from restock.ingest.store.summary import SUMMARY_SCHEMA
+from restock.ingest.store.version import expect_writable
 from restock.ingest.task.schema import recording_schema
 
 ATTEMPTS = 12  # at a commit, when other writers are faster; Delta's library tries 15 times in each

@@ -28,13 +28,14 @@ from deltalake.fs import DeltaStorageHandler
 
 from restock.errors import StoreError, expect
 from restock.files import first_line
-from restock.ingest.store.protocol import expect_readable, unsupported
 from restock.ingest.store.version import (
     LOG,
     Version,
+    expect_readable,
     expect_whole,
     log_damage,
     split_version,
+    unsupported,
     version_at,
 )
 from restock.words import quoted

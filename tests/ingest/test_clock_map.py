@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from restock.ingest.steps.clock_map import ClockMap, residual_ns, spread_ns
+from restock.ingest.steps.clocks import ClockMap, residual_ns, spread_ns
 
 NS = 10**9
 DAY = 1_700_000_000 * NS

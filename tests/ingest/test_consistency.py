@@ -273,7 +273,7 @@ def test_profile_new_does_not_use_wheels_that_are_none(tmp_path, capsys):
     file = tmp_path / "p.toml"
     assert main(["profile", "new", str(bag), "--out", str(file), "--hindsight-goals"]) == 0
     text = file.read_text()
-    assert "# /odom is not used: its speed stays at 0 beside that of the poses of /odom" in text
+    assert "/odom is not used, as its speed stays at 0" in text
     assert "[motion]" in text
     assert "localiser_m" not in text
     assert "[inputs.wheels]\n" not in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -273,19 +272,20 @@ def _measured(
     return [], "; ".join(reasons)
 
 
-def with_other_wheels(seen: Evidence, why: str) -> Evidence | None:
-    """Without the odometry that the wheels' speeds were to come from: by the next topic that has
-    them, or by the poses. `why` is said in the profile. None where the poses are too few."""
-    roles = {**seen.roles, "wheels": seen.roles["wheels"][1:]}
-    if roles["wheels"]:
-        return replace(seen, roles=roles)
+def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
+    """Without the topic that an input was to come from: by the next one that fits; of wheels, else
+    by the poses. `why` is said in the profile. None where the poses are too few."""
+    roles = {**seen.roles, role: seen.roles[role][1:]}
+    reasons = "; ".join(filter(None, [seen.unmeasured.get(role, ""), why]))
+    seen = replace(seen, roles=roles, unmeasured={**seen.unmeasured, role: reasons})
+    if roles[role] or role != "wheels":
+        return seen
     frames = seen.frames if seen.poses_from_frames else None
     poses = pose_series(seen.recording, roles, frames, transform_edges(seen.recording))
     motion = choose_motion(seen.recording, *poses)
     if motion.problem:
         return None
-    motion = replace(motion, comments=(*textwrap.wrap(why, 96), *motion.comments))
-    return replace(seen, roles=roles, motion=motion)
+    return replace(seen, motion=motion)
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
