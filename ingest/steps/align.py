@@ -170,6 +170,8 @@ def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]
         for name in laps:
             of = topics[name].lap
             before, after = (topics[name].log_time_ns[of == lap + late] for late in (0, 1))
+            if not len(before) or not len(after):
+                return [{}]
             gone_ns.append(int(before.max() - after.min()))
         if min(gone_ns) <= 0 or max(gone_ns) - min(gone_ns) > round(LATENCY_S * NS):
             return [{}]
