@@ -10,10 +10,9 @@ from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.feed.imitation import cloned
 from restock.train.feed.practice import MOVING
-from restock.train.loop import TrainResult, time_left
+from restock.train.loop import TrainResult
 from restock.train.prepare import Prepared, rows_by_policy
 from restock.train.run.fed_shares import SHORT
-from restock.train.session import Session
 from restock.train.twin.env.floor_report import sealed
 from restock.train.twin.floors.floors import open_floors
 
@@ -112,25 +111,6 @@ def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
         | {name: f"{100 * row[column]:.1f}" for name, column in columns.items()}
         for row in fed
     ]
-
-
-def nothing_to_do(session: Session) -> str | None:
-    """Why a resumed run ends at once, and what to do; None where it goes on."""
-    progress, schedule = session.progress, session.config.schedule
-    if progress.evaluated_at != progress.env_steps:  # its last evaluation is still to be made
-        return None
-    if progress.stopped:
-        return f"the guard stopped it after {progress.env_steps:,} environment steps"
-    if not session.config.env.twin:
-        return "it learns from logs alone, and has made its updates"
-    if progress.env_steps >= schedule.env_steps:
-        return (
-            f"its budget of {schedule.env_steps:,} environment steps is used up;"
-            " give more with --env-steps N"
-        )
-    if not time_left(session):
-        return f"its budget of {schedule.seconds:g} s is used up; give more with --seconds S"
-    return None
 
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:

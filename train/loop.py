@@ -75,7 +75,7 @@ def train(
     stop: Callable[[], bool] = lambda: False,
     notify: Notify = lambda event, values: None,
 ) -> TrainResult:
-    """Run a session to the end of its budget.
+    """Run a session to the end of its budget; one that is there already is left as it is.
 
     Args:
         stop: asked between steps and while the policy is evaluated; True ends the run with a
@@ -89,6 +89,9 @@ def train(
             written.
         NotFinite: a loss or gradient is NaN or infinite; names the rows of the batch.
     """
+    if nothing_to_do(session) is not None:
+        return _result(session)
+    session.open_events()
     try:
         return _train(session, stop, notify)
     except TeacherFailed as error:
@@ -197,16 +200,21 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     session.run.append("episodes", session.collector.label(all_of_them=True))
     session.run.append("practice", session.practice.advance(session.steps, last=True))
-    if session.interval.updates or progress.env_steps > session.interval.env_steps_before:
+    if _interval_is_open(session):
         _close_interval(session, "warmup" if progress.online_from is None else "online", notify)
     if progress.evaluated_at != progress.env_steps:
         _evaluate(session, notify, stop)
     _note_silence(session, notify)
     _save(session)
     session.write_held()
+    return _result(session)
+
+
+def _result(session: Session) -> TrainResult:
+    progress = session.progress
     return TrainResult(
         progress.env_steps,
-        learner.gradient_steps,
+        session.learner.gradient_steps,
         progress.online_updates,
         session.wall_s,
         session.best,
@@ -214,6 +222,11 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
         progress.stopped,
         progress.rollbacks,
     )
+
+
+def _interval_is_open(session: Session) -> bool:
+    interval = session.interval
+    return bool(interval.updates) or session.progress.env_steps > interval.env_steps_before
 
 
 def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
@@ -498,6 +511,25 @@ def time_left(session: Session, part: float = 1.0) -> bool:
     if seconds is None or session.learner.gradient_steps < session.config.record.every_updates:
         return True
     return session.wall_s + session.progress.evaluation_s < part * seconds
+
+
+def nothing_to_do(session: Session) -> str | None:
+    """Return why a resumed run ends at once, and what to do; None if it goes on."""
+    progress, schedule = session.progress, session.config.schedule
+    if progress.evaluated_at != progress.env_steps or _interval_is_open(session):
+        return None  # its end is still to be made
+    if progress.stopped:
+        return f"the guard stopped it after {progress.env_steps:,} environment steps"
+    if not session.config.env.twin:
+        return "it learns from logs alone, and has made its updates"
+    if progress.env_steps >= schedule.env_steps:
+        return (
+            f"its budget of {schedule.env_steps:,} environment steps is used up;"
+            " give more with --env-steps N"
+        )
+    if not time_left(session):
+        return f"its budget of {schedule.seconds:g} s is used up; give more with --seconds S"
+    return None
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:

@@ -193,7 +193,9 @@ class Session(Stateful):
 
     def save(self) -> None:
         """Write all state to the run's latest checkpoint, and the tables to match it."""
-        keep(self.run.latest, self.progress.checkpointed_at, self.config.record.keep_checkpoints)
+        if self.progress.env_steps != self.progress.checkpointed_at:
+            count = self.config.record.keep_checkpoints
+            keep(self.run.latest, self.progress.checkpointed_at, count)
         self.progress.checkpointed_at = self.progress.env_steps
         self.progress.wall_s, self._started = self.wall_s, time.monotonic()
         self.run.flush()
@@ -209,6 +211,15 @@ class Session(Stateful):
         """
         self.feed.write_held()
         self.run.flush()
+
+    def open_events(self) -> None:
+        """Begin to write curves; in a run that goes on, those after its checkpoint are purged."""
+        run, record = self.run, self.config.record
+        from_step = self.progress.env_steps if run.latest.exists() else None
+        sinks = tracker_sinks(run, record.trackers)
+        if record.tensorboard:
+            sinks["tensorboard"] = lambda: TensorBoard(run.path / "tensorboard", from_step)
+        self.events = Events(run.path, sinks)
 
     def restore(self) -> None:
         """Go on from the run's latest checkpoint.
@@ -419,9 +430,4 @@ def open_session(
             config, learner, batches, session.imitation, session.log_terms
         )
     session.practice.check_reference()
-    from_step = session.progress.env_steps if resume else None
-    sinks = tracker_sinks(run, config.record.trackers)
-    if config.record.tensorboard:
-        sinks["tensorboard"] = lambda: TensorBoard(run.path / "tensorboard", from_step)
-    session.events = Events(run.path, sinks)
     return session

@@ -21,14 +21,14 @@ from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
 from restock.train import jump_start
-from restock.train.describe import no_update, nothing_to_do
+from restock.train.describe import no_update
 from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
 from restock.train.feed.logs import Coded, Logs, LogTerms
-from restock.train.loop import TrainingInterrupted, train
+from restock.train.loop import TrainingInterrupted, nothing_to_do, train
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import earlier, go_back
 from restock.train.run.run import Run
@@ -489,6 +489,43 @@ def test_a_run_whose_budget_is_used_up_says_so_when_it_is_resumed(
     undisturbed.progress.evaluated_at, before = 800, undisturbed.progress.evaluated_at
     assert nothing_to_do(undisturbed) is None  # its last evaluation was abandoned
     undisturbed.progress.evaluated_at = before
+
+
+def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path) -> None:
+    settings = config(
+        schedule={"env_steps": 1200}, record={"tensorboard": True, "keep_checkpoints": 2}
+    )
+    done = session(tmp_path / "run", settings)
+    outcome = train(done)
+    done.close()
+
+    def files() -> dict[Path, tuple[int, bytes]]:
+        found = (file for file in done.run.path.rglob("*") if file.is_file())
+        return {file: (file.stat().st_mtime_ns, file.read_bytes()) for file in found}
+
+    before = files()
+    assert any("tensorboard" in file.parts for file in before)
+    assert list(earlier(done.run.latest)) == [800]
+    for _ in range(2):
+        again = session(done.run.path, settings, resume=True)
+        assert train(again).env_steps == outcome.env_steps == 1200
+        again.close()
+    assert files() == before
+
+
+def test_a_resume_that_is_interrupted_at_once_keeps_the_earlier_checkpoints(
+    undisturbed: Session, tmp_path: Path
+) -> None:
+    path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
+    latest = path / "checkpoints" / undisturbed.run.latest.name
+    kept = list(earlier(latest))
+    assert kept
+    for _ in range(3):
+        live = session(path, config(schedule={"env_steps": 2400}), resume=True)
+        with pytest.raises(TrainingInterrupted):
+            train(live, stop=lambda: True)
+        live.close()
+    assert list(earlier(latest)) == kept
 
 
 def test_updates_keep_the_asked_ratio(undisturbed: Session) -> None:

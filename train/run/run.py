@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 FORMAT = "restock-run/2"
 _EARLIER = ("restock-run/1",)
 _LONG_TABLE = 4096  # rows
+_UNKNOWN = -1  # rows on disk: others than those in memory, so the next flush writes them
 _AGAIN = "restore the file from a copy, or train the run again"
 Rows = Sequence[Mapping[str, Any]]
 
@@ -115,7 +116,7 @@ class Run:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on from a pickled run: the next flush writes all tables, without rows of later."""
         vars(self).update(state)
-        self._on_disk = dict.fromkeys(TABLES, -1)
+        self._on_disk = dict.fromkeys(TABLES, _UNKNOWN)
 
     @property
     def latest(self) -> Path:
@@ -213,7 +214,7 @@ class Run:
         return {name: self.table(name).num_rows for name in TABLES}
 
     def truncate(self, counts: Mapping[str, int]) -> None:
-        """Remove rows that were written after the checkpoint of `counts`.
+        """Forget rows that were written after the checkpoint of `counts`; `flush` removes them.
 
         Raises:
             RunError: a table has fewer rows than the checkpoint knew of.
@@ -228,7 +229,7 @@ class Run:
                 )
             self._written[name] = table.slice(0, count)
             if table.num_rows != count:
-                self._write(name)
+                self._on_disk[name] = _UNKNOWN
 
 
 def check_free(path: Path, remedy: str | None = None) -> None:

@@ -117,9 +117,9 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
     from restock.interrupts import went_on_after_interrupt
-    from restock.train.describe import describe_run, nothing_to_do
+    from restock.train.describe import describe_run
     from restock.train.flush_fresh import flush
-    from restock.train.loop import TrainingInterrupted, train
+    from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming
 
     config = prepared.config
