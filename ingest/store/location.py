@@ -104,7 +104,7 @@ class Location:
         if _SECRET.match(text):
             raise StoreError(
                 "a store's address must not hold a key and its secret",
-                where=f"{text.partition(':')[0]}://***:***@{text.rpartition('@')[2]}",
+                where=text,
                 remedy="give the address without them, and set AWS_ACCESS_KEY_ID and"
                 " AWS_SECRET_ACCESS_KEY; make a new secret if others can read this line",
             )

@@ -7,9 +7,15 @@ Python they are ordinary exceptions, all below `RestockError`.
 from __future__ import annotations
 
 import os
+import re
 from enum import IntEnum
 
 TRACEBACK = "RESTOCK_TRACEBACK"  # of the environment: print tracebacks
+
+
+def told(text: str, keep: str = "") -> str:
+    """The text as `visible`, without key and secret of an address such as `s3://KEY:SECRET@…`."""
+    return visible(_SECRET.sub(r"\1***:***@", text), keep)
 
 
 def visible(text: str, keep: str = "") -> str:
@@ -46,15 +52,18 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130  # Ctrl-C
 
 
+_SECRET = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]+:/{1,2})[^/@\s]*:\S*@")
+
+
 class RestockError(Exception):
     """An error that the user can fix: `what` is wrong, `where`, and the `remedy`."""
 
     exit_code = ExitCode.USAGE
 
     def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
-        # They quote what files say, and end up on a terminal.
-        what, remedy = visible(what, keep="\n"), remedy and visible(remedy, keep="\n")
-        where = where and visible(where)
+        # They quote what files and people say, and end up on a terminal.
+        what, remedy = told(what, keep="\n"), remedy and told(remedy, keep="\n")
+        where = where and told(where)
         self.what, self.where, self.remedy = what, where, remedy
         parts = [f"{where}: {what}" if where else what]
         if remedy:

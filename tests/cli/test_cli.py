@@ -236,3 +236,17 @@ def test_an_empty_path_is_not_the_working_directory(
     assert cli.main(words) == 2
     assert "variable of the shell not set" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("verb", ["info", "ingest", "sql", "mix"])
+def test_no_verb_repeats_a_secret_that_was_typed_into_an_address(verb, capsys, tmp_path):
+    more = {
+        "ingest": ["--store", str(tmp_path)],
+        "sql": ["SELECT 1"],
+        "mix": ["--mixture", "uniform"],
+    }
+    more["mix"] += ["--out", str(tmp_path / "p")]
+    assert cli.main([verb, "s3://AKIA:hu/sh@bucket/logs", *more.get(verb, [])]) == 2
+    said = "".join(capsys.readouterr())
+    assert "***:***@bucket/logs" in said
+    assert "hu/sh" not in said
