@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from restock.errors import RunError, StoreError
-from restock.files import read_json
+from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
 from restock.replay.store.definitions import definitions
-from restock.replay.store.parquet_views import read_parquet
+from restock.replay.store.parquet_views import REMAKE, read_parquet
 from restock.replay.store.store import Store, is_store
 
 RUN_CONFIG = "config.json"
@@ -122,6 +122,7 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
     if (path / HEADER).is_file():
         panel = Panel.open(path)
         for view, name in (("rows", META), ("evaluation_split", EVALUATION_SPLIT)):
+            panel.header.files[name].check(path / name, verify=True)
             _add_table(connection, schema, view, path / name)
         strata = pa.Table.from_pylist([msgspec.structs.asdict(s) for s in panel.strata])
         _keep(connection, schema, "strata", strata)
@@ -132,6 +133,8 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
     files = {file.stem: file for file in tables}
     files |= {f"eval_{file.stem}": file for file in sorted(path.glob("eval/*.parquet"))}
     for view, file in files.items():
+        # DuckDB verifies no checksum of a page.
+        read_table(file, error=StoreError, remedy=REMAKE)
         read_parquet(connection, view, [file], schema=schema)
         for field in pq.read_schema(file):
             if meaning := (field.metadata or {}).get(b"meaning", b"").decode():

@@ -25,6 +25,7 @@ _FILE = re.compile(
 _NAMELESS = re.compile(
     r"TProtocolException|[Dd]ecompress|[Tt]hrift|[Pp]arquet (?:file|page|reader)"
 )
+REMAKE = "restore the file from a copy, or make it again with the verb that wrote it"
 _OTHER = (
     *(duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException),
     *(duckdb.OutOfMemoryException, duckdb.InterruptException),
@@ -68,7 +69,7 @@ def read_parquet(
         raise StoreError(
             f"cannot be read: {first_line(error)}",
             where=where,
-            remedy="restore the file from a copy, or make it again with the verb that wrote it",
+            remedy=REMAKE,
         ) from error
 
 

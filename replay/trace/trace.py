@@ -13,12 +13,14 @@ from typing import Any
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 
 from restock.errors import PanelError, RunError, StoreError
-from restock.files import read_json
+from restock.files import read_json, read_table
 from restock.ingest.store.version import Version
 from restock.replay.panel.panel import HEADER, Panel
 from restock.replay.places import RUN_CONFIG
+from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store, is_store
 from restock.replay.trace.origin import Origin, StoreVersion, find_origin, rows_of, sql_file
 from restock.words import quoted
@@ -96,9 +98,9 @@ def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
             where=str(run),
             remedy="give ROW: a row number of a panel, or a transition id of a store",
         )
-    table = _audit_table(Path(run))
-    with duckdb.connect() as connection:
-        return rows_of(connection, sql_file("trace_rows.sql"), {"file": table, "limit": limit})
+    table = _run_table(Path(run), "audit")
+    with duckdb.connect() as connection, passed_in(connection, audit=table):
+        return rows_of(connection, sql_file("trace_rows.sql"), {"limit": limit})
 
 
 def _of_run(trace: Trace, run: Path, row: str, where: TracePlaces) -> None:
@@ -162,10 +164,10 @@ def _of_twin(
     trace: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
     """A fresh row: its episode of the twin, and how that is laid out again."""
-    query = "FROM read_parquet($file) WHERE episode = $episode"
-    values = {"file": str(run / "episodes.parquet"), "episode": int(audit["episode"])}
-    with duckdb.connect() as connection:
-        rows = rows_of(connection, query, values)
+    query = "FROM episodes WHERE episode = $episode"
+    table = _run_table(run, "episodes")
+    with duckdb.connect() as connection, passed_in(connection, episodes=table):
+        rows = rows_of(connection, query, {"episode": int(audit["episode"])})
     trace.episode = {"run_seed": document.get("seeds", {}).get("run")}
     if not rows:
         trace.notes.append(
@@ -188,7 +190,7 @@ def _of_twin(
 
 
 def _audit_row(run: Path, row: str) -> dict[str, Any]:
-    table = _audit_table(run)
+    table = _run_table(run, "audit")
     step, _, place = row.partition("/")
     if not (step.isdecimal() and place.isdecimal()):
         raise RunError(
@@ -197,9 +199,9 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
             remedy="write STEP/ROW, a gradient step and a row of its batch, e.g. 1200/17;"
             f" `restock trace {quoted(run)}` lists some",
         )
-    query = "FROM read_parquet($file) WHERE gradient_step = $step AND batch_row = $place"
-    values = {"file": table, "step": int(step), "place": int(place)}
-    with duckdb.connect() as connection:
+    query = "FROM audit WHERE gradient_step = $step AND batch_row = $place"
+    values = {"step": int(step), "place": int(place)}
+    with duckdb.connect() as connection, passed_in(connection, audit=table):
         rows = rows_of(connection, query, values)
     if not rows:
         raise RunError(
@@ -211,11 +213,13 @@ def _audit_row(run: Path, row: str) -> dict[str, Any]:
     return rows[0]
 
 
-def _audit_table(run: Path) -> str:
-    table = run / "audit.parquet"
-    if not table.is_file():
-        raise RunError("it has no audit.parquet", where=str(run), remedy="train the run first")
-    return str(table)
+def _run_table(run: Path, name: str) -> pa.Table:
+    file = run / f"{name}.parquet"
+    if not file.is_file():
+        raise RunError(f"it has no {file.name}", where=str(run), remedy="train the run first")
+    return read_table(
+        file, error=RunError, remedy="restore the file from a copy, or train the run again"
+    )
 
 
 def _number(row: str, where: Path, what: str) -> int:

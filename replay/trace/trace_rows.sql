@@ -14,6 +14,6 @@ SELECT
     reward,
     q,
     td
-FROM read_parquet($file)
+FROM audit
 ORDER BY abs(td) DESC, gradient_step, batch_row
 LIMIT $limit

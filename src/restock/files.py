@@ -33,10 +33,17 @@ def read_table(
 ) -> pa.Table:
     """The rows of a Parquet file; checksums of its pages are verified where it has them.
 
+    Columns of `schema` that it lacks are null. One that `schema` lacks is refused: its name may be
+    damaged, which no checksum covers.
+
     Raises:
         RestockError: (of the kind `error`) there is no such file, or it is damaged.
     """
     try:
+        if schema is not None:
+            for name in pq.read_schema(path).names:
+                if name not in schema.names:
+                    raise pa.ArrowInvalid(f"it has an unknown column {name!r}")
         return pq.read_table(
             path,
             schema=schema,

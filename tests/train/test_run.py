@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import duckdb
@@ -11,7 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 from support.paths import ROOT
 
-from restock.errors import RunError
+from restock.errors import RestockError, RunError
+from restock.replay.places import open_place
 from restock.train.run.run import Run, check_free
 from restock.train.run.run_tables import EVAL_EPISODES, TABLES, rewrite
 
@@ -44,6 +46,40 @@ def test_rows_are_readable_by_others_after_a_flush(tmp_path: Path) -> None:
     run.flush()
     total = duckdb.sql(f"SELECT sum(rows) FROM '{run.path}/policies.parquet'").fetchall()
     assert total == [(100,)]
+
+
+def read_policies(run: Path) -> list[dict[str, object]]:
+    return Run.open(run).table("policies").to_pylist()
+
+
+def select_policies(run: Path) -> list[dict[str, object]]:
+    with open_place(run) as connection:
+        return connection.sql("FROM policies").to_arrow_table().to_pylist()
+
+
+@pytest.mark.parametrize("read", [read_policies, select_policies])
+def test_no_flipped_bit_of_a_table_is_read_in_silence(
+    tmp_path: Path, read: Callable[[Path], list[dict[str, object]]]
+) -> None:
+    run = Run.create(tmp_path / "a", {})
+    counts = {**policies(0, 0), "rows": np.arange(40) ** 2, "env_steps": np.arange(40)}
+    run.append_columns("policies", counts)
+    run.flush()
+    file = run.path / "policies.parquet"
+    whole, rows = file.read_bytes(), read(run.path)
+    refused = 0
+    # DuckDB is not given the names of the columns, which stand in the footer.
+    end = len(whole) - (8 + int.from_bytes(whole[-8:-4], "little")) * (read is select_policies)
+    for place in range(4, end, 7):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << place % 8
+        file.write_bytes(flipped)
+        try:
+            assert read(run.path) == rows
+        except RestockError as error:
+            assert "policies.parquet" in str(error)
+            refused += 1
+    assert refused > 40
 
 
 def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:

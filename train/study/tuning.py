@@ -24,10 +24,9 @@ from urllib.parse import quote
 
 import msgspec
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from restock.errors import RestockError, RunError
-from restock.files import write_text
+from restock.files import read_table, write_text
 from restock.imports import import_extra
 from restock.interrupts import ended_with_us, kill_as_interrupt
 from restock.stats import wilson
@@ -261,7 +260,7 @@ def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:
         return False
     import pyarrow.compute as pc  # slow to import
 
-    table = pq.read_table(file, columns=["env_steps", "condition", "success"])
+    table = read_table(file, columns=["env_steps", "condition", "success"], error=RunError)
     for steps in sorted(set(table["env_steps"].to_pylist()) - told):
         told.add(steps)
         bound, _ = worst_condition([table.filter(pc.equal(table["env_steps"], steps))])
