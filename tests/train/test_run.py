@@ -67,7 +67,7 @@ def test_no_flipped_bit_of_a_table_is_read_in_silence(
     run.flush()
     file = run.path / "policies.parquet"
     whole, rows = file.read_bytes(), read(run.path)
-    refused = 0
+    refused = []
     # DuckDB is not given the names of the columns, which stand in the footer.
     end = len(whole) - (8 + int.from_bytes(whole[-8:-4], "little")) * (read is select_policies)
     for place in range(4, end, 7):
@@ -77,9 +77,9 @@ def test_no_flipped_bit_of_a_table_is_read_in_silence(
         try:
             assert read(run.path) == rows
         except RestockError as error:
-            assert "policies.parquet" in str(error)
-            refused += 1
-    assert refused > 40
+            refused.append(str(error))
+    assert len(refused) > 40
+    assert all("policies.parquet" in said for said in refused)
 
 
 def test_a_long_table_waits_until_it_has_grown(tmp_path: Path) -> None:

@@ -84,6 +84,7 @@ def to_onnx(network: PolicyNetwork) -> Any:
     graph.node("Identity", [values], "values")
     graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
     tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
+    opsets = [onnx.helper.make_opsetid("", _OPSET)]
     return onnx.helper.make_model(
         onnx.helper.make_graph(
             graph.nodes,
@@ -95,8 +96,9 @@ def to_onnx(network: PolicyNetwork) -> Any:
             ],
             graph.constants,
         ),
-        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
-        ir_version=10,  # of the format; runtimes of the last years read it
+        opset_imports=opsets,
+        # The oldest format that has these operators: robots have old runtimes, which refuse others.
+        ir_version=onnx.helper.find_min_ir_version_for(opsets),
         producer_name="restock",
         producer_version=__version__,
     )
