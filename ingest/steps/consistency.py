@@ -28,8 +28,10 @@ STEPS_PER_WINDOW = 2 / 3  # of its time that must be known
 BEYOND, BEYOND_MPS = 1.5, 0.1  # times the fastest command or wheels, and a margin
 OFTEN = 0.02  # of the steps
 LEAST_STEPS = 5
+JUMP_M = 0.2  # further than that, less is the localiser's noise
 LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
-MOST_LEAD_S = 2.0
+MOST_LEAD_S = 1.0
+LEAST_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
 
 
 @dataclass(frozen=True)
@@ -151,16 +153,16 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
     wheels = np.abs(signals["wheel_speed_mps"])[joined]
     most = max(fastest_mps, float(np.percentile(wheels, 99)) if len(wheels) else 0.0)
     limit = BEYOND * most + BEYOND_MPS + noise_mps
-    beyond = joined & (np.abs(signals["localised_speed_mps"]) > limit)
+    speed = np.abs(signals["localised_speed_mps"])
+    beyond = joined & (speed > limit) & ((speed - most) * drive.seconds > JUMP_M)
     count = int(beyond.sum())
     if count < max(LEAST_STEPS, OFTEN * joined.sum()):
         return []
-    speed = float(np.median(np.abs(signals["localised_speed_mps"][beyond])))
     return [
         Finding(
             "sources",
             topic,
-            f"its poses step at {speed:.2g} m/s (median) where neither commands nor wheels exceed"
+            f"its poses step at {np.median(speed[beyond]):.2g} m/s (median) where neither commands nor wheels exceed"
             f" {most:.2g} m/s",
             count,
             "two publishers on one topic, or a localiser that jumps",
@@ -228,7 +230,7 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
         by_lag = [_correlation(asked, did, drive.joined, lag) for lag in range(-most, most + 1)]
         best = int(np.argmax(by_lag))
         lead = most - best  # steps by which the motion comes before
-        if lead >= 1 and by_lag[best] > max(SURE, by_lag[most] + LEADS):
+        if lead >= 1 and by_lag[best] > max(SURE, max(by_lag[most:]) + LEADS):
             return [
                 Finding(
                     "order",
@@ -251,7 +253,7 @@ def _correlation(asked: F64, did: F64, joined: Bools, lag: int) -> float:
     elif lag < 0:
         asked, did, joined = asked[-lag:], did[:lag], joined[-lag:] & joined[:lag]
     asked, did = asked[joined], did[joined]
-    if len(asked) < 10 * LEAST_STEPS or asked.std() < 1e-3 or did.std() < 1e-3:
+    if len(asked) < LEAST_FOLLOWED or asked.std() < 1e-3 or did.std() < 1e-3:
         return -1.0
     return float(np.corrcoef(asked, did)[0, 1])
 

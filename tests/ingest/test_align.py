@@ -90,7 +90,7 @@ def test_a_clock_that_jumps_back_starts_a_segment_and_no_hold_crosses_it():
     assert not segments[1].topics["/slow"].hold(first_tick, None).known[0]  # not the old one's
     assert segments[1].topics["/goal"].hold(first_tick, None).known[0]  # latched: still holds
     # Headerless topics are mapped by their own segment's offset.
-    assert segments[1].offset_ns - segments[0].offset_ns == 5 * NS
+    assert segments[1].clock_map.offset_ns - segments[0].clock_map.offset_ns == 5 * NS
 
 
 def test_one_bad_stamp_is_left_out_and_counted_and_is_no_jump():

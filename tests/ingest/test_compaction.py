@@ -56,6 +56,7 @@ def test_ingest_goes_on_after_another_tool_compacted_the_files(tmp_path):
         assert store.version > version
         after = store.sql("FROM transitions WHERE recording_id LIKE '%3'").to_arrow_table()
     written = one(3)[1].rename_columns({"condition": "primary_condition"})
+    written = written.drop_columns("logged_ns")  # null: the view works it out
     for name, values in written.to_pydict().items():
         assert after.sort_by("transition_id")[name].to_pylist() == values, name
 

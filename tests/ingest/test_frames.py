@@ -161,7 +161,7 @@ def test_a_transform_stamped_ahead_counts_from_when_it_was_received():
     tree = tree_of(Frames(), moving, [], ahead_s=1.0)
     found = tree.place("base_link", at(0.1, 1.01, 2.6))
     assert found.translation_m[:, 0].tolist() == [0.0, 1.0, 2.5]
-    assert tree.segments[0].offset_ns == 2_000_000
+    assert tree.segments[0].clock_map.offset_ns == 2_000_000
 
 
 def test_a_frame_that_gets_another_parent_is_counted_and_followed():
