@@ -162,8 +162,8 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
         Finding(
             "sources",
             topic,
-            f"its poses step at {np.median(speed[beyond]):.2g} m/s (median) where neither commands nor"
-            f" wheels exceed {most:.2g} m/s",
+            f"its poses step at {np.median(speed[beyond]):.2g} m/s (median) where neither commands"
+            f" nor wheels exceed {most:.2g} m/s",
             count,
             "two publishers on one topic, or a localiser that jumps",
             "record each publisher on a topic of its own, or name another pose in [inputs.pose]",
