@@ -139,7 +139,7 @@ def test_mix_says_which_of_two_profiles_of_a_task_the_panel_carries(
             "sql = \"EXISTS (FROM read_text('/etc/hostname'))\"",
             "reads",
         ),
-        ("x = " + "[" * 100_000, "is not TOML"),
+        ("x = " + "[" * 100_000, "nested more than 64 levels deep"),
         ("unknown = 1\n", "unknown"),
     ],
 )
