@@ -42,7 +42,6 @@ def describe_recording(
         RecordingError: it cannot be opened; see `open_recording`.
     """
     with open_recording(path, typestore=typestore, salvage=salvage, watch=watch) as recording:
-        topics = recording.topics  # notes which have several types
         span = recording.span_ns
         duration_s = (span[1] - span[0]) / NANOSECONDS if span else None
         notes = list(recording.notes)
@@ -71,7 +70,7 @@ def describe_recording(
                     "qos": offered(recording.qos(topic.name)),
                     **({"clock": compared.get(topic.name)} if clocks else {}),
                 }
-                for topic in topics.values()
+                for topic in recording.topics.values()
             },
             "chunks": [packed._asdict() for packed in recording.packed],
             "attachments": [

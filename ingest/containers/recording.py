@@ -110,6 +110,8 @@ class Recording:
         for storage in self._storages:
             for channel in storage.channels.values():
                 self._streams.setdefault(channel.topic, []).append(_Stream(storage, channel))
+        several = map(self._several_types, sorted(self._streams))
+        self.notes += [note for note in several if note]
 
     @cached_property
     def recording_id(self) -> str:
@@ -127,10 +129,8 @@ class Recording:
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
-        """Every topic by name, in alphabetical order. Those of several types are noted."""
-        topics = {name: self._info(name) for name in sorted(self._streams)}
-        self.notes += [note for name in topics if (note := self._several_types(name))]
-        return topics
+        """Every topic by name, in alphabetical order."""
+        return {name: self._info(name) for name in sorted(self._streams)}
 
     def _info(self, name: str) -> TopicInfo:
         streams = self._streams[name]

@@ -129,11 +129,11 @@ class TopicColumns:
         return len(self.log_time_ns)
 
     def laps(self) -> int:
-        """How often log time goes far back in the file."""
+        """Count how often log time goes far back in the file."""
         return 0 if self.lap is None else int(self.lap.max(initial=0))
 
     def gaps_s(self) -> F64:
-        """Seconds from each message to the next; none across a time that log time goes back."""
+        """Return the seconds from each message to the next; none where log time goes far back."""
         if self.lap is None:
             return np.asarray(np.diff(self.log_time_ns) * 1e-9, np.float64)
         laps = [self.log_time_ns[self.lap == lap] for lap in range(self.laps() + 1)]

@@ -212,7 +212,7 @@ def _odd_commands(seen: Evidence) -> list[Advice]:
 
 
 def _without_odd(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Trial]:
-    """Without odometry and gyros whose speeds are other ones than those of the poses."""
+    """Leave out odometry and gyros whose speeds are other ones than those of the poses."""
     roles = {"wheels": "wheels", "gyro": "imu"}
     while off := [one for one in trial.findings if one.kind in roles]:
         why = f"{off[0].topic} is not used, as {off[0].what}"

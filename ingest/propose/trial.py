@@ -98,7 +98,7 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
         advice,
         problem,
         steps.findings,
-        None if steps.findings else _pose_noise_m(steps, profile.task),
+        _pose_noise_m(steps, profile.task) if all(f.repaired for f in steps.findings) else None,
     )
 
 

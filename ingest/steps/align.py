@@ -8,10 +8,10 @@ A topic without a header is put on a `header.stamp` clock by subtracting the rec
 the smallest, over the stamped topics, of the median of (log time - stamp). Topics whose stamps are
 of another clock have no say in it, and count from their reception: commands (they take effect when
 they arrive) whose delay is another one, and what is stamped later than it was received while others
-are not. The offset is one
-constant a clock segment, unless it drifts by more than the tolerance, as it does where a simulation
-runs slower than real time: then log time is mapped piece by piece (`ClockMap`). Either is measured
-over the whole segment, so it uses later messages' clocks, but never their values.
+are not. The offset is one constant a clock segment, unless it drifts by more than the tolerance, as
+it does where a simulation runs slower than real time: then log time is mapped piece by piece
+(`ClockMap`). Either is measured over the whole segment, so it uses later messages' clocks, but
+never their values.
 
 Where the clock itself jumps (a simulation restarted, a clock set) a new segment starts, and no
 hold reaches across but that of latched topics.
@@ -158,9 +158,9 @@ def align(
 
 
 def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
-    """The messages of each topic before and after each time at which the recorder's clock was set
-    back: that log time goes back on every frequent topic, by about as much, and over what was
-    recorded. One empty part where it was not."""
+    """Split each topic's messages where the recorder's clock was set back: log time goes back on
+    every frequent topic, by about as much, and over what was recorded. Returns one empty part if it
+    was not."""
     laps = {name: one.laps() for name, one in topics.items() if len(one) >= OFTEN}
     if not laps or len(set(laps.values())) > 1 or not max(laps.values()):
         return [{}]
@@ -184,7 +184,7 @@ def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]
 
 
 def _part(columns: TopicColumns, rows: NDArray[np.intp]) -> TopicColumns:
-    """The times of some messages of a topic."""
+    """Take the times of some messages of a topic."""
     kept = columns.fields.keys() & {STAMP, CLOCK_FIELD}
     fields: dict[str, FieldColumn] = {n: np.asarray(columns.fields[n])[rows] for n in kept}
     return TopicColumns(columns.log_time_ns[rows], columns.publish_time_ns[rows], fields)
@@ -199,7 +199,7 @@ def _align(
     tolerance_s: float,
     report: ClockReport,
 ) -> list[ClockSegment]:
-    """The segments of topics whose log time is never set back."""
+    """Align topics whose log time is never set back."""
     simulated = topics.get(CLOCK_TOPIC)
     if simulated is not None and CLOCK_FIELD in simulated.fields:
         topics = {name: columns for name, columns in topics.items() if name != CLOCK_TOPIC}
@@ -262,8 +262,8 @@ def stamped_topics(
 
 
 def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
-    """The topics stamped after their reception, and by how many ns, where others are stamped by the
-    recorder's clock; none where all are ahead (the recorder's clock is behind)."""
+    """Find the topics stamped after their reception, and by how many ns, if others are stamped by
+    the recorder's clock; none if all are ahead (the recorder's clock is behind)."""
     medians = {name: median(delay_ns(columns)) for name, columns in stamped.items()}
     limit = round(IMPOSSIBLE_S * NS)
     if not any(-limit < each < LATENCY_S * NS for each in medians.values()):

@@ -240,7 +240,7 @@ def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> Aligne
 
 
 def _command_topics(inputs: InputColumns) -> frozenset[str]:
-    """The topics of which only commands are taken: they take effect when they are received."""
+    """Find the topics of which only commands are taken: they take effect when they are received."""
     topics: dict[bool, set[str]] = {True: set(), False: set()}
     for name, source in inputs.by_name.items():
         asks = name in ("command", "nav_command", COMMAND_THROUGH) or name.startswith(

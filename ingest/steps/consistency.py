@@ -51,11 +51,11 @@ class Finding:
 
     @property
     def told(self) -> str:
-        """As a line for people."""
+        """Return it as a line for people."""
         return f"{'repaired' if self.repaired else 'contradicts itself'}: {self}"
 
     def as_row(self) -> dict[str, str | int | bool]:
-        """Plain values, as `recordings.findings` holds them."""
+        """Return plain values, as `recordings.findings` holds them."""
         return asdict(self)
 
 
@@ -70,7 +70,7 @@ class Drive:
 
     @classmethod
     def of(cls, signals: Signals, segment: Ints, problem: Sequence[str], longest_s: float) -> Drive:
-        """The steps of `signals`; those further apart than `longest_s` are not joined."""
+        """Make it of `signals`; steps further apart than `longest_s` are not joined."""
         stamp = np.asarray(signals["stamp_ns"], np.int64)
         usable = np.array([each == "" for each in problem], np.bool_)
         gap_s = np.diff(stamp, prepend=stamp[:1]) / NS
@@ -84,24 +84,24 @@ class Drive:
         return cls(signals, joined, np.where(joined, gap_s, 0.0), window)
 
     def sums(self, values: F64) -> F64:
-        """The sum of values (T,) in each window (W,), of joined steps."""
+        """Return the sum of values (T,) in each window (W,), of joined steps."""
         known = np.where(self.joined, np.nan_to_num(values), 0.0)
         return np.asarray(np.bincount(self.window, known), np.float64)
 
     def driven(self, name: str) -> F64:
-        """What a speed (T,) integrates to in each window (W,), with its sign."""
+        """Return what a speed (T,) integrates to in each window (W,), with its sign."""
         speed = np.asarray(self.signals[name], np.float64)
         return self.sums((speed + np.roll(speed, 1)) / 2 * self.seconds)
 
     def full(self) -> Bools:
-        """The windows (W,) of which enough is known."""
+        """Return which windows (W,) are known for enough of their time."""
         return np.asarray(self.sums(self.seconds) > STEPS_PER_WINDOW * WINDOW_S)
 
 
 def findings_of(
     aligned: AlignedInputs, signals: Signals, segment: Ints, problem: Sequence[str]
 ) -> list[Finding]:
-    """What in a recording contradicts itself, of its steps' signals (T,)."""
+    """Find what contradicts itself in a recording, by its steps' signals (T,)."""
     profile = aligned.profile
     found = clock_findings(aligned.clock, len(problem))
     if not len(problem):
@@ -125,8 +125,8 @@ def findings_of(
 
 
 def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
-    """Where the recorder's clock was set back, and the topics whose stamps are of another clock
-    than the others', and were not used."""
+    """Find where the recorder's clock was set back, and the topics whose stamps are of another
+    clock than the others', and were not used."""
     found = []
     if clock.set_back:
         what = (
@@ -148,7 +148,7 @@ def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
 
 
 def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: float) -> list[Finding]:
-    """Poses that step further than anything drove."""
+    """Find poses that step further than anything drove."""
     signals, joined = drive.signals, drive.joined
     wheels = np.abs(signals["wheel_speed_mps"])[joined]
     most = max(fastest_mps, float(np.percentile(wheels, 99)) if len(wheels) else 0.0)
@@ -172,7 +172,7 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
 
 
 def _wheels(drive: Drive, topic: str, poses: str, fastest_mps: float) -> list[Finding]:
-    """Wheels whose speed or yaw rate is another one than that of the poses."""
+    """Find wheels whose speed or yaw rate is another one than that of the poses."""
     wheels = drive.driven("wheel_speed_mps")
     along = drive.driven("localised_speed_mps")
     path = np.maximum(np.abs(wheels), np.abs(along))
@@ -186,7 +186,7 @@ def _wheels(drive: Drive, topic: str, poses: str, fastest_mps: float) -> list[Fi
 
 
 def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
-    """The angles by a yaw rate and by the poses, of the windows in which the robot turned."""
+    """Return the angles by a yaw rate and by the poses, of windows in which the robot turned."""
     yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
     by_rate, by_pose = drive.driven(name), drive.sums(wrap_angle(yaw - np.roll(yaw, 1)))
     turned = drive.full() & (np.maximum(np.abs(by_rate), np.abs(by_pose)) > TURNS_RAD)
@@ -196,7 +196,7 @@ def _windows_of_turns(drive: Drive, name: str) -> tuple[F64, F64]:
 
 
 def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: int) -> list[Finding]:
-    """A finding where a source is off from the poses in one direction in three of four windows.
+    """Find a source that is off from the poses in one direction in three of four windows.
 
     `of`: the finding's kind, its topic, what is compared, and the poses' topic.
     """
@@ -213,7 +213,8 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
         cause = "another sign, or another frame"
     elif high >= 1 / APART and low <= APART:
         return []
-    said = f"{what} {size} that of the poses of {pose_topic}, in {len(ratio)} stretches of 3 s"
+    said = f"{what} {size} that of the poses of {pose_topic}"
+    said += f", in {len(ratio)} stretches of {WINDOW_S:g} s"
     remedy = {
         "wheels": "take the speeds from the poses ([motion] instead of [inputs.wheels]), or"
         " correct what publishes it",
@@ -223,7 +224,7 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
 
 
 def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:
-    """Motion that comes before the command that it follows."""
+    """Find motion that comes before the command that it follows."""
     most = max(1, round(MOST_LEAD_S / period_s))
     for name in ("speed_mps", "yaw_rate_radps"):
         asked, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
@@ -247,7 +248,7 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
 
 
 def _correlation(asked: F64, did: F64, joined: Bools, lag: int) -> float:
-    """How well a motion (T,) follows a command (T,) `lag` steps later; -1 if little is known."""
+    """Return how well a motion (T,) follows a command (T,) `lag` steps later; -1: unknown."""
     if lag > 0:
         asked, did, joined = asked[:-lag], did[lag:], joined[:-lag] & joined[lag:]
     elif lag < 0:

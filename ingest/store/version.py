@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -229,14 +229,11 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
     Raises:
         StoreError: the table uses a feature that Restock cannot read.
     """
-    protocol, name = table.protocol(), table.table_uri.rstrip("/").rpartition("/")[2]
-    version = protocol.min_reader_version
-    if version > _LISTED_READER:
-        raise _unreadable(f"version {version} of the protocol (minReaderVersion)", name, where)
-    listed = version == _LISTED_READER and protocol.reader_features
-    for feature in listed or _legacy(_BY_READER_VERSION, version):
-        if feature not in _READ and _in_use(table, feature):
-            raise _unreadable(f"feature `{feature}`", name, where)
+    protocol = table.protocol()
+    asked = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
+    for feature, what in _asked(table, *asked, _BY_READER_VERSION, "minReaderVersion"):
+        if feature not in _READ:
+            raise _unreadable(what, _name(table), where)
 
 
 def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) -> None:
@@ -245,15 +242,34 @@ def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) ->
     Raises:
         StoreError: the table uses a feature that Restock cannot write.
     """
-    protocol, name = table.protocol(), table.table_uri.rstrip("/").rpartition("/")[2]
-    version = protocol.min_writer_version
-    if version > _LISTED_WRITER:
-        raise _unwritable(f"version {version} of the protocol (minWriterVersion)", name, where)
-    listed = version == _LISTED_WRITER and protocol.writer_features
-    for feature in listed or _legacy(_BY_WRITER_VERSION, version):
-        allowed = feature in _WRITTEN or (feature == "appendOnly" and not removing)
-        if not allowed and _in_use(table, feature):
-            raise _unwritable(f"feature `{feature}`", name, where)
+    protocol = table.protocol()
+    asked = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
+    for feature, what in _asked(table, *asked, _BY_WRITER_VERSION, "minWriterVersion"):
+        if feature not in _WRITTEN and (feature != "appendOnly" or removing):
+            raise _unwritable(what, _name(table), where)
+
+
+def _asked(
+    table: DeltaTable,
+    version: int,
+    newest: int,
+    listed: Sequence[str] | None,
+    by_version: Mapping[int, tuple[str, ...]],
+    key: str,
+) -> Iterator[tuple[str, str]]:
+    """Yield what the protocol of a table asks of a program: features in use, and each in words; ""
+    for a `version` that is newer than the `newest` known, the one that lists its features."""
+    if version > newest:
+        yield "", f"version {version} of the protocol ({key})"
+    features = listed if version == newest else None
+    legacy = (one for least, several in by_version.items() if least <= version for one in several)
+    for feature in features or legacy:
+        if _in_use(table, feature):
+            yield feature, f"feature `{feature}`"
+
+
+def _name(table: DeltaTable) -> str:
+    return str(table.table_uri.rstrip("/").rpartition("/")[2])
 
 
 def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None:
@@ -264,10 +280,6 @@ def unsupported(error: Exception, name: str, *, where: str) -> StoreError | None
         return None
     # Older versions cannot be named: the library opens the newest first.
     return _unreadable(f"feature `{named[1]}`", name, where, otherwise=_AGAIN)
-
-
-def _legacy(by_version: Mapping[int, tuple[str, ...]], version: int) -> Iterator[str]:
-    return (one for least, several in by_version.items() if least <= version for one in several)
 
 
 def _in_use(table: DeltaTable, feature: str) -> bool:

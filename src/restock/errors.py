@@ -14,7 +14,7 @@ TRACEBACK = "RESTOCK_TRACEBACK"  # of the environment: print tracebacks
 
 
 def told(text: str, keep: str = "") -> str:
-    """The text as `visible`, without key and secret of an address such as `s3://KEY:SECRET@…`."""
+    """Mask the key and secret of an address such as `s3://KEY:SECRET@…`; else as `visible`."""
     return visible(_SECRET.sub(r"\1***:***@", text), keep)
 
 

@@ -289,3 +289,20 @@ def test_profile_new_does_not_use_wheels_that_are_none(tmp_path, capsys):
     assert main(["profile", "new", str(wrong), "--out", str(other), "--hindsight-goals"]) == 3
     assert "localiser_m" not in other.read_text()
     assert "# CONTRADICTS ITSELF: /odom: its poses step" in other.read_text()
+
+
+def test_a_clock_that_is_repaired_does_not_hide_the_localisers_noise(tmp_path):
+    """Noise that slip must exceed is told of a drive whose other clock was repaired, too."""
+    noisy = winding()
+    pose, rng = noisy["/odom"], np.random.default_rng(0)
+    path = "pose.pose.position.x"
+    x = np.asarray(pose.fields[path])
+    noisy["/odom"] = replace(pose, fields=pose.fields | {path: x + rng.normal(0, 0.04, len(x))})
+    told = []
+    for number, topics in enumerate((noisy, shifted(noisy, "/cmd_vel", 0.4))):
+        bag = written(topics, tmp_path / str(number))
+        with open_recording(bag) as recording:
+            proposal = propose_profile(recording, "r", hindsight_goals=True)
+        told.append([line for line in proposal.toml.splitlines() if "localiser_m" in line])
+        assert [one.repaired for one in proposal.findings] == [True] * number
+    assert told[0] == told[1] != []

@@ -273,8 +273,8 @@ def _measured(
 
 
 def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
-    """Without the topic that an input was to come from: by the next one that fits; of wheels, else
-    by the poses. `why` is said in the profile. None where the poses are too few."""
+    """Leave out the topic that an input was to come from, and say `why` in the profile: the next
+    one takes its place, or for wheels the poses. Returns None if there are too few poses."""
     roles = {**seen.roles, role: seen.roles[role][1:]}
     reasons = "; ".join(filter(None, [seen.unmeasured.get(role, ""), why]))
     seen = replace(seen, roles=roles, unmeasured={**seen.unmeasured, role: reasons})
