@@ -170,7 +170,7 @@ def _row(
             sum(drive["bumps"][ids].sum() for drive in of)
             / sum(drive["distance_m"][ids].sum() for drive in of)
         )
-    for name in success.keys() - {"agent"}:
+    for name in [name for name in drives if name != "agent"]:  # in order: they share `rng`
         ahead = success["agent"] - success[name]
         row[f"ahead_of_{name}"] = float(ahead.mean())
         row[f"ahead_of_{name}_interval"] = mean_interval(ahead, rng, RESAMPLES)
