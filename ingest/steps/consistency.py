@@ -231,7 +231,8 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
         by_lag = [_correlation(asked, did, drive.joined, lag) for lag in range(-most, most + 1)]
         best = int(np.argmax(by_lag))
         lead = most - best  # steps by which the motion comes before
-        if lead >= 1 and by_lag[best] > max(SURE, max(by_lag[most:]) + LEADS):
+        # One step is no clock: a command may be sent when the motion of its step is over.
+        if lead > 1 and by_lag[best] > max(SURE, max(by_lag[most:]) + LEADS):
             return [
                 Finding(
                     "order",
