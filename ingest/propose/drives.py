@@ -140,14 +140,12 @@ def propose_for_drives(
         )
         for recording in recordings
     ]
-    seen = max(
-        (pooled(base, evidence) for base in _bases(evidence)),
-        key=lambda one: (
-            sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), evidence))
-            * (LOCALISED_WORTH if _on_map(one) else 1.0)
-        ),
-    )
+    seen = _best(evidence, evidence)
     usual = _trials(seen, evidence)
+    giving = [one for one, trial in zip(evidence, usual, strict=True) if trial.transitions]
+    if giving and not any(one.recording is seen.recording for one in giving):
+        seen = _best(giving, evidence)  # the fullest drive stood still, or had no goal
+        usual = _trials(seen, evidence)
     dropped: Counter[str] = sum((Counter(trial.dropped) for trial in usual), Counter())
     goal = seen.goal.tried(sum(trial.transitions for trial in usual), dropped)
     proposal = propose_from(replace(seen, goal=goal), name, goal_decided=True)
@@ -156,10 +154,21 @@ def propose_for_drives(
         proposal,
         problems=[*proposal.problems, *_in_another(proposal.missing, evidence)],
         toml="\n".join([*_lines(evidence, trials, drives), proposal.toml]),
-        advice=[*proposal.advice, *_left_out(drives.others)],
+        advice=[*proposal.advice, *_without_rows(evidence, trials), *_left_out(drives.others)],
         kinds=drives.robots,
         ticks=sum(trial.ticks for trial in trials),
         transitions=sum(trial.transitions for trial in trials),
+    )
+
+
+def _best(bases: Sequence[Evidence], drives: Sequence[Evidence]) -> Evidence:
+    """Return what makes rows of most of the time of all drives, from one of the `bases`."""
+    return max(
+        (pooled(base, drives) for base in _bases(bases)),
+        key=lambda one: (
+            sum(t.seconds for t in _trials(replace(one, goal=GoalChoice(None)), drives))
+            * (LOCALISED_WORTH if _on_map(one) else 1.0)
+        ),
     )
 
 
@@ -319,6 +328,18 @@ def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]
                 said = f"{_name(one.recording.path)} has a {role} ({topics[0][0].name})"
                 found.append(f"{said} and no {lacks}: one recording must hold both")
     return found
+
+
+def _without_rows(drives: Sequence[Evidence], trials: Sequence[Trial]) -> list[Advice]:
+    none = [
+        drive.recording.path
+        for drive, trial in zip(drives, trials, strict=True)
+        if not trial.transitions
+    ]
+    if not none or len(none) == len(trials):  # of none at all the problems tell
+        return []
+    text = f"{len(none):,} of {len(trials):,} recordings give no transition: {names_of(none)}"
+    return [Advice("name", f"{text}; the first lines of the profile say why")]
 
 
 def _left_out(others: Sequence[tuple[Path, RobotTraits]]) -> list[Advice]:

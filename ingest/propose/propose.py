@@ -60,6 +60,7 @@ class Proposal:
     """The TOML of a profile, what in it needs a person, and what it makes of the recording."""
 
     toml: str
+    base: Path  # the recording that it was proposed from, and tried on
     missing: list[str] = field(default_factory=list)  # required inputs that nothing fills
     signals: int = 0  # custom signals that stand in it, commented out
     ticks: int = 0
@@ -170,7 +171,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         hanging = ["scan"]
     advice += [Advice(f"inputs.{name}", UPSIDE_DOWN) for name in hanging]
     return Proposal(
-        *(text, missing, len(seen.signals), trial.ticks, trial.transitions, problems, advice),
+        *(text, recording.path, missing, len(seen.signals)),
+        *(trial.ticks, trial.transitions, problems, advice),
         several_commands(recording),
         findings=trial.findings,
         wheeled=other is None,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.driven_robot import FREE_M, PERIOD_S, Drive, columns, scans, write_bag
+from support.driven_robot import FREE_M, PERIOD_S, Drive, columns, scans, up_to_the_panel, write_bag
 from support.paths import ROOT
 
 from restock.cli import main
@@ -182,6 +182,37 @@ def test_what_was_read_and_what_not_is_told(tmp_path, capsys, monkeypatch):
     assert "# NOT READ, of that kind: bags/b\n" in header
     assert "# NOT OF THAT KIND: bags/other: lidar" in header
     assert "1 recording is of another kind of robot, by what it says: bags/other" in printed.err
+
+
+@dataclass
+class Idle(Told):
+    """It stands, and is told to."""
+
+    speed_mps: float = 0.0
+
+    def x_at(self, time_s):
+        return 1.0 + 0.0 * time_s
+
+
+def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, capsys):
+    """The largest of three drives stood still: the proposal was refused for all of them."""
+    for name, drive in (("a", Told(16.0)), ("b", Told(15.0)), ("idle", Idle(40.0))):
+        write_bag(drive, tmp_path / "bags" / name)
+    file, out = tmp_path / "robot.toml", tmp_path / "out"
+    words = [str(tmp_path / "bags"), "--out"]
+    assert main(["profile", "new", *words, str(file), "--hindsight-goals", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["read"][0].endswith("bags/a")
+    # Ticks are .2 s apart; the goal's radius is reached a little before its place.
+    assert 79 + 74 - 4 <= said["transitions"] <= 79 + 74
+    assert "#   bags/idle: 0  (no transition" in file.read_text()
+    told = "1 of 3 recordings give no transition: bags/idle; "
+    assert any(told in each["text"] for each in said["advice"])
+    # And the whole way goes on with the others.
+    assert main(["start", *words, str(out), "--accept", *up_to_the_panel(tmp_path)]) != 0
+    printed = capsys.readouterr()
+    assert f"{said['transitions']} transitions in" in printed.out + printed.err
+    assert "no_such_column" in printed.out + printed.err
 
 
 def test_what_a_recording_says_of_its_robot(tmp_path: Path):

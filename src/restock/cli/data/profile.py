@@ -79,8 +79,9 @@ class ProfileCommand:
     """Also read what is intact in damaged or truncated files."""
     json: bool = False
     """Print one JSON document: `new`: {"toml", "missing", "signals", "ticks", "transitions",
-    "problems", "advice", "commands", "kinds", "wheeled", "read", "unread", "unreadable", "losses"};
-    `check`: {"inputs", "problems", "advice", "inside_outline", "outcome", …}."""
+    "problems", "advice", "commands", "kinds", "wheeled", "read" (first the one it
+    was proposed from), "unread", "unreadable", "losses"}; `check`: {"inputs", "problems", "advice",
+    "inside_outline", "outcome", …}."""
 
     @property
     def _typestore(self) -> str | None:
@@ -132,6 +133,7 @@ class ProfileCommand:
                     hindsight_goals=self.hindsight_goals,
                 )
             losses = _losses(recordings, proposal.toml)
+        chosen.sort(key=lambda path: path != proposal.base)  # that one first
         toml = "".join(f"# LOST: {loss}\n" for loss in losses) + proposal.toml
         if unread:
             of = len(chosen) + len(unread)

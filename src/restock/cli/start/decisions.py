@@ -92,10 +92,19 @@ def _options(asked: StartCommand, *, but: Collection[str]) -> list[str]:
 def of_other_kinds(out: Path) -> list[str]:
     """The recordings that the proposal in this folder is not for: those of other kinds of robots,
     and those that it could not read."""
-    proposed = out / FOLDER / "propose.json"
-    document = read_json(proposed) if proposed.is_file() else {}
+    document = _proposal(out)
     others = [path for kind in document.get("kinds", [])[1:] for path in kind["recordings"]]
     return [*others, *document.get("unreadable", [])]
+
+
+def proposed_from(out: Path) -> str | None:
+    """The recording that the proposal in this folder was made from: it gives rows, if any does."""
+    return next(iter(_proposal(out).get("read", [])), None)
+
+
+def _proposal(out: Path) -> Document:
+    proposed = out / FOLDER / "propose.json"
+    return read_json(proposed) if proposed.is_file() else {}
 
 
 def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bool) -> Stop | None:
@@ -328,6 +337,7 @@ __all__ = [
     "of_other_kinds",
     "possible_kinds",
     "practice_settings",
+    "proposed_from",
     "robot_line",
     "several_kinds",
     "updates_settings",

@@ -23,6 +23,7 @@ from restock.cli.start.decisions import (
     of_other_kinds,
     possible_kinds,
     practice_settings,
+    proposed_from,
     robot_line,
     several_kinds,
     updates_settings,
@@ -125,6 +126,8 @@ class Way:
         if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
             recording = fullest({"recordings": mine}) or recording
+        if not (own or self.work.plan):
+            recording = proposed_from(asked.out) or recording
         checked = self.work.do(stages.check(to, recording))
         if not checked.good:
             known = "; if it is of another robot, give only the recordings of this one"
