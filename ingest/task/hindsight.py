@@ -2,7 +2,9 @@
 
 For recordings without a goal topic. A drive is cut into missions, and each one's goal is the place
 where it ended: where the robot stood still, where it turned back, a place that it visited often, or
-as far as an episode may go. The route is the way that was driven, thinned and without its loops.
+as far as an episode may go. Where the drive passed that place on its way, left it and came back,
+the mission ends at the first pass, and the rest is cut again. The route is the way that was driven,
+thinned and without its loops.
 
 Goal and route are from the future, by definition; nothing else here is. Every mission arrives, by
 construction: its success says nothing of who drove.
@@ -193,6 +195,8 @@ class _Cutting:
         goal = self._place(self.xy_m[end])
         gap = np.hypot(*(self.xy_m[start : end + 1] - goal).T)
         arrival = start + int(np.flatnonzero(gap <= self.radius_m)[0])
+        if (gap[arrival - start :] > self.shortest_m).any():  # an episode ends where it arrives
+            end, why, last = arrival, "came back later", False
         number = len(self.goals)
         self.goals.append(goal)
         self.routes.append(route_of(self.xy_m[start : end + 1], goal, self.radius_m / 2))
@@ -200,7 +204,7 @@ class _Cutting:
         # A drive that goes on has its next goal at once, where this one is reached.
         self.mission[start : (end if last else arrival) + 1] = number
         self.standing[start:end] = False
-        return end if last else arrival
+        return end if last else max(arrival, start + 1)
 
     def _place(self, goal: F64) -> F64:
         """The goal, or one of an earlier mission that is the same place."""

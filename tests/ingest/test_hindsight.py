@@ -46,6 +46,13 @@ class Turntable(Unguided):
         return 1.0 + 0.0 * time_s
 
 
+class Returning(Unguided):
+    """5 m out, and 1.8 m back: it ends where it was on its way out."""
+
+    def x_at(self, time_s):
+        return 1.0 + 0.5 * (np.minimum(time_s, 10.0) - np.maximum(time_s - 10.0, 0.0))
+
+
 class Waiting(Unguided):
     """It stands for a minute, and then drives 6 m."""
 
@@ -225,6 +232,22 @@ def test_where_a_drive_turns_back_it_has_arrived() -> None:
     assert made.goals_m[:, 0] == pytest.approx([5, 0], abs=0.2)
 
 
+def test_no_goal_was_passed_before_its_mission_ends(tmp_path, capsys) -> None:
+    """Half of a drive that ended on its way out had reached its goal while it drove on."""
+    _, _, said = proposed(Returning(13.6), tmp_path, capsys)
+    assert said["ticks"] - said["transitions"] <= 6  # the ends of its missions
+    # Out, round, and back onto the way out: to where it passes first, to the far end, and back.
+    turn = np.linspace(0, np.pi, 20)
+    round_it = np.stack([4.4 + 0.6 * np.sin(turn), 0.6 - 0.6 * np.cos(turn)], axis=1)
+    down = np.stack([np.full(13, 3.2), np.linspace(1.2, 0, 13)], axis=1)
+    way = [line(0, 4.4), round_it, line(4.4, 3.2) + np.array([0, 1.2]), down]
+    made = found(np.concatenate(way))
+    assert made.ended_at == ["came back later", "turned back", "end of the recording"]
+    assert made.goals_m[[0, 2]] == pytest.approx(np.array([[3.2, 0], [3.2, 0]]))
+    assert set(made.problem) == {""}
+    assert len(made.routes_m[0]) < 3.2 / (RADIUS_M / 2) + 2  # without the rest of the way
+
+
 def test_a_long_drive_is_cut_where_it_comes_by_often() -> None:
     turn = np.linspace(0, 6 * np.pi, 600)
     circle = 6.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -275,6 +298,9 @@ def test_every_mission_arrives_in_time_and_on_its_own_leg(moves, seed, noise) ->
         near = np.hypot(*(xy[[*ticks, *after]] - goal).T).min()
         assert near <= RADIUS_M + 1e-9
         assert np.allclose(made.routes_m[number][-1], goal)
+        gap = np.hypot(*(xy[ticks] - goal).T)
+        then = gap[(gap <= RADIUS_M).argmax() :]  # arrived, if it did before the last tick
+        assert gap.min() > RADIUS_M or then.max() <= GoalRules().at_least_m(TASK)
         away = np.hypot(*(xy[ticks[0]] - goal))
         assert away >= GoalRules().at_least_m(TASK) - RADIUS_M / 2 - 1e-9
     assert all((made.mission >= 0) | (np.array(made.problem) != ""))
