@@ -3,9 +3,9 @@
 A profile is a TOML file: `name`, the shipped `conditions` and `exposures` it uses, `[[condition]]`
 of its own, `[task]`, `[goal]` (logged, or in hindsight), `[clock]`, `[episodes]`, `[inputs.*]`
 (which topic fills what), `[command_sources.*]` (whose command it may be), `[frames]` (poses from
-transforms), `[motion]` (speeds from poses), `[signals.*]` (custom columns), `[cameras.*]` (frames
-that are kept), `[tags]` (whose drive it is), `[robot]` (what the twin builds), `[limiter]` (of a
-policy's commands) and `[[zone]]` (named rectangles of the map).
+transforms), `origin_m` (of positions), `[motion]` (speeds from poses), `[signals.*]` (custom
+columns), `[cameras.*]` (frames that are kept), `[tags]` (whose drive it is), `[robot]` (what the
+twin builds), `[limiter]` (of a policy's commands) and `[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
 """
@@ -81,6 +81,8 @@ class Profile(Checked, frozen=True):
     clock: Clock = Clock()
     episodes: Episodes = Episodes()
     zones: list[Zone] = msgspec.field(default_factory=list, name="zone")
+    # Subtracted from poses, goals and plans, which are in metres: UTM coordinates, for example.
+    origin_m: tuple[float, float] | None = None
     frames: Frames | None = None
     motion: Motion | None = None
     signals: dict[str, CustomSignal] = msgspec.field(default_factory=dict)
@@ -143,8 +145,7 @@ class Profile(Checked, frozen=True):
         for source in values["command_sources"].values():
             for key in (*SCAN_SETTINGS, *FIX_SETTINGS):
                 del source[key]
-        if self.command_through is None:
-            apart |= {"command_through"}
+        apart |= {name for name in ("command_through", "origin_m") if values[name] is None}
         for name in ("heading", *SCANS[1:]):
             if values["inputs"][name] is None:
                 del values["inputs"][name]

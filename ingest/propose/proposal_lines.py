@@ -66,6 +66,7 @@ def profile_lines(
         *_slip_lines(seen),
         f"exposures = {json.dumps(_exposures(seen))}  # situations, whatever came of them",
         f'behaviour_policy = "{seen.chosen.policy}"  # {seen.chosen.why}',
+        *_origin_lines(seen),
         "",
         *task_lines(seen, trial),
         *seen.goal.table_lines(),
@@ -95,6 +96,13 @@ def profile_lines(
     lines += camera_lines(seen.cameras)
     # Names are of a stranger: a line break in one starts no key.
     return [visible(line) for line in [*lines, *_ENDING]]
+
+
+def _origin_lines(seen: Evidence) -> list[str]:
+    if seen.origin_m is None:
+        return []
+    x, y = seen.origin_m
+    return [f"origin_m = [{x}, {y}]  # of all positions: poses are far from 0 (UTM?)"]
 
 
 def _conditions(seen: Evidence) -> list[str]:

@@ -153,6 +153,9 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     advice += [*_seldom_poses(seen), *_odd_commands(seen)]
     advice += [Advice(f"inputs.{role}", why) for role, why in seen.unmeasured.items() if why]
+    if seen.origin_m is not None:
+        why = f"poses are far from 0 (UTM coordinates?): positions are from {list(seen.origin_m)}"
+        advice.append(Advice("origin_m", f"{why}, and so are zones and floors"))
     if seen.commands.steered and not seen.robot.wheelbase_from:
         told = "a guess, and with it every yaw rate that was commanded: measure it"
         advice.append(Advice("inputs.command.wheelbase_m", told))

@@ -318,6 +318,9 @@ def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSeg
 def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[str]:
     """What is odd about the frames of a recording."""
     notes = []
+    if profile.origin_m is not None:
+        x, y = profile.origin_m
+        notes.append(f"positions: metres from ({x:.12g}, {y:.12g}), the profile's origin_m")
     if edges.parent_changes:
         changes = counted(edges.parent_changes, "time")
         notes.append(f"transforms: a frame was given another parent {changes}")

@@ -25,8 +25,8 @@ from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task, terminated
 
 FAR = (
-    "record poses in a frame that begins near the robot (of UTM coordinates, subtract an origin): "
-    "a store's positions would be rounded to decimetres"
+    "they may be UTM coordinates, which a store would round to decimetres: set `origin_m = [X, Y]` "
+    "at the top of the profile, a point near the robot (`restock profile new` proposes one)"
 )
 RELEASE_S = 1.0  # that the bumper must have been free for before a robot drives on
 

@@ -252,7 +252,7 @@ class Filling:
         assert tree is not None  # the profile is refused otherwise
         at = tree.place(tree.frames.base, self.aligned.ticks)
         self._mark_reasons("pose", at.problem)
-        x, y, _ = at.translation_m.T
+        x, y = (at.translation_m[:, :2] - self.inputs.origin_m).T
         for signal, values in (("x_m", x), ("y_m", y), ("yaw_rad", at.yaw_rad)):
             self._set("pose", f"pose_{signal}", values, at.problem == "")
         self.located = np.asarray(at.problem == "", np.bool_)

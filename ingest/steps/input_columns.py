@@ -1,7 +1,8 @@
 """The inputs of a profile that a recording has, by name: their fields as columns.
 
-Positions are in the fixed frame: a pose by latitude and longitude is projected into it, and goals
-and plans that were given in another frame are put into it by their `Placement`.
+Positions are in the fixed frame, from the profile's `origin_m`: a pose by latitude and longitude is
+projected into it, and goals and plans that were given in another frame are put into it by their
+`Placement`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class InputColumns:
 
     def __init__(self, profile: Profile, topics: Mapping[str, TopicColumns]) -> None:
         self.topics = topics
+        self.origin_m = np.array(profile.origin_m or (0.0, 0.0))  # of all positions
         self.placed: dict[str, Placement] = {}  # of each message of an input in another frame
         self.by_name: dict[str, Input] = {  # those whose topic the recording has
             name: source
@@ -47,6 +49,11 @@ class InputColumns:
 
     def numbers(self, name: str, key: str) -> F64:
         """A field of an input, one number a message (N,)."""
+        if name == "pose" and key in ("x_m", "y_m"):
+            return self._numbers(name, key) - float(self.origin_m["xy".index(key[0])])
+        return self._numbers(name, key)
+
+    def _numbers(self, name: str, key: str) -> F64:
         if self.by_name[name].by_fix and key in ("x_m", "y_m", "yaw_rad"):
             return np.asarray(getattr(self.fixed, key), np.float64)
         if key == "yaw_rad" and "orientation" in self.by_name[name].fields:
@@ -134,10 +141,10 @@ class InputColumns:
             for row in range(len(x))
         ]
         if "plan" not in self.placed:
-            return points
+            return [plan - self.origin_m for plan in points]
         at = self.placed["plan"]
         return [
-            plan @ at.rotation[row, :2, :2].T + at.translation_m[row, :2]
+            plan @ at.rotation[row, :2, :2].T + at.translation_m[row, :2] - self.origin_m
             for row, plan in enumerate(points)
         ]
 
@@ -146,11 +153,10 @@ class InputColumns:
         """Each goal (G, 2)."""
         goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
         if "goal" not in self.placed:
-            return goals
+            return np.asarray(goals - self.origin_m)
         at = self.placed["goal"]
-        return np.asarray(
-            np.einsum("nij,nj->ni", at.rotation[:, :2, :2], goals) + at.translation_m[:, :2]
-        )
+        turned = np.einsum("nij,nj->ni", at.rotation[:, :2, :2], goals)
+        return np.asarray(turned + at.translation_m[:, :2] - self.origin_m)
 
     def frames_of(self, name: str) -> list[str]:
         """The frame that each message of an input is in; empty where messages do not say."""

@@ -18,6 +18,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose.propose import propose_profile
 from restock.replay.store.store import Store
+from restock.train.twin.survey.poses import candidate_poses
 
 SAMPLES = ROOT / "sample_logs"
 ROWS = sample_transitions("amr_tuesday")
@@ -256,6 +257,39 @@ def test_every_common_type_can_be_gone_through(kind, capsys):
 
 
 @pytest.mark.parametrize("bumper", [True, False])
+class Utm(Drive):
+    """Its poses are UTM coordinates; it has neither goal nor plan."""
+
+    def topics(self):
+        topics = super().topics()
+        del topics["/goal_pose"], topics["/plan"]
+        for axis, far_m in (("x", 4.5e5), ("y", 5.2e6)):
+            topics["/amcl_pose"].fields[f"pose.pose.position.{axis}"] += far_m
+        return topics
+
+
+def test_poses_in_utm_coordinates_are_stored_to_the_millimetre(tmp_path, capsys):
+    """They were refused, with a remedy for recordings still to be made."""
+    recording = write_bag(Utm(8.0), tmp_path / "bag")
+    file = proposed(recording, tmp_path, capsys)
+    profile = load_profile(file)
+    assert profile.origin_m == pytest.approx((4.5e5 + 1 + 0.5 * 4.0, 5.2e6 + 1), abs=1)
+    store = tmp_path / "store"
+    assert main(["ingest", str(recording), "--profile", str(file), "--store", str(store)]) == 0
+    assert f"positions: metres from ({profile.origin_m[0]:.0f}, 5200001)" in capsys.readouterr().out
+    with Store(store) as rows:
+        found = rows.sql(
+            "SELECT pose_x_m, pose_y_m FROM transitions ORDER BY stamp_ns"
+        ).fetchnumpy()
+    x, y = found["pose_x_m"].astype(float), found["pose_y_m"].astype(float)
+    driven = 1 + 0.5 * np.arange(len(x)) * 0.2
+    assert x + profile.origin_m[0] == pytest.approx(4.5e5 + driven, abs=1e-3)
+    assert y + profile.origin_m[1] == pytest.approx(5.2e6 + 1, abs=1e-3)
+    with open_recording(recording) as opened:
+        (surveyed,) = candidate_poses(opened, profile)  # of a floor: from the same origin
+    assert surveyed.places_m[0] == pytest.approx([x[0], y[0]], abs=1e-3)
+
+
 def test_a_contact_ends_an_episode_whether_a_bumper_was_recorded_or_not(bumper, tmp_path, capsys):
     class Robot(Drive):
         def topics(self):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.driven_robot import (
     FREE_M,
     PERIOD_S,
@@ -15,6 +16,7 @@ from support.driven_robot import (
     without,
 )
 
+from restock.ingest.decoding.columns import Ragged
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.episodes import split, why_none
@@ -132,7 +134,18 @@ def test_positions_far_from_their_origin_are_refused_with_what_to_do():
     why, remedy = why_none(steps, split(PROFILE.task, steps))
     assert f"pose: beyond a million: {len(steps)} of {len(steps)} ticks" in why
     assert remedy is not None
-    assert "subtract an origin" in remedy
+    assert "set `origin_m = [X, Y]`" in remedy
+    # With an origin near them, poses, goals and plans are what they are without the offset.
+    for topic, path in (("/goal_pose", "pose.position.y"), ("/plan", "poses[].pose.position.y")):
+        column = topics[topic].fields[path]
+        (column.values if isinstance(column, Ragged) else column)[:] += 5.2e6
+    origin = (0.0, 5.2e6)
+    moved = steps_of(replace(PROFILE, origin_m=origin), topics)
+    near = steps_of(PROFILE, Drive().topics())
+    assert set(moved.problem) == {""}
+    assert any("metres from (0, 5200000)" in note for note in moved.notes)
+    for name, column in near.signals.items():
+        assert moved.signals[name] == pytest.approx(column, abs=1e-6, nan_ok=True), name
 
 
 def test_a_pose_without_an_orientation_looks_nowhere():

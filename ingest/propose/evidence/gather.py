@@ -87,6 +87,7 @@ from restock.ingest.urdf.description import BASE_FRAMES
 
 # Input -> the field without which a topic is of no use for it.
 MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}
+MILLIMETRES_UP_TO_M = 1e4  # in float32
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,7 @@ class Evidence:
     robot: RobotProposal
     node_topics: dict[str, str]  # of Restock's own node: name -> type
     unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
+    origin_m: tuple[int, int] | None  # of positions, where poses are far from 0
 
 
 def gather(
@@ -245,7 +247,15 @@ def gather(
         robot,
         node_topics(recording),
         unmeasured,
+        None if poses is None else _origin_m(poses),
     )
+
+
+def _origin_m(poses: PoseSeries) -> tuple[int, int] | None:
+    """Return the middle of poses that are so far from 0 that a store, in float32, would round them
+    to more than a millimetre; None if they are nearer."""
+    x, y = (float(np.median(column)) if len(poses) else 0.0 for column in (poses.x_m, poses.y_m))
+    return (round(x), round(y)) if max(abs(x), abs(y)) > MILLIMETRES_UP_TO_M else None
 
 
 def _measured(

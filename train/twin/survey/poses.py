@@ -8,7 +8,7 @@ the one that both its topic and the pose's carry.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from restock.ingest.task.signals import yaw_of
 MOST_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
 JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
 WELL_PLACED = 0.9  # of the poses on free floor
-FURTHEST_M = 1e5  # a pose beyond is a fault
+FURTHEST_M = 1e5  # from the middle of the poses: one beyond is a fault
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,8 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
     localised ones first, and other transforms.
     """
     if profile is not None:
-        return [poses for poses in [_by_profile(recording, profile)] if poses is not None]
+        at, (x_m, y_m) = _by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
+        return [] if at is None else [replace(at, x_m=at.x_m - x_m, y_m=at.y_m - y_m)]
     usable = usable_topics(recording)
     guess = transform_frames(recording, transform_edges(recording))
     along = None
@@ -228,9 +229,11 @@ def _paths(fields: Mapping[str, str]) -> list[str]:
 
 
 def _poses(times: Times, x: F64, y: F64, yaw: F64, frame: str, source: str) -> Poses | None:
-    sane = (np.abs(x) < FURTHEST_M) & (np.abs(y) < FURTHEST_M)  # False for NaN
-    if not sane.any():
+    known = np.isfinite(x) & np.isfinite(y)
+    if not known.any():
         return None
+    sane = known & (np.abs(x - np.median(x[known])) < FURTHEST_M)
+    sane &= np.abs(y - np.median(y[known])) < FURTHEST_M
     kept = Times(times.stamp_ns[sane], times.log_ns[sane])
     x, y, yaw = x[sane], y[sane], yaw[sane]
     if np.isfinite(yaw).all():
