@@ -185,7 +185,7 @@ class LiveObserver:
             if known:
                 newest = max(known)
                 if motion is not None and pose is not None and topic == pose.topic:
-                    newest -= round(motion.window_s * NS)  # speeds are of the poses before
+                    newest -= round(2 * motion.window_s * NS)  # speeds are of the poses before
                 self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:

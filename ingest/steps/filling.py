@@ -226,8 +226,9 @@ class Filling:
             self._numbers("wheels", **speeds)
             return None
         jump_m = self.profile.episodes.max_pose_jump_m
+        fastest_mps = self.task.condition_limits["fastest_mps"]
         parts = [
-            motion_at(poses, ticks, motion.window_s, jump_m)
+            motion_at(poses, ticks, motion.window_s, jump_m, fastest_mps)
             for poses, ticks in zip(self.aligned.poses(), self.aligned.ticks, strict=True)
         ]
         for signal, name in (("speed_mps", "forward_mps"), ("yaw_rate_radps", "yaw_rate_radps")):

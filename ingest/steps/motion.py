@@ -2,12 +2,15 @@
 
 A straight line is fitted to the poses of the last `window_s` up to the latest one at the tick, none
 later. What it says is the motion in the middle of that window, half of it ago: a longer window
-takes off more of the localiser's noise, and says later what happened. A tick whose window holds
-fewer than two poses, or a jump (the localiser found the robot elsewhere), has no speed.
+takes off more of the localiser's noise, and says later what happened. Poses that arrive together
+span too little time for a speed: the one before the window then belongs to it. A tick without poses
+that are far enough apart in time has no speed, nor has one with a jump in its window: the robot
+cannot have driven so far, so the localiser found it elsewhere.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +22,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.ingest.steps.frames import Tree
 from restock.ingest.task.signals import wrap_angle
 
+SCATTER_M = 0.05  # between two poses: less is no jump
 _CHUNK = 4096  # ticks at a time: bounds memory
 
 
@@ -72,8 +76,18 @@ class Motion:
     problem: NDArray[Any]  # (T,) why there is none, or ""
 
 
-def motion_at(poses: PoseSeries, tick_ns: Ints, window_s: float, max_jump_m: float) -> Motion:
-    """The motion at ticks (T,) by the poses of the `window_s` before each tick's latest one."""
+def motion_at(
+    poses: PoseSeries,
+    tick_ns: Ints,
+    window_s: float,
+    max_jump_m: float,
+    fastest_mps: float = math.inf,
+) -> Motion:
+    """The motion at ticks (T,) by the poses of the `window_s` before each tick's latest one.
+
+    A step of more than `max_jump_m` is a jump, and so is one that a robot of `fastest_mps` does not
+    drive in the time of the step and a window more: stamps jitter, and it may be faster than asked.
+    """
     count = len(tick_ns)
     out = Motion(np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, "", object))
     end = np.searchsorted(poses.stamp_ns, tick_ns, "right")
@@ -81,11 +95,17 @@ def motion_at(poses: PoseSeries, tick_ns: Ints, window_s: float, max_jump_m: flo
     if not len(poses):
         out.problem[:] = "no pose yet"
         return out
-    begin = np.searchsorted(poses.stamp_ns, poses.stamp_ns[latest] - round(window_s * 1e9))
-    begin = np.where(end > 0, begin, end)
-    few = end - begin < 2
-    out.problem[few] = f"fewer than two poses within {window_s:g} s"
-    jumps = np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)) > max_jump_m
+    window_ns, latest_ns = round(window_s * 1e9), poses.stamp_ns[latest]
+    begin = np.searchsorted(poses.stamp_ns, latest_ns - window_ns)
+    together = latest_ns - poses.stamp_ns[begin] < window_ns // 2
+    earlier = np.maximum(begin - 1, 0)
+    together &= latest_ns - poses.stamp_ns[earlier] <= 2 * window_ns
+    begin = np.where(end > 0, np.where(together, earlier, begin), end)
+    few = (end == 0) | (latest_ns - poses.stamp_ns[begin] < window_ns // 2)
+    out.problem[few] = f"no pose from {window_s / 2:g} to {2 * window_s:g} s before the last one"
+    reach_m = fastest_mps * (np.diff(poses.stamp_ns) * 1e-9 + window_s) + SCATTER_M
+    steps_m = np.hypot(np.diff(poses.x_m), np.diff(poses.y_m))
+    jumps = steps_m > np.minimum(reach_m, max_jump_m)
     before = np.concatenate([[0], np.cumsum(jumps)])  # jumps up to each pose
     jumped = ~few & (before[latest] > before[np.minimum(begin, len(poses) - 1)])
     out.problem[jumped] = f"a pose jump within {window_s:g} s"

@@ -47,10 +47,13 @@ def test_it_is_the_slope_of_a_line_through_the_last_poses(seed, speed, turn, win
     found = motion_at(poses, ticks, window, 1.0)
     for index, tick in enumerate(ticks.tolist()):  # one by one, as one would write it down
         before = [i for i, stamp in enumerate(poses.stamp_ns.tolist()) if stamp <= tick]
-        used = [i for i in before if poses.stamp_ns[i] >= poses.stamp_ns[before[-1]] - window * NS]
-        assert (found.problem[index] != "") == (len(used) < 2)
-        if len(used) < 2:
+        ago = [(poses.stamp_ns[before[-1]] - poses.stamp_ns[i]) / NS for i in before]
+        assert (found.problem[index] == "") == any(window / 2 <= s <= 2 * window for s in ago)
+        if found.problem[index]:
             continue
+        used = [i for i, s in zip(before, ago, strict=True) if s <= window]
+        if ago[used[0]] < window / 2:
+            used = [used[0] - 1, *used]
         since = (poses.stamp_ns[used] - poses.stamp_ns[used[0]]) / NS
         yaw = np.unwrap(poses.yaw_rad[used])
         vx, vy, rate = (np.polyfit(since, c, 1)[0] for c in (poses.x_m[used], poses.y_m[used], yaw))
@@ -92,6 +95,46 @@ def test_a_jump_is_no_speed():
     assert set(found.problem[bad]) == {"a pose jump within 0.4 s"}
     assert set(found.problem[ticks < 5 * NS]) == set(found.problem[ticks > 5.5 * NS]) == {""}
     assert np.abs(found.forward_mps).max() < 0.5
+
+
+def test_poses_that_arrive_together_are_no_speed():
+    """Of stamps that jitter, a pose 6 ms after the one before it gave ten times the speed."""
+    even = np.arange(0, 20, 0.1)
+    late = np.where(np.arange(200) % 4 == 0, 0.094, 0.0) * (even > 5)  # with the next one
+    poses = circle(even, 0.4, 0.5)
+    poses = PoseSeries.of(
+        poses.stamp_ns + np.rint(late * NS).astype(int), *[*vars(poses).values()][1:]
+    )
+    kept = np.arange(200) % 8 < 6  # and some are lost
+    poses = PoseSeries(*(column[kept] for column in vars(poses).values()))
+    found = motion_at(poses, np.arange(6 * NS, 19 * NS, NS // 10), 0.2, 1.0)
+    assert set(found.problem) == {""}
+    assert found.forward_mps == pytest.approx(np.full(130, 0.4), abs=0.2)
+
+
+class Relocalised(Drive):
+    """Its localiser finds it .38 m further on, after 3 s."""
+
+    def x_at(self, time_s: Any) -> Any:
+        return super().x_at(time_s) + 0.38 * (time_s > 3.0)
+
+    def topics(self) -> dict[str, TopicColumns]:
+        topics = super().topics()
+        del topics["/odom"], topics["/goal_pose"], topics["/plan"]
+        return topics
+
+
+def test_a_jump_that_no_robot_drives_is_counted_as_one(tmp_path, capsys):
+    """Jumps of less than max_pose_jump_m were speeds of up to five times the fastest action."""
+    bag, file, store = write_bag(Relocalised(8.0), tmp_path / "b"), tmp_path / "p", tmp_path / "s"
+    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
+    assert main(["ingest", str(bag), "--profile", str(file), "--store", str(store)]) == 0
+    assert "wheels: a pose jump within" in capsys.readouterr().out
+    query = "SELECT max(wheel_speed_mps) AS high, count(*) AS rows FROM transitions"
+    assert main(["sql", str(store), query, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["high"] == pytest.approx(SPEED_MPS)
+    assert row["rows"] > 30
 
 
 class NoOdometry(Drive):
