@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import (
-    Stores,
-    TypesysError,
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-)
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
+from restock.ingest.decoding.definition_text import types_in
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
 from restock.ingest.decoding.hand_definitions import ackermann_types, folder_types
 from restock.ingest.decoding.messages import Channel
-
-# The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
-_QUOTED = re.compile(r'"(?:\\.|[^"\\])*(?:"|\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
-_ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
-_NESTED = re.compile(r"(?:<[^<>]*){4}")
 
 DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
@@ -142,20 +131,9 @@ def _from_distro(name: str, distro: str) -> RosType:
 @lru_cache(KEPT)
 def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     try:
-        text = definition.decode()
-        types: Typesdict = {}
-        rule = "=" * 80 + "\n"
-        if form != "ros2idl":
-            types.update(get_types_from_msg(text, name))
-        elif _costly(text):
-            raise CannotDecode("its definition nests brackets, which is not supported")
-        elif text.startswith(f"{rule}IDL: "):
-            for part in text.split(rule)[1:]:
-                types.update(get_types_from_idl(part.split("\n", 1)[1]))
-        else:
-            types.update(get_types_from_idl(text))
-    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, IndexError) as error:
-        raise CannotDecode(f"its definition cannot be parsed: {_first_line(error)}") from error
+        types = types_in(definition, name, form)
+    except CannotDecode as error:
+        raise CannotDecode(f"its definition {error}") from error
     if form == "ros1msg":  # time and duration are primitives there
         types = {**distro_types("ros1_noetic"), **types}
     source = "embedded"
@@ -168,16 +146,7 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
     return kind
 
 
-def _costly(idl: str) -> bool:
-    bare = _ANNOTATION.sub(" ", _QUOTED.sub(" ", idl))
-    return "(" in bare or _NESTED.search(bare) is not None
-
-
 def _named(types: Typesdict) -> set[str]:
     """The messages that fields of these types are made of."""
     fields = [_field(*item) for _, items in types.values() for item in items]
     return {field.message for field in fields if field.message}
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

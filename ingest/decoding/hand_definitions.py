@@ -10,9 +10,11 @@ from functools import cache
 from pathlib import Path
 
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+from rosbags.typesys import get_types_from_msg
 
 from restock.errors import RecordingError
+from restock.ingest.decoding.definition_text import types_in
+from restock.ingest.decoding.field_paths import CannotDecode
 
 LARGEST = 512 << 10  # bytes of one file
 MOST_FILES = 5000
@@ -58,15 +60,11 @@ def folder_types(folder: str) -> Typesdict:
         try:
             if file.stat().st_size > LARGEST:
                 raise ValueError("too long for a definition")
-            text = file.read_text("utf-8")
-            if file.suffix == ".idl":
-                types.update(get_types_from_idl(text))
-            else:
-                types.update(get_types_from_msg(text, f"{package}/msg/{file.stem}"))
-        except (TypesysError, ValueError, RecursionError, IndexError, OSError) as error:
-            what = (str(error).splitlines() or [type(error).__name__])[0]
+            form = "ros2idl" if file.suffix == ".idl" else "ros2msg"
+            types.update(types_in(file.read_bytes(), f"{package}/msg/{file.stem}", form))
+        except (CannotDecode, ValueError, OSError) as error:
             raise RecordingError(
-                f"a definition that cannot be read: {what}",
+                f"a definition that cannot be read: {error}",
                 where=str(file),
                 remedy="correct the file, or remove it from the folder",
             ) from error

@@ -26,6 +26,7 @@ from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.custom_columns import custom_reduction
 from restock.ingest.steps.frames import FIELDS, frame_path, transform_fields
 from restock.ingest.steps.input_columns import estimate_reduction
+from restock.words import counted
 
 if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
@@ -53,9 +54,9 @@ def read_topics(
     """
     if not reduced:
         profile = msgspec.structs.replace(profile, cameras={})  # images do not fit into memory
-    readable = {name: info for name, info in recording.topics.items() if info.skipped is None}
-    leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in readable}
-    wanted, made = wanted_fields(profile, readable, leaves), reductions(profile, readable, leaves)
+    topics = recording.topics
+    leaves = {topic: recording.fields(topic) for topic in profile.topics if topic in topics}
+    wanted, made = wanted_fields(profile, topics, leaves), reductions(profile, topics, leaves)
     if not reduced:
         wanted = {
             topic: [*paths, *(made[topic].fields if topic in made else ())]
@@ -65,7 +66,7 @@ def read_topics(
     by_stamp = profile.clock.alignment == STAMP and CLOCK_TOPIC not in columns
     half_period_s = profile.task.control_period_s / 2
     clocks = without_cameras(profile, columns)
-    if by_stamp and CLOCK_TOPIC in readable and clock_drifts(clocks, half_period_s):
+    if by_stamp and CLOCK_TOPIC in topics and clock_drifts(clocks, half_period_s):
         columns |= recording.read({CLOCK_TOPIC: [CLOCK_FIELD]})
     return columns
 
@@ -82,13 +83,14 @@ def _told(profile: Profile, available: Mapping[str, Any]) -> str:
 
 def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
     """The profile as a recording with these topics is read by it, `available` as `wanted_fields`
-    has it: without a lidar where its scan is optional and there is no message of it, so that rows
-    with and without clearance are never of one task."""
+    has it: without a lidar where its scan is optional and no message of it can be read, so that
+    rows with and without clearance are never of one task."""
     scan = profile.inputs.scan
     if scan is None or not scan.optional:
         return profile
     topic = available.get(scan.topic)
-    return profile if topic is not None and topic.expected else without_lidar(profile)
+    readable = topic is not None and topic.expected and not topic.skipped
+    return profile if readable else without_lidar(profile)
 
 
 def wanted_fields(
@@ -96,12 +98,13 @@ def wanted_fields(
 ) -> dict[str, list[str]]:
     """topic -> the field paths to keep for this profile, of the topics that are `available`.
 
-    `available` maps a topic to something with a `type` and an `expected` count, `leaves` to every
-    field of its messages. What `reductions` reads is not in it, unless it is kept too.
+    `available` maps a topic to something with a `type`, an `expected` count and why it is `skipped`
+    if it is, `leaves` to every field of its messages. What `reductions` reads is not in it, unless
+    it is kept too. A topic that is skipped is in it: reading it counts its messages as lost.
 
     Raises:
-        RecordingError: a required topic is missing, holds another type than the profile says, or
-            its messages have no such field.
+        RecordingError: a required topic is missing, cannot be decoded, holds another type than the
+            profile says, or its messages have no such field.
     """
     if problems := input_problems(profile, available, leaves):
         raise RecordingError(
@@ -210,13 +213,16 @@ def input_problems(
             what = "no message of" if topic is not None else "no topic"
             needed.setdefault(f"{what} {source.topic}", []).append(name)
             types[f"{what} {source.topic}"] = source.type
+        elif topic is not None and topic.skipped:
+            if required:
+                wrong.setdefault(_skipped(source.topic, available), []).append(name)
         elif topic is not None and topic.type != source.type:
             what = f"{source.topic} holds {topic.type}, not {source.type}"
             wrong.setdefault(what, []).append(name)
         elif topic is not None and leaves is not None:
             fields += _field_problems(name, source, leaves[source.topic])
     for name, camera in profile.cameras.items():
-        if (topic := available.get(camera.topic)) is None:
+        if (topic := available.get(camera.topic)) is None or topic.skipped:
             continue
         if topic.type not in TYPES:
             what = f"{camera.topic} holds {topic.type}, which is not an image"
@@ -280,12 +286,24 @@ def _transform_problems(
     pose, frames = profile.inputs.pose, profile.frames
     if frames is None:
         return []
+    there = [topic for topic in profile.transform_topics if topic in available]
+    skipped = [topic for topic in there if available[topic].skipped]
     others = [
         f"{topic} holds {available[topic].type}, not transforms (frames)"
-        for topic in profile.transform_topics
-        if topic in leaves and not transform_fields({leaf.path for leaf in leaves[topic]})
+        for topic in there
+        if topic in leaves
+        and topic not in skipped
+        and not transform_fields({leaf.path for leaf in leaves[topic]})
     ]
-    seen = any(t in available and available[t].expected for t in profile.transform_topics)
+    seen = any(available[topic].expected for topic in there if topic not in skipped)
     if others or seen or (pose is not None and pose.topic in available):
         return others
-    return [f"no message of {frames.topic} or {frames.static_topic} (pose, by [frames])"]
+    return [f"{_skipped(topic, available)} (pose, by [frames])" for topic in skipped] or [
+        f"no message of {frames.topic} or {frames.static_topic} (pose, by [frames])"
+    ]
+
+
+def _skipped(topic: str, available: Mapping[str, Any]) -> str:
+    """Say that a topic is there, and why its messages cannot be decoded."""
+    info = available[topic]
+    return f"{topic} is skipped, with {counted(info.expected, 'message')}: {info.skipped}"

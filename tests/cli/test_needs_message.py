@@ -15,7 +15,11 @@ SCAN, PATH = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Path"
 
 
 def topics(**types: str) -> dict[str, SimpleNamespace]:
-    return {f"/{name}": SimpleNamespace(type=kind, expected=9) for name, kind in types.items()}
+    return {f"/{name}": topic(kind) for name, kind in types.items()}
+
+
+def topic(kind: str, skipped: str | None = None) -> SimpleNamespace:
+    return SimpleNamespace(type=kind, expected=9, skipped=skipped)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +62,7 @@ def test_of_very_many_topics_those_that_could_be_used_are_named() -> None:
 def test_a_field_of_another_name_is_no_matter_of_topics() -> None:
     """After an update of the robot, one profile does not fit the recordings from before it."""
     profile = load_profile("warehouse_amr")
-    there = {s.topic: SimpleNamespace(type=s.type, expected=9) for s in profile.sources.values()}
+    there = {s.topic: topic(s.type) for s in profile.sources.values()}
     leaves = {
         s.topic: [Leaf(path, (), "") for path in field_paths(s)] for s in profile.sources.values()
     }
@@ -68,3 +72,22 @@ def test_a_field_of_another_name_is_no_matter_of_topics() -> None:
     assert "`inputs.wheels.fields`: /odom: no field 'twist.twist.angular.z'" in str(error.value)
     assert "with a profile each: a copy with the other field and another `name`" in str(error.value)
     assert "its topics are" not in str(error.value)
+
+
+def test_a_topic_that_was_skipped_is_not_called_absent() -> None:
+    profile = load_profile("warehouse_amr")
+    there = {s.topic: topic(s.type) for s in profile.sources.values()}
+    leaves = {s.topic: [Leaf(p, (), "") for p in field_paths(s)] for s in profile.sources.values()}
+    wanted = wanted_fields(profile, there, leaves)
+    optional = next(s.topic for s in profile.sources.values() if s.optional)
+    there[optional] = topic("a_msgs/msg/Own", "unknown type a_msgs/msg/Own")
+    leaves[optional] = []
+    assert optional in wanted_fields(profile, there, leaves).keys() & wanted.keys()  # to be counted
+    there["/cmd_vel"] = topic(there["/cmd_vel"].type, "its definition cannot be parsed at 'x'")
+    with pytest.raises(RecordingError) as error:
+        wanted_fields(profile, there, leaves)
+    reason = (
+        "/cmd_vel is skipped, with 9 messages: its definition cannot be parsed at 'x' (command)"
+    )
+    assert reason in str(error.value)
+    assert "no topic" not in str(error.value)

@@ -242,7 +242,7 @@ class ProfileCommand:
 
         profile = load_profile(self.paths[0])
         with self._open(self.paths[1]) as recording:
-            topics = {n: t for n, t in recording.topics.items() if t.skipped is None}
+            topics = recording.topics
             leaves = {name: recording.fields(name) for name in profile.topics if name in topics}
             problems = input_problems(profile, topics, leaves)
             inputs = _inputs(profile, topics)
