@@ -43,6 +43,7 @@ from restock.ingest.store.manifest import (
     manifest_row,
     recorded_facts,
     software_version,
+    uncertain_conditions,
 )
 from restock.ingest.store.transitions import Provenance, recording_table, replaced
 from restock.ingest.store.writer import Staged, StoreWriter
@@ -151,6 +152,7 @@ def prepare(
             new: dict[str, Any] = {"tags": told.tags}
             if _other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
+                new["uncertain_conditions"] = uncertain_conditions(profile)
             elif told.tags == (before["tags"] or {}):
                 return Prepared(IngestResult(str(path), "unchanged", before))
             staged = _tag(store, before, new)

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
+from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.profile_text import (
     profile_toml,
     read_profile_toml,
@@ -27,7 +28,12 @@ from restock.ingest.profile.profile_text import (
 )
 from restock.ingest.store.corrections import correction_rows, corrections_in, lay_over, rules_of
 from restock.ingest.store.episode_rows import episode_ends
-from restock.ingest.store.manifest import conditions_json, count_rows, score_rows
+from restock.ingest.store.manifest import (
+    conditions_json,
+    count_rows,
+    score_rows,
+    uncertain_conditions,
+)
 from restock.ingest.store.transitions import by_name, names_of, replaced
 from restock.ingest.store.version import Version
 from restock.ingest.store.writer import StoreWriter
@@ -177,6 +183,7 @@ def relabel_rows(
     rows, corrections = lay_over(rows, corrections, every_condition, row["clock_offset_ns"])
     named = rows["condition"].to_pylist()
     scores = label_scores(rows, labels, task.control_period_s)
+    profile = _with_conditions(row["profile_toml"], definitions)
     manifest = row | {
         "ingest_id": ingest_id,
         "ingested_at": dt.datetime.now(dt.UTC),
@@ -187,7 +194,8 @@ def relabel_rows(
         "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
         "exposures_json": conditions_json(every_exposure),
-        "profile_toml": _with_conditions(row["profile_toml"], definitions),
+        "profile_toml": None if profile is None else profile_toml(profile),
+        "uncertain_conditions": None if profile is None else uncertain_conditions(profile),
     }
     outcome = Relabelled(
         row["recording_id"],
@@ -202,14 +210,14 @@ def relabel_rows(
     return pa.Table.from_pylist([manifest], recording_schema()), rows, outcome
 
 
-def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> str | None:
-    """The text of a manifest's profile with the conditions that label its rows now; None where it
+def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> Profile | None:
+    """The profile of a manifest's text with the conditions that label its rows now; None where it
     has none, or one that only a newer Restock can read."""
     try:
         profile = read_profile_toml(text or "", where="the manifest's profile")
     except ConfigError:
         return None
-    return profile_toml(with_conditions(profile, conditions))
+    return with_conditions(profile, conditions)
 
 
 def open_for_relabel(path: Path | str) -> StoreWriter:

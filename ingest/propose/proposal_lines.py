@@ -216,7 +216,8 @@ def steered_by(seen: Evidence) -> str:
 def _robot_lines(seen: Evidence) -> list[str]:
     """What the twin builds; the actions are within its limits."""
     robot = seen.robot.limited(*seen.commands.reached)
-    return robot.lines(*np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist())
+    fastest = np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist()
+    return robot.lines(*fastest, outline_guessed=not seen.footprint.measured)
 
 
 def _fixes(seen: Evidence) -> tuple[TopicInfo, Kind] | None:

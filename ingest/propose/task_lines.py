@@ -15,7 +15,7 @@ from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, Footprin
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
-from restock.ingest.propose.evidence.scanned_outline import range_lines
+from restock.ingest.propose.evidence.scanned_outline import TIGHT_PER_WIDTH, range_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.robot import Robot
@@ -25,7 +25,6 @@ GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
 LONGEST_TIME_LIMIT_STEPS = 1000
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
-TIGHT_PER_WIDTH = 0.3  # the default tight_clearance_m is of a robot half a metre wide
 LEAST_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 

@@ -21,8 +21,9 @@ from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
-from restock.ingest.task.conditions import Condition, unknown_rows
+from restock.ingest.task.conditions import Condition, told, unknown_rows, unseen
 from restock.ingest.task.label_scores import LabelScore
+from restock.ingest.task.signals import OUTLINE_SIGNALS
 
 UNUSED = "not used by the profile"
 
@@ -78,6 +79,7 @@ def manifest_row(
         "signals": [],
         "cameras": [],
         "unknown_conditions": unknown_rows(profile.definitions, lidar=profile.task.lidar),
+        "uncertain_conditions": uncertain_conditions(profile),
         "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
         "conditions_json": conditions_json(profile.conditions),
@@ -85,6 +87,13 @@ def manifest_row(
         "profile_toml": profile_toml(profile),
         **recorded,
     }
+
+
+def uncertain_conditions(profile: Profile) -> list[str]:
+    """Return the conditions and exposures whose labels rest on an outline that nobody measured."""
+    if profile.robot is None or not profile.robot.outline_guessed:
+        return []
+    return sorted(unseen(told(profile.definitions, lidar=profile.task.lidar), OUTLINE_SIGNALS))
 
 
 def recorded_facts(

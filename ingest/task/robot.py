@@ -23,6 +23,7 @@ Drive = Literal["differential", "skid_steer", "omnidirectional", "ackermann"]
 Origin = Literal["profile", "robot_description", "urdf", "fit", "logs", "default"]
 Metres = Annotated[float, Meta(gt=0, le=10)]
 Limit = Annotated[float, Meta(gt=0, le=100)]
+OUTLINE = "outline"  # in [robot.origin]: of [task.body]
 USUAL_STEERING_RAD = 0.6  # of a robot that steers, where nothing says
 
 
@@ -74,7 +75,8 @@ class Robot(Checked, frozen=True):
     origin: dict[str, Origin] = msgspec.field(default_factory=dict)
 
     def check(self) -> None:
-        known = {*self.__struct_fields__, *(f"lidar.{n}" for n in Lidar.__struct_fields__)}
+        lidar = (f"lidar.{name}" for name in Lidar.__struct_fields__)
+        known = {*self.__struct_fields__, *lidar, OUTLINE}
         for name in self.origin:
             if name not in known or name in ("origin", "lidar"):
                 raise ValueError(f"origin refers to a value that the robot does not have: {name!r}")
@@ -84,6 +86,11 @@ class Robot(Checked, frozen=True):
             raise ValueError(
                 f"a robot with {self.drive} drive does not steer: leave out max_steering_*"
             )
+
+    @property
+    def outline_guessed(self) -> bool:
+        """Whether nobody measured the outline."""
+        return self.origin.get(OUTLINE) == "default"
 
     @property
     def min_turning_radius_m(self) -> float:

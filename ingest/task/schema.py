@@ -326,6 +326,13 @@ RECORDING_COLUMNS: tuple[Column, ...] = (
         nullable=True,
     ),
     Column(
+        "uncertain_conditions",
+        pa.list_(pa.string()),
+        "conditions and exposures whose labels rest on an outline that is a guess; null: from an "
+        "older Restock",
+        nullable=True,
+    ),
+    Column(
         "corrections",
         _rows_of(
             condition=pa.string(), value=pa.bool_(), episode_index=pa.int64(),

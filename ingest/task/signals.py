@@ -91,6 +91,7 @@ SIGNALS: tuple[Signal, ...] = (
 
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
+OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # rest on it
 LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 
 

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from restock import words
 from restock.arrays import Bools, Codes
 from restock.errors import ConfigError, MixtureError, PanelError, StoreError
 from restock.ingest.task.condition_sql import not_an_expression, not_repeatable
@@ -188,6 +189,21 @@ def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
         " HAVING count(DISTINCT recording_id) = (SELECT count(*) FROM recordings)"
     ).fetchall()
     return dict(rows)
+
+
+def uncertain_labels(
+    connection: duckdb.DuckDBPyConnection, names: Sequence[str]
+) -> tuple[str, ...]:
+    """Say which of these conditions and exposures have labels that rest on a guess, if any."""
+    if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
+        return ()
+    guessed = "list_intersect(uncertain_conditions, $names::VARCHAR[])"
+    (found,) = connection.execute(
+        f"SELECT list_sort(list_distinct(flatten(list({guessed})))), count_if(len({guessed}) > 0)"
+        " FROM recordings",
+        {"names": list(names)},
+    ).fetchall()
+    return (words.uncertain_labels(*found),) if found[1] else ()
 
 
 def episodes_met(

@@ -31,6 +31,7 @@ from restock.replay.plan.candidates import (
     episodes_met,
     one_task,
     read_candidates,
+    uncertain_labels,
     unknown_conditions,
     without_measured_actions,
 )
@@ -167,9 +168,10 @@ def plan_panel(
         )
     stratum[out.gone & ~beyond_cap] = NO_STRATUM
     given = _sources(mixture, table, stratum, state_code, beyond_cap, out.admitted, len(strata))
+    names = [named.name for named in strata]
+    warnings += uncertain_labels(connection, names)
     if others:
         met = episodes_met(connection, mixture, conditions)
-        names = [named.name for named in strata]
         warnings += look_for_archives(mixture.sources.said, met, names)
     occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)

@@ -16,10 +16,16 @@ SELECT
     coalesce(zones, least) AS zones,
     coalesce(behaviour_policies, CASE WHEN least = 0 THEN [] END) AS behaviour_policies,
     coalesce(primary_rows, least) AS primary_rows,
-    coalesce(primary_rows, least) / nullif(sum(primary_rows) OVER (), 0) AS primary_share
+    coalesce(primary_rows, least) / nullif(sum(primary_rows) OVER (), 0) AS primary_share,
+    coalesce(uncertain_recordings, least) AS uncertain_recordings
 FROM conditions
 FULL JOIN seen USING (condition)
 FULL JOIN by_episode USING (condition)
 LEFT JOIN (SELECT condition, 0 AS least FROM conditions ANTI JOIN untold_conditions USING (condition)) AS told
     USING (condition)
+LEFT JOIN (
+    SELECT condition, count(*) AS uncertain_recordings
+    FROM (SELECT unnest(uncertain_conditions) AS condition FROM recordings)
+    GROUP BY condition
+) AS guessed USING (condition)
 ORDER BY rows_held DESC, condition

@@ -25,6 +25,7 @@ FROM (
         NULL::STRUCT(
             condition VARCHAR, kind VARCHAR, signals VARCHAR[], because VARCHAR
         )[] AS unknown_conditions,
+        NULL::VARCHAR[] AS uncertain_conditions,
         NULL::STRUCT(
             condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
             event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT

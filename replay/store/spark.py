@@ -99,6 +99,7 @@ _LATER = {
             "CAST(NULL AS ARRAY<STRUCT<condition: STRING, kind: STRING, signals: ARRAY<STRING>,"
             " because: STRING>>) AS unknown_conditions"
         ),
+        "uncertain_conditions": "CAST(NULL AS ARRAY<STRING>) AS uncertain_conditions",
         "label_counts": (
             "CAST(NULL AS ARRAY<STRUCT<condition: STRING, known: BIGINT, labelled: BIGINT,"
             " support: BIGINT, agreed: BIGINT, event_labelled: BIGINT, event_right: BIGINT,"

@@ -19,6 +19,15 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {plural(number, noun)}"
 
 
+def uncertain_labels(conditions: Iterable[str], recordings: int) -> str:
+    """Say which labels rest on an outline that nobody measured, and how to settle it."""
+    return (
+        f"uncertain: {', '.join(conditions)}, as the robot's outline is a guess in"
+        f" {counted(recordings, 'recording')}: measure it, give --footprint LENGTHxWIDTH to"
+        " `restock profile new`, and ingest again"
+    )
+
+
 def by_priority(conditions: Iterable[str]) -> str:
     """How rows that hold several conditions are counted once; `conditions` come in that order."""
     return (

@@ -15,7 +15,7 @@ from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
 from restock.ingest.propose.evidence.lidars import MountedLidar, SeenScans, View, joined_view
 from restock.ingest.propose.evidence.roles import shared
-from restock.ingest.task.robot import USUAL_STEERING_RAD, Lidar, Robot
+from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
@@ -98,7 +98,7 @@ class RobotProposal:
         origin = self.origin | dict.fromkeys(found, "logs")
         return replace(self, values=self.values | found, origin=origin)
 
-    def lines(self, speed_mps: float, yaw_rate_radps: float) -> list[str]:
+    def lines(self, speed_mps: float, yaw_rate_radps: float, *, outline_guessed: bool) -> list[str]:
         """The TOML; a limit below what was commanded (m/s, rad/s) is none, and said."""
         if not self.rolls:
             return [*(f"# [robot]  # {note}" for note in self.notes), ""]
@@ -125,9 +125,11 @@ class RobotProposal:
         if lidar:
             lines += ["", "[robot.lidar]", *(f"{k} = {toml_value(v)}" for k, v in lidar.items())]
         origin = {key: self.origin[key] for key in values if key in self.origin}
-        if origin:
+        if origin or outline_guessed:
             lines += ["", "[robot.origin]"]
             lines += [f'{_key(key)} = "{value}"' for key, value in origin.items()]
+        if outline_guessed:
+            lines += [f'{OUTLINE} = "default"  # a guess: remove this once task.body is measured']
         return [*lines, ""]
 
 

@@ -1,8 +1,10 @@
 """How large a robot can be, by what its lidar never saw inside; and which returns are its own.
 
 Nothing stands where the robot is, so no return comes from within its outline: the nearest that any
-did is a bound. Parts of the robot that its lidar sees stay at one range whichever way it faces,
-which nothing around it does: they belong to the outline, and are no obstacles.
+did is a bound. A robot also keeps its distance: a guess that reached that far would make a near
+collision of every such pass, so it leaves the room that is no near collision. Parts of the robot
+that its lidar sees stay at one range whichever way it faces, which nothing around it does: they
+belong to the outline, and are no obstacles.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ BINS = 60  # of the full circle
 NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field's name holds a space
 LEAST_SCANS = 20
 OFTEN = 0.005  # of the scans, and at least three: one odd return says nothing
-ROOM_M = 0.05  # that a robot leaves between itself and what it comes nearest to
-LEAST_M = 0.1  # half of a robot's length
+TIGHT_PER_WIDTH = 0.3  # room, by the robot's width: less is a near collision
+LEAST_M = 0.05  # half of a robot's length
 LEAST_RANGE_M = 0.01
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
@@ -56,7 +58,7 @@ class ScannedOutline:
 
     def footprint(self, guess: Footprint) -> Footprint | None:
         """The outline by these scans, where they say more than the guess that there is without."""
-        half_m = max(self.nearest_m - ROOM_M, LEAST_M)
+        half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(LEAST_M, self.nearest_m))
         own = 2 * np.abs(self.own_m).max(axis=0, initial=0.0)
         length, width = (
             max(min(usual, 2 * half_m), float(least))

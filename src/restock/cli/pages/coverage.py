@@ -48,7 +48,7 @@ class CoverageCommand:
         from restock.files import expect_file_place
         from restock.ingest.store.version import given_version
         from restock.replay.store.store import Store
-        from restock.words import by_priority
+        from restock.words import by_priority, uncertain_labels
 
         if self.out is None:
             options, why = ("figures", "mixture", "every"), "applies only to the page"
@@ -68,6 +68,9 @@ class CoverageCommand:
         else:
             output.print_table([_line(row) for row in rows], title="rows that hold each condition")
             output.stdout().print(by_priority(order), markup=False, soft_wrap=True)
+            if guessed := {r["condition"]: n for r in rows if (n := r["uncertain_recordings"])}:
+                said = uncertain_labels(guessed, max(guessed.values()))
+                output.stdout().print(said, markup=False, soft_wrap=True)
 
     def _write(self, store: Any, out: Path, advance: Callable[[int, str], None]) -> Path:
         from restock.errors import ConfigError, RestockError

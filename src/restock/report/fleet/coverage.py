@@ -29,7 +29,7 @@ from restock.report.look.blocks import (
     words,
 )
 from restock.report.look.queries import ask, statements
-from restock.words import by_priority, counted, plural
+from restock.words import by_priority, counted, plural, uncertain_labels
 
 MOST_DOTS = 1500
 MOST_CELLS_ACROSS = 90  # of the map
@@ -129,6 +129,7 @@ def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
 
 def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
     unknown = [words(row["condition"]) for row in rows if row["rows_held"] is None]
+    guessed = {words(r["condition"]): n for r in rows if (n := r["uncertain_recordings"])}
     rows = [row for row in rows if row["rows_held"] is not None]
     table = [
         {
@@ -150,6 +151,7 @@ def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
         "What the store holds",
         intro="Rows in which each condition holds: a row that holds several counts for each. "
         f"{once} Effective episodes: the number of equally long episodes with the same information."
+        + (f" {uncertain_labels(guessed, max(guessed.values()))}." if guessed else "")
         + (
             f" Unknown in every row: {', '.join(unknown)}, as a signal that they need was not "
             "measured (see the view unknown_conditions)."

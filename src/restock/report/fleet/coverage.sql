@@ -2,7 +2,8 @@
 
 -- name: shelves
 SELECT condition, rows_held, held_share, episodes_held, effective_episodes, success_share,
-       recordings, zones, behaviour_policies, primary_rows, primary_share
+       recordings, zones, behaviour_policies, primary_rows, primary_share,
+       uncertain_recordings
 FROM coverage_by_condition;
 
 -- name: weeks
