@@ -250,14 +250,18 @@ class Recording:
 
     @property
     def lost_messages(self) -> list[LostMessages]:
-        """What is missing: of the files, and of the topics that were read."""
+        """What is missing, each once: of the files, and, for other reasons, of the topics read."""
+        damaged = {item.what for item in self.damage}
         lost = [
             LostMessages(None, sum(item.messages.values()) or None, item.what)
             for item in self.damage
         ]
         for account in self.accounts.values():
-            reasons = account.reasons.items()
-            lost += [LostMessages(account.topic, count, why) for why, count in reasons if count]
+            lost += [
+                LostMessages(account.topic, count, why)
+                for why, count in account.reasons.items()
+                if count and why not in damaged
+            ]
         return lost
 
     def leaves(self, topic: str) -> list[str]:

@@ -132,7 +132,7 @@ class Ros1File:
         only its own messages."""
         wanted = set(channels)
         for position in sorted(self._reader.chunks):
-            counts = {key: self._counts[position][key] for key in sorted(wanted)}
+            counts = {key: self._counts[position][key] for key in sorted(self.channels)}
             try:
                 data = self._reader.inflated(position)
             except BROKEN as error:

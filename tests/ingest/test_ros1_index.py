@@ -168,3 +168,30 @@ def test_a_chunk_of_bz2_that_is_read_again_is_kept(
         for _ in range(5):
             recording.read({"/flag": []})
     assert len(unpacked) == 2 + 5
+
+
+def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    writer = Writer(path)
+    writer.set_compression(Writer.CompressionFormat.BZ2)
+    writer.chunk_threshold = 20_000
+    with writer:
+        topics = {
+            topic: writer.add_connection(topic, "std_msgs/msg/Float64", typestore=TYPES)
+            for topic in ("/one", "/two")
+        }
+        for row in range(1000):
+            for number in topics.values():
+                writer.write(number, row * 1_000_000, struct.pack("<d", row))
+    content = bytearray(path.read_bytes())
+    second = content.index(b"BZh9", content.index(b"BZh9") + 1)
+    content[second + 200] ^= 0xFF
+    path.write_bytes(content)
+    with open_recording(path) as recording:
+        there = sum(len(recording.read({topic: []})[topic]) for topic in topics)
+        assert 1000 < there < 2000
+        (lost,) = recording.lost_messages
+        assert (lost.topic, lost.messages) == (None, 2000 - there)
+        reasons = [account.reasons for account in recording.accounts.values()]
+        assert [list(one) for one in reasons] == [[lost.reason]] * 2  # each topic's own share
+        assert sum(one[lost.reason] for one in reasons) == lost.messages

@@ -313,10 +313,7 @@ class ProfileCommand:
 
 def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
     """What is missing of these recordings' files and of the topics that a profile takes: a line
-    each. Of a profile that cannot be used yet, of all topics that were read.
-
-    Topics are read one after the other, so that a count of a whole file would be of some alone.
-    """
+    each. Of a profile that cannot be used yet, of all topics that were read."""
     from restock.ingest.profile.profile import parse_profile
 
     topics = None
@@ -324,7 +321,7 @@ def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
         topics = parse_profile(toml, where="the proposal").topics
     return [
         visible(f"{recording.path}: {loss.topic or 'the file'}: {loss.reason}")
-        + (f" ({counted(n, 'message')})" if loss.topic and (n := loss.messages) else "")
+        + (f" ({counted(n, 'message')})" if (n := loss.messages) else "")
         for recording in recordings
         for loss in recording.lost_messages
         if loss.topic is None or topics is None or loss.topic in topics
