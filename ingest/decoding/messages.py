@@ -6,6 +6,7 @@ written out (`visible`) where they come in.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,9 +19,15 @@ from restock.errors import visible
 from restock.ingest.decoding.columns import offsets_of
 
 
+_SHORT_NAME = re.compile(r"(\w+)/(\w+)")
+
+
 @dataclass(frozen=True)
 class Channel:
-    """One stream of messages of one type in one file."""
+    """One stream of messages of one type in one file.
+
+    Some writers leave the `msg` out of a ROS type's name: the type has it.
+    """
 
     id: int
     topic: str
@@ -33,6 +40,8 @@ class Channel:
     def __post_init__(self) -> None:
         for name in ("topic", "type", "encoding", "definition_format"):
             object.__setattr__(self, name, visible(getattr(self, name)))
+        if short := _SHORT_NAME.fullmatch(self.type):
+            object.__setattr__(self, "type", "/msg/".join(short.groups()))
 
 
 @dataclass(frozen=True)

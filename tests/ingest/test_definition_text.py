@@ -106,3 +106,10 @@ def test_what_cannot_be_parsed_is_quoted(tmp_path: Path, form: str, text: str, p
         skipped = recording.topics["/twist"].skipped
         assert skipped is not None
         assert skipped.startswith(f"its definition cannot be parsed{place}")
+
+
+@pytest.mark.parametrize("name", ["a_msgs/Twist", "a_msgs/msg/Twist"])
+def test_a_type_has_one_name_with_or_without_msg(tmp_path: Path, name: str) -> None:
+    with open_recording(recorded(tmp_path / "run.mcap", "ros2msg", MSG, name)) as recording:
+        assert recording.topics["/twist"].type == "a_msgs/msg/Twist"
+        assert recording.read({"/twist": ["level"]})["/twist"].fields["level"].tolist() == [7]
