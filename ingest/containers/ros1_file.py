@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
+from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.ros1_bag import BROKEN, Bag, Walked, walk
 from restock.ingest.containers.storage import (
@@ -20,6 +22,12 @@ from restock.ingest.containers.storage import (
     unwatched,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
+
+# Whose places are remembered, of 24 bytes: who proposes a profile reads topic after topic, and
+# walking a chunk takes longer than inflating it.
+MOST_REMEMBERED = 1 << 20  # messages
+# Start, end and stamp of a chunk's messages (N, 3), by connection; and where it is damaged.
+_Places: TypeAlias = tuple[dict[int, Ints], int | None]
 
 
 class Ros1File:
@@ -37,6 +45,8 @@ class Ros1File:
         self.extras: list[Extra] = []
         self.metadata: list[Metadata] = []  # the format has no place for it
         self.packed: list[Packed] = []
+        self._places: dict[int, _Places] = {}  # by the position of the chunk
+        self._room = MOST_REMEMBERED
         self._reader = Bag(path)
         try:
             self._reader.open()
@@ -132,6 +142,8 @@ class Ros1File:
         only its own messages."""
         wanted = set(channels)
         for position in sorted(self._reader.chunks):
+            if position in self._places and not wanted & self._places[position][0].keys():
+                continue
             counts = {key: self._counts[position][key] for key in sorted(self.channels)}
             try:
                 data = self._reader.inflated(position)
@@ -139,7 +151,7 @@ class Ros1File:
                 lost = {key: count for key, count in counts.items() if count}
                 self._damaged(f"chunk at byte {position:,} is lost: {error}", lost)
                 continue
-            found, cut = walk(data)
+            found, cut = self._walked(position, data)
             for key, rows in found.items():
                 if key in wanted:
                     yield key, _batch(data, rows)
@@ -151,6 +163,17 @@ class Ros1File:
                 lost = {key: count for key, count in fewer.items() if count > 0}
                 self._damaged(f"chunk at byte {position:,}: damaged at its byte {cut:,}", lost)
 
+    def _walked(self, position: int, data: bytes) -> _Places:
+        """Walk a chunk, or remember where its messages are."""
+        if position in self._places:
+            return self._places[position]
+        found, cut = walk(data)
+        places = {key: np.array(rows, np.int64) for key, rows in found.items()}
+        self._room -= sum(map(len, places.values()))
+        if self._room >= 0:
+            self._places[position] = places, cut
+        return places, cut
+
     def _damaged(self, what: str, messages: dict[int, int]) -> None:
         self.integrity = "damaged"
         if all(item.what != what for item in self.damage):
@@ -161,7 +184,7 @@ class Ros1File:
         self._reader.close()
 
 
-def _batch(data: bytes, rows: list[tuple[int, int, int]]) -> MessageBatch:
+def _batch(data: bytes, places: Ints) -> MessageBatch:
     """The messages that lie at these places of a chunk."""
-    start, stop, times = np.array(rows, np.int64).T
+    start, stop, times = places.T
     return MessageBatch(np.frombuffer(data, np.uint8), start, stop, times, times)

@@ -18,7 +18,6 @@ from restock.arrays import Ints
 from restock.errors import visible
 from restock.ingest.decoding.columns import offsets_of
 
-
 _SHORT_NAME = re.compile(r"(\w+)/(\w+)")
 
 

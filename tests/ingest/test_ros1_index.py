@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.paths import SHARED
 
 from restock.errors import RecordingError
-from restock.ingest.containers import ros1_bag
+from restock.ingest.containers import ros1_bag, ros1_file
 from restock.ingest.containers.open_recording import open_recording
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -195,3 +195,20 @@ def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> 
         reasons = [account.reasons for account in recording.accounts.values()]
         assert [list(one) for one in reasons] == [[lost.reason]] * 2  # each topic's own share
         assert sum(one[lost.reason] for one in reasons) == lost.messages
+
+
+@pytest.mark.parametrize("most", [ros1_file.MOST_REMEMBERED, 150])
+def test_a_chunk_is_walked_once_while_there_is_room(bag, monkeypatch, most: int) -> None:
+    walked = []
+    real = ros1_file.walk
+    monkeypatch.setattr(ros1_file, "walk", lambda data: walked.append(data) or real(data))
+    monkeypatch.setattr(ros1_file, "MOST_REMEMBERED", most)
+    with Reader(bag) as reader:
+        chunks = len(reader.chunks)
+    with open_recording(bag) as recording:
+        for _ in range(3):
+            columns = recording.read({"/number": ["data"]})["/number"]
+            assert np.array_equal(columns.fields["data"], np.arange(ROWS))
+            assert len(recording.read({"/flag": []})["/flag"]) == ROWS
+    assert chunks > 3
+    assert len(walked) == chunks if most > 2 * ROWS else chunks < len(walked) < 6 * chunks
