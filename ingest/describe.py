@@ -35,8 +35,8 @@ def describe_recording(
     """Format, size, time span and topics of one recording; nothing is decoded but for `clocks`.
 
     Times are log times. `rate_hz` is the messages of a topic over the recording's duration. With
-    `clocks` the whole recording is read for its header stamps, and every topic has its `clock`;
-    `watch` is told how far that is.
+    `clocks` the whole recording is read for its header stamps, every topic has its `clock`, and
+    `integrity` is known; `watch` is told how far that is.
 
     Raises:
         RecordingError: it cannot be opened; see `open_recording`.
@@ -59,6 +59,7 @@ def describe_recording(
             "end": _date(span[1]) if span else None,
             "duration_s": duration_s,
             "messages": recording.messages,
+            "integrity": recording.integrity if clocks else None,
             "topics": {
                 topic.name: {
                     "type": topic.type,

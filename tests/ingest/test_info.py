@@ -168,3 +168,23 @@ def test_sample_logs_say_what_their_publishers_offered(capsys: pytest.CaptureFix
             }
         ]
         assert entry["topics"]["/imu"]["qos"][0]["reliability"] == "best_effort"
+
+
+def test_it_says_that_damage_is_unseen_until_messages_are_read(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "one.mcap"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 4] ^= 0xFF  # within the messages of a chunk
+    path.write_bytes(content)
+    assert main(["info", str(path)]) == 0
+    assert "--clocks reads every message" in capsys.readouterr().out
+    assert main(["info", str(path), "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert (entry["integrity"], entry["damage"]) == (None, [])
+    assert main(["info", str(path), "--clocks", "--json"]) == 3
+    (entry,) = json.loads(capsys.readouterr().out)["recordings"]
+    assert entry["integrity"] == "damaged"
+    assert "is lost" in entry["damage"][0]
+    assert main(["info", str(path), "--clocks"]) == 3
+    assert "--clocks reads" not in capsys.readouterr().out

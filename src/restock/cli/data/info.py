@@ -229,7 +229,7 @@ def _qos(profile: dict[str, Any]) -> str:
 def _print(entry: dict[str, Any]) -> None:
     from restock.cli import output
 
-    clocked = any("clock" in topic for topic in entry["topics"].values())
+    clocked = entry["integrity"] is not None
     rows = [
         {
             **(output.clock_cells(topic.get("clock")) if clocked else {}),
@@ -262,6 +262,8 @@ def _print(entry: dict[str, Any]) -> None:
     for packed in entry["chunks"]:
         sys.stdout.write(f"{inside}{_packed(packed)}\n")
     output.print_table(rows, shown)
+    if not clocked:
+        sys.stdout.write("not decoded, so damage may be unseen: --clocks reads every message\n")
     output.print_skipped({name: topic["skipped"] for name, topic in entry["topics"].items()})
     for what, names in (
         ("attachments", [item["name"] for item in entry["attachments"]]),
