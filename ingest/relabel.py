@@ -31,6 +31,7 @@ from restock.ingest.store.episode_rows import episode_ends
 from restock.ingest.store.manifest import (
     conditions_json,
     count_rows,
+    driven_plan,
     score_rows,
     uncertain_conditions,
 )
@@ -143,7 +144,8 @@ def relabel_rows(
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     conditions, situations_told = (
-        told(several, lidar=task.lidar) for several in (every_condition, every_exposure)
+        told(several, lidar=task.lidar, driven_plan=driven_plan(rows))
+        for several in (every_condition, every_exposure)
     )
     if row["format"] == TWIN:  # which fills none of the profile's own signals
         conditions = runnable(stored, conditions)
@@ -190,7 +192,9 @@ def relabel_rows(
         "labels_version": rows["labels_version"][0].as_py(),
         "label_scores": score_rows(scores),
         "label_counts": count_rows(scores),
-        "unknown_conditions": unknown_rows(definitions, lidar=task.lidar),
+        "unknown_conditions": unknown_rows(
+            definitions, lidar=task.lidar, driven_plan=driven_plan(rows)
+        ),
         "corrections": correction_rows(corrections),
         "conditions_json": conditions_json(every_condition),
         "exposures_json": conditions_json(every_exposure),

@@ -111,9 +111,10 @@ def episode_rows(
             signals[name][old] = column
     custom = steps.custom.take(tick)
     table = label_table(signals, episode, step, custom)
-    lidar = profile.task.lidar
+    lidar, driven_plan = profile.task.lidar, profile.goal_source == "hindsight"
     conditions, situations = (
-        told(several, lidar=lidar) for several in (profile.conditions, profile.exposures)
+        told(several, lidar=lidar, driven_plan=driven_plan)
+        for several in (profile.conditions, profile.exposures)
     )
     held, probable = label_with_probabilities(table, [*conditions, *situations])
     labels, exposures = (

@@ -78,7 +78,9 @@ def manifest_row(
         "findings": [],
         "signals": [],
         "cameras": [],
-        "unknown_conditions": unknown_rows(profile.definitions, lidar=profile.task.lidar),
+        "unknown_conditions": unknown_rows(
+            profile.definitions, lidar=profile.task.lidar, driven_plan=driven_plan(table)
+        ),
         "uncertain_conditions": uncertain_conditions(profile),
         "corrections": [],
         "task_json": msgspec.json.encode(profile.task).decode(),
@@ -93,7 +95,17 @@ def uncertain_conditions(profile: Profile) -> list[str]:
     """Return the conditions and exposures whose labels rest on an outline that nobody measured."""
     if profile.robot is None or not profile.robot.outline_guessed:
         return []
-    return sorted(unseen(told(profile.definitions, lidar=profile.task.lidar), OUTLINE_SIGNALS))
+    hindsight = profile.goal_source == "hindsight"
+    known = told(profile.definitions, lidar=profile.task.lidar, driven_plan=hindsight)
+    return sorted(unseen(known, OUTLINE_SIGNALS))
+
+
+def driven_plan(rows: pa.Table) -> bool:
+    """Whether the plan of a recording's rows is the path that was driven: goals in hindsight."""
+    return (
+        "goal_source" in rows.column_names
+        and "hindsight" in rows["goal_source"].unique().to_pylist()
+    )
 
 
 def recorded_facts(

@@ -49,7 +49,7 @@ import pyarrow as pa
 from restock.arrays import F32, F64, Bools
 from restock.errors import ConfigError
 from restock.ingest.task.condition_sql import SANDBOX, WINDOW, refusal, sandbox, select_of
-from restock.ingest.task.signals import LIDAR_SIGNALS
+from restock.ingest.task.signals import LIDAR_SIGNALS, PLAN_SIGNALS
 from restock.toml import Checked
 
 Timing = Literal["pre", "post"]
@@ -61,6 +61,7 @@ _LENGTH = re.compile(r"\{(\d*\.?\d+) ([sm])\}")
 # What conditions may take on a recording: those that Restock brings take a thirtieth of it a step.
 LIMIT_S, LIMIT_S_PER_STEP = 60.0, 0.001
 NO_LIDAR = "no lidar"  # why a condition is unknown
+DRIVEN_PLAN = "the plan is the path that was driven"  # and so nothing stood on it
 
 
 class Condition(Checked, frozen=True):
@@ -155,26 +156,41 @@ def unseen(
     return {name: named for name, named in lost.items() if named}
 
 
-def unknown_rows(conditions: Iterable[Condition], *, lidar: bool) -> list[dict[str, Any]]:
-    """What a robot's steps do not tell, as manifests hold it."""
-    definitions = [] if lidar else list(conditions)
-    lost = unseen(definitions)
+def unknown_rows(
+    conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
+) -> list[dict[str, Any]]:
+    """What a robot's steps do not tell, as manifests hold it.
+
+    Without a lidar, or with the path that was driven as their plan, as goals in hindsight have it.
+    """
+    definitions = list(conditions)
+    unknown: dict[str, tuple[list[str], str]] = {}
+    for known, signals, because in (
+        (not driven_plan, PLAN_SIGNALS, DRIVEN_PLAN),
+        (lidar, LIDAR_SIGNALS, NO_LIDAR),
+    ):
+        if not known:
+            lost = unseen(definitions, signals)
+            unknown |= {name: (named, because) for name, named in lost.items()}
     return [
         {
             "condition": one.name,
             "kind": one.kind,
-            "signals": lost[one.name],
-            "because": NO_LIDAR,
+            "signals": unknown[one.name][0],
+            "because": unknown[one.name][1],
         }
         for one in definitions
-        if one.name in lost
+        if one.name in unknown
     ]
 
 
-def told(conditions: Iterable[Condition], *, lidar: bool) -> list[Condition]:
-    """The conditions that steps can be told by, with a lidar or without."""
+def told(
+    conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
+) -> list[Condition]:
+    """The conditions that such steps can be told by."""
     conditions = list(conditions)
-    lost = {} if lidar else unseen(conditions)
+    rows = unknown_rows(conditions, lidar=lidar, driven_plan=driven_plan)
+    lost = {row["condition"] for row in rows}
     return [condition for condition in conditions if condition.name not in lost]
 
 

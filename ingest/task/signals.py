@@ -92,6 +92,7 @@ SIGNALS: tuple[Signal, ...] = (
 STORED_SIGNALS: tuple[Signal, ...] = tuple(signal for signal in SIGNALS if signal.stored)
 OPTIONAL_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.optional)
 OUTLINE_SIGNALS = frozenset({"clearance_m", "clearance_ahead_m", "plan_return_m"})  # rest on it
+PLAN_SIGNALS = frozenset({"plan_return_m", "plan_gap_m"})  # what stands on the plan
 LIDAR_SIGNALS = frozenset(signal.name for signal in SIGNALS if signal.lidar)
 
 

@@ -109,6 +109,27 @@ def test_a_bag_without_goals_becomes_missions_that_say_so(tmp_path, capsys) -> N
     assert audits["mixed_goal_sources"]["status"] == "pass"
 
 
+def test_what_stands_on_the_driven_path_is_unknown_not_false(tmp_path, capsys) -> None:
+    """The plan is what was driven: nothing stood on it, and of another plan nothing is known."""
+    bag, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
+    store = tmp_path / "store"
+    names = ["blocked_aisle", "plan_blocked"]
+    query = "SELECT condition FROM unknown_conditions WHERE because LIKE '%driven' ORDER BY 1"
+    with ingested(bag, file, store, capsys) as opened:
+        assert [name for (name,) in opened.sql(query).fetchall()] == names
+        held = dict(opened.sql("SELECT condition, rows_held FROM coverage_by_condition").fetchall())
+        assert (held["blocked_aisle"], held["near_collision"]) == (None, 0)
+    more = '[[condition]]\nname = "close"\ntiming = "pre"\nsql = "plan_gap_m < 9"\n'
+    file.write_text(file.read_text() + more)
+    assert main(["label", str(store), "--profile", str(file)]) == 0  # and again, of one's own
+    with Store(store) as opened:
+        assert [name for (name,) in opened.sql(query).fetchall()] == [
+            "blocked_aisle",
+            "close",
+            names[1],
+        ]
+
+
 def test_no_feature_but_goal_and_route_changes_with_what_came_after(tmp_path, capsys) -> None:
     bag, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
     bare = tmp_path / "none.toml"

@@ -4,6 +4,7 @@
 -- a rack that the plan passes does not. Where the robot has turned away from the plan it sees less of
 -- what stands on it. In the first 1.6 s of an episode nothing says that it stays. It takes clear
 -- evidence within 1 s, and holds on through gaps.
+-- Unknown where the plan is the path that was driven, as goals in hindsight have it.
 -- Weights: a logistic regression; `python benchmarks/labels.py --cache FOLDER --fit blocked_aisle`.
 -- That of someone_m was raised by hand, on two logs, when edges and lost beams ceased to count in it.
 -- timing: pre

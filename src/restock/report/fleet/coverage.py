@@ -153,8 +153,7 @@ def _shelves(rows: Rows, colours: dict[str, str], once: str) -> Section:
         f"{once} Effective episodes: the number of equally long episodes with the same information."
         + (f" {uncertain_labels(guessed, max(guessed.values()))}." if guessed else "")
         + (
-            f" Unknown in every row: {', '.join(unknown)}, as a signal that they need was not "
-            "measured (see the view unknown_conditions)."
+            f" Unknown in every row: {', '.join(unknown)} (the view unknown_conditions says why)."
             if unknown
             else ""
         ),
