@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
@@ -32,6 +32,7 @@ def open_place(
     memory_limit: str | None = None,
     only_store: bool = False,
     version: Version | None = None,
+    opened: Callable[[Store], None] = lambda store: None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """A connection with the views of a store, a run or a panel: for `query` or `install_named`,
     which make those views of a store that a text names.
@@ -43,6 +44,7 @@ def open_place(
         memory_limit: of DuckDB, for a store.
         only_store: take nothing but a store.
         version: of a store; the newest.
+        opened: called with the store before it is queried: `Store.verify` verifies its files.
 
     Raises:
         StoreError: there is nothing that can be queried, or no such version; or what is beside it
@@ -52,6 +54,7 @@ def open_place(
     place = Location.of(path)
     if only_store or place.folder is None or is_store(place):
         with Store(place, version=version, memory_limit=memory_limit) as store:
+            opened(store)
             _add_all(store.bare, beside)
             for schema, path in (beside or {}).items():
                 _refuse_of_another_store(store, schema, path)

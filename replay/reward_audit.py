@@ -24,6 +24,7 @@ from restock.replay.places import RUN_CONFIG, open_place
 from restock.replay.store.audit import Audit, Finding, Thresholds, check_thresholds, run_audits
 from restock.replay.store.definitions import install_named
 from restock.replay.store.query import found
+from restock.replay.store.store import Store
 from restock.words import quoted
 
 DISCOUNT = 0.99  # of a store's rows, unless another is asked for
@@ -79,7 +80,12 @@ def audit_reward(
     discount = DISCOUNT if discount is None else discount
     beside = {"run": place} if of_run else {}
     with open_place(
-        place, beside=beside, memory_limit=memory_limit, only_store=not of_run, version=version
+        place,
+        beside=beside,
+        memory_limit=memory_limit,
+        only_store=not of_run,
+        version=version,
+        opened=Store.verify,
     ) as connection:
         if of_run:
             _check_evaluated(connection, Path(place))

@@ -1,4 +1,7 @@
-"""Damaged files: a store goes on without those that cannot be read, and says what it lost.
+"""Damaged files: how they are found, and how a store goes on without them and says what it lost.
+
+Every page of a store's Parquet files has a checksum, which DuckDB does not verify. So files are
+read whole once before rows are taken from them, and which were is remembered in the store.
 
 A file that others were joined into is joined again from them, while they are kept. Where they are
 gone it is taken out of its table, and the recordings whose rows or manifests were in it are named:
@@ -9,14 +12,18 @@ writers may go on meanwhile.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import pyarrow as pa
+import pyarrow.fs
 
+from restock.errors import StoreError
 from restock.ingest.store.data_files import READ_ROWS, merge
 from restock.ingest.store.lineage import (
     OWN_PATH,
@@ -24,14 +31,24 @@ from restock.ingest.store.lineage import (
     active_files,
     by_system,
     damage_named,
+    damage_remedy,
     held_by,
     stored_files,
 )
-from restock.ingest.store.location import RECORDINGS, TRANSITIONS, Location, open_parquet
+from restock.ingest.store.location import (
+    FRAMES,
+    RECORDINGS,
+    TRANSITIONS,
+    Location,
+    open_parquet,
+)
+from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.writer import StoreWriter
+from restock.words import quoted
 
 OPERATION = "restock compact --drop-damaged"
 READ_AT_ONCE = 4  # files, of each of which a row group may be in memory
+VERIFIED = "verified.json"  # in a store: path -> [bytes, time written in ns] of files found whole
 Files = Mapping[str, list[StoredFile]]  # by table
 _TOLD = (
     *("recording_id", "ingest_id", "ingested_at"),
@@ -47,6 +64,22 @@ class LostRecording:
     source_file: str
     transitions: int
     corrections: int | None  # of its labels, by people; None where its manifest was damaged
+
+
+@dataclass(frozen=True)
+class DamagedFile:
+    """A file of a store that is damaged or missing, and what to do about it."""
+
+    file: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What was found of a store's files: how many it has, and those that are damaged."""
+
+    files: int
+    damaged: list[DamagedFile]
 
 
 @dataclass
@@ -73,9 +106,7 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
     for name in (TRANSITIONS, RECORDINGS):  # of manifests, those of the rows that stay are needed
         table = store.path.open_table(name)
         rows = {path: count or 0 for path, count, *_ in active_files(table)}
-        with ThreadPoolExecutor(READ_AT_ONCE) as pool:
-            broken = pool.map(lambda path: is_damaged(store.path, path), _below(name, rows))
-            damaged = [path for path, one in zip(rows, broken, strict=True) if one]
+        damaged = _damaged(store.path, {f"{name}/{path}": path for path in rows})
         readable[name] = stored_files(store.path, name, table, without=damaged)
         for path in damaged:
             sources = _sources(store.path, name, path, rows[path], readable)
@@ -94,6 +125,95 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
     return done
 
 
+def verify_store(path: str | Path | Location) -> Verified:
+    """Read every file of a store whole: rows, manifests, and the frames that manifests name.
+
+    Raises:
+        StoreError: there is no store, it cannot be reached, or a file cannot be read for another
+            reason than damage.
+    """
+    store = StoreReader(path)
+    store.path.expect_both_tables()
+    paths = [
+        f"{name}/{file}"
+        for name in (TRANSITIONS, RECORDINGS)
+        for file, *_ in active_files(store.path.open_table(name))
+    ]
+    damaged = verify_files(store.path, paths, again=True)
+    if not any(path.startswith(f"{RECORDINGS}/") for path in damaged):
+        frames = [f"{FRAMES}/{path}" for path in frame_files(store.live())]
+        damaged += verify_files(store.path, frames, again=True)
+        paths += frames
+    told = [DamagedFile(path, damage_remedy(store.path, path)) for path in damaged]
+    return Verified(len(paths), told)
+
+
+def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) -> list[str]:
+    """Read files of a store whole and return those that are damaged; paths are within the store.
+
+    A file that was found whole before is skipped while its size and time are the same, unless
+    `again`.
+
+    Raises:
+        StoreError: a file cannot be read for another reason than damage.
+    """
+    paths, stamps = list(paths), _stamps(place)
+    known = {} if again else _remembered(place, stamps)
+    unread = [path for path in paths if path not in known]
+    damaged = _damaged(place, {path: path for path in unread})
+    if unread:
+        whole = {path: stamps[path] for path in unread if path in stamps}
+        whole = {path: stamp for path, stamp in whole.items() if path not in damaged}
+        with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # may be read-only
+            out.write(json.dumps(_remembered(place, stamps) | whole).encode())
+    return damaged
+
+
+def unverified_files(place: Location, paths: Iterable[str]) -> int:
+    """How many of these files of a store `verify_files` would read."""
+    known = _remembered(place, _stamps(place))
+    return sum(path not in known for path in paths)
+
+
+def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
+    """What is wrong with files of a store that `verify_files` found, and what to do."""
+    more = f" and {len(damaged) - 1:,} more" if len(damaged) > 1 else ""
+    return StoreError(
+        f"its file {damaged[0]}{more}: damaged or missing (a page does not match its checksum, or"
+        " it cannot be read)",
+        where=str(place),
+        remedy=damage_remedy(place, damaged[0])
+        + (f"; `restock store verify {quoted(place)}` lists all" if more else ""),
+    )
+
+
+def _stamps(place: Location) -> dict[str, list[int]]:
+    """Size in bytes and time written in ns of each Parquet file of a store, by its path in it."""
+    with place.translate_errors():
+        infos = place.files.get_file_info(pa.fs.FileSelector("", recursive=True))
+    return {
+        one.path: [one.size, one.mtime_ns or 0] for one in infos if one.path.endswith(".parquet")
+    }
+
+
+def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, list[int]]:
+    """The files that were found whole and have not changed since."""
+    try:
+        with place.reading(VERIFIED) as source:
+            told = json.loads(source.read())
+    except (OSError, ValueError, StoreError):
+        return {}
+    told = told if isinstance(told, dict) else {}
+    return {path: stamp for path, stamp in stamps.items() if told.get(path) == stamp}
+
+
+def _damaged(place: Location, paths: Mapping[str, str]) -> list[str]:
+    """The names of those files that are damaged, of files and their names."""
+    with ThreadPoolExecutor(READ_AT_ONCE) as pool:
+        broken = pool.map(lambda path: is_damaged(place, path), paths)
+        return [name for name, one in zip(paths.values(), broken, strict=True) if one]
+
+
 def is_damaged(place: Location, path: str) -> bool:
     """Whether a file of the store is missing, is no whole Parquet file, or has a page that does
     not match its checksum.
@@ -104,15 +224,16 @@ def is_damaged(place: Location, path: str) -> bool:
     with damage_named(place, path):
         try:
             with place.reading(path) as source:
-                for _ in open_parquet(source).iter_batches(READ_ROWS):
-                    pass
+                file = open_parquet(source)
+                # A column whose page says that it is empty ends the batches without an error.
+                read = sum(batch.num_rows for batch in file.iter_batches(READ_ROWS))
+                return bool(read != file.metadata.num_rows)
         except (FileNotFoundError, pa.ArrowInvalid):
             return True
         except OSError as error:
             if by_system(error):
                 raise
             return True
-    return False
 
 
 def _sources(place: Location, name: str, path: str, rows: int, readable: Files) -> list[StoredFile]:

@@ -23,7 +23,7 @@ from deltalake import DeltaTable
 
 from restock.errors import StoreError
 from restock.files import first_line
-from restock.ingest.store.location import TRANSITIONS, Location, open_parquet
+from restock.ingest.store.location import FRAMES, TRANSITIONS, Location, open_parquet
 from restock.words import quoted
 
 OWN_PATH = re.compile(r"([0-9a-f]{16})/[^/]+\.parquet")
@@ -113,7 +113,14 @@ def active_files(table: DeltaTable) -> list[tuple[str, int | None, int | None, i
         actions[column].to_pylist() if column in actions.schema.names else [None] * len(actions)
         for column in ("path", "num_records", "size_bytes", "modification_time")
     ]
-    return [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
+    files = [(unquote(str(path)), *rest) for path, *rest in zip(*columns, strict=True)]
+    if damaged := next((path for path, *_ in files if "\0" in path), None):
+        raise StoreError(
+            f"its log names a file that cannot be: {damaged}",
+            where=table.table_uri,
+            remedy="restore the newest commits of its _delta_log from a copy",
+        )
+    return files
 
 
 def held_by(place: Location, name: str, path: str) -> StoredFile:
@@ -157,7 +164,7 @@ def by_system(error: BaseException) -> bool:
 def damage_remedy(place: Location, path: str) -> str:
     """What to do where a file of the store is damaged or missing."""
     name, _, file = path.partition("/")
-    if name == TRANSITIONS and OWN_PATH.fullmatch(file):
+    if name == FRAMES or (name == TRANSITIONS and OWN_PATH.fullmatch(file)):
         return "restore the file from a copy, or ingest its recording again with --force"
     return (
         f"restore the file from a copy, or let `restock compact {quoted(place)} --drop-damaged`"

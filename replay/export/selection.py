@@ -103,6 +103,7 @@ def open_selection(
         Store(path, version=version) as store,
         open_place(path, beside=beside, only_store=True, version=version) as connection,
     ):
+        store.verify()
         chosen = chosen_cameras(store, cameras)
         yield _of_query(store, connection, text, panel, continuous, chosen)
 

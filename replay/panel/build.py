@@ -73,8 +73,12 @@ def open_source(
 
     A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
+
+    Raises:
+        StoreError: a file of a store is damaged: its page checksums are verified first.
     """
     if isinstance(transitions, Store):
+        transitions.verify()
         named = (
             (*transitions.conditions(), *transitions.exposures())
             if conditions is None

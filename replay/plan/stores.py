@@ -70,7 +70,9 @@ def _open(wanted: OtherStore, folder: Path | None) -> Store:
         if not path.is_absolute() and folder is not None:
             path = folder / path
     try:
-        return Store(path, version=wanted.version)
+        store = Store(path, version=wanted.version)
+        store.verify()
+        return store
     except StoreError as error:
         raise StoreError(
             f"the mixture's store {wanted.name!r}: {error.what}",

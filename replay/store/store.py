@@ -21,6 +21,7 @@ import msgspec
 import pyarrow as pa
 
 from restock.errors import QueryError, StoreError, expect
+from restock.ingest.store.damaged_files import damaged_error, unverified_files, verify_files
 from restock.ingest.store.lineage import (
     Ingest,
     StoredFile,
@@ -158,6 +159,21 @@ class Store:
         """With the common views; macros, and views of fewer uses, `install_named` makes."""
         self._definitions.make_common()
         return self.bare
+
+    def verify(self) -> None:
+        """Verify the page checksums of the files that queries read; DuckDB does not.
+
+        A file is read whole once and again when its size or time changed: see `verified.json`.
+
+        Raises:
+            StoreError: a file is damaged or missing, or the place cannot be reached.
+        """
+        if damaged := verify_files(self.path, self._paths()):
+            raise damaged_error(self.path, damaged)
+
+    def unverified(self) -> int:
+        """How many of those files `verify` would read."""
+        return unverified_files(self.path, self._paths())
 
     def close(self) -> None:
         """Close the connection and remove its temporary files."""
@@ -346,6 +362,11 @@ class Store:
         except StoreError as error:
             cause = error.__cause__
             raise (isinstance(cause, duckdb.Error) and damage(cause)) or error from error
+
+    def _paths(self) -> list[str]:
+        """The files of rows and manifests, by their paths in the store."""
+        tables = (self._transitions, self._recordings)
+        return [f"{table.table}/{path}" for table in tables for path in table.paths]
 
     def _frames(self) -> StoredTable:
         """The frames of cameras that the manifests of its rows name."""

@@ -166,6 +166,7 @@ def _store(path: str) -> list[Finding]:
     began = time.monotonic()
     try:
         with Store(path) as store:
+            store.verify()
             opened = time.monotonic() - began
             counts: dict[str, Any] = dict(
                 store.sql(

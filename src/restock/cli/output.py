@@ -16,10 +16,13 @@ from typing import TYPE_CHECKING, Any
 from restock.cli.table_layout import FAR, PIPE_WIDTH, Layout, Row, grouped, is_number
 from restock.cli.table_layout import cell as cell  # for those who print
 from restock.errors import visible
+from restock.words import counted, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
+
+    from restock.replay.store.store import Store
 
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
@@ -68,6 +71,15 @@ def stderr() -> Console:
 def say(message: str) -> None:
     """One line of progress, to stderr: no markup, for it may hold a path or a command."""
     stderr().print(visible(message, keep="\n"), markup=False, emoji=False, soft_wrap=True)
+
+
+def say_unverified(store: Store) -> None:
+    """Say how many files a store has whose checksums nobody has verified; nothing if none."""
+    if files := store.unverified():
+        say(
+            f"note: {counted(files, 'file')} of {store.path} not verified:"
+            f" `restock store verify {quoted(store.path)}` compares their checksums"
+        )
 
 
 def plain(value: Any) -> Any:

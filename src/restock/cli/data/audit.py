@@ -69,6 +69,7 @@ class AuditCommand:
         from restock.replay.places import RUN_CONFIG, open_place
         from restock.replay.reward_audit import audit_reward
         from restock.replay.store.audit import junit_xml, load_audits, load_thresholds, run_audits
+        from restock.replay.store.store import Store
 
         beside = {"panel": self.panel, "run": self.run_dir}
         given = {name: path for name, path in beside.items() if path is not None}
@@ -123,6 +124,7 @@ class AuditCommand:
                 memory_limit=self.memory_limit,
                 only_store=True,
                 version=version,
+                opened=Store.verify,
             )
             with place as connection, output.progress("audits", len(audits)) as advance:
                 findings = run_audits(

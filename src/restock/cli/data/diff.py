@@ -70,9 +70,12 @@ def _difference(first: str, second: str) -> dict[str, Any]:
         from restock.train.comparison.run_difference import diff_runs
 
         return diff_runs(Path(first), Path(second))
+    from restock.cli import output
     from restock.replay.fleet.store_difference import diff_stores
 
     with _open(first) as one, _open(second) as other:
+        output.say_unverified(one)
+        output.say_unverified(other)
         return diff_stores(one, other).document()
 
 

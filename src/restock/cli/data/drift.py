@@ -59,6 +59,7 @@ class DriftCommand:
 
         expect_file_place(self.out, "--out")
         with Store(self.store, version=given_version(self.version)) as store:
+            output.say_unverified(store)
             drift = measure_drift(
                 store,
                 every=self.every,

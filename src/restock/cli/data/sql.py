@@ -57,6 +57,7 @@ class SqlCommand:
 
     def run(self) -> None:
         """Run the query and print its rows."""
+        from restock.cli import output
         from restock.ingest.store.version import given_version
         from restock.replay.places import open_place
 
@@ -76,6 +77,7 @@ class SqlCommand:
             beside=given,
             memory_limit=self.memory_limit,
             version=given_version(self.version),
+            opened=output.say_unverified,
         ) as connection:
             if self.query is None and sys.stdin.isatty():
                 self._prompt(connection)

@@ -57,6 +57,7 @@ class CoverageCommand:
         if self.figures is not None:
             expect_file_place(self.figures / "figure.svg", "--figures")
         with Store(self.store, version=given_version(self.version)) as store:
+            output.say_unverified(store)
             rows = store.sql("FROM coverage_by_condition").to_arrow_table().to_pylist()
             order = store.priority()
             if self.out is not None:

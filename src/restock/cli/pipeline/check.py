@@ -94,12 +94,14 @@ class CheckCommand:
         from restock.cli.pipeline.findings import Part, of_difference, of_regression, refused
         from restock.replay.places import RUN_CONFIG, open_place
         from restock.replay.store.audit import load_audits, load_thresholds, run_audits
+        from restock.replay.store.store import Store
 
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
         audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
         beside = {} if self.run_dir is None else {"run": self.run_dir}
-        with open_place(self.store, beside=beside, only_store=True) as connection:
+        place = open_place(self.store, beside=beside, only_store=True, opened=Store.verify)
+        with place as connection:
             parts = [Part("audit", run_audits(connection, audits, thresholds, beside=beside))]
         if self.against is not None:
             parts.append(Part("diff", self._difference(self.against, of_difference, refused)))
@@ -122,6 +124,7 @@ class CheckCommand:
         path, version = split_version(old)
         try:
             with Store(path, version=version) as first, Store(self.store) as second:
+                first.verify()
                 return of_difference(diff_stores(first, second).document(), old=old)
         except RestockError as error:
             return refused("comparable", error, option=f"--against {old}")

@@ -1,0 +1,169 @@
+"""Bytes of a store that changed are found before rows are taken from it, and by `store verify`."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from support.stores import recording_transitions, write_store
+
+from restock import cli
+from restock.errors import StoreError
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.store.compaction import compact
+from restock.ingest.store.damaged_files import VERIFIED, verify_store
+from restock.ingest.store.writer import StoreWriter
+from restock.replay.store.store import Store
+
+FLIPS = 60
+NOTE = "not verified: `restock store verify"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    task = load_profile("warehouse_amr").task
+    rows = [recording_transitions(number, episodes=6, task=task) for number in (1, 2)]
+    path = write_store(tmp_path_factory.mktemp("whole") / "store", rows, task=task)
+    compact(StoreWriter(path))  # now one file of rows and one of manifests, with checksums
+    return path
+
+
+@pytest.fixture
+def store(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "store"))
+
+
+def flip(file: Path, at: int, bit: int = 0) -> None:
+    """Change one bit."""
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1 << bit
+    file.write_bytes(content)
+
+
+def damaged(store: Store) -> bool:
+    """Whether `verify` refuses it."""
+    with suppress(StoreError):
+        store.verify()
+        return False
+    return True
+
+
+def rows_file(store: Path) -> Path:
+    return next(store.glob("transitions/compacted/*.parquet"))
+
+
+def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
+    """Of a page's header no checksum is kept: some of its bits mean nothing to who reads values."""
+    file, draw = rows_file(store), random.Random(5)
+    with Store(store) as opened:
+        rows = opened.sql("FROM transitions ORDER BY ALL").to_arrow_table()
+    found = 0
+    content = file.read_bytes()
+    footer = int.from_bytes(content[-8:-4], "little")
+    for _ in range(FLIPS):
+        flip(file, draw.randrange(4, len(content) - footer - 8), draw.randrange(8))
+        with Store(store) as opened:
+            if damaged(opened):
+                found += 1
+            else:
+                assert opened.sql("FROM transitions ORDER BY ALL").to_arrow_table() == rows
+        file.write_bytes(content)
+    assert found > 0.9 * FLIPS
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ["mix", "STORE", "--dry-run"],
+        ["mix", "STORE", "--out", "OUT"],
+        ["export", "STORE", "--to", "npz", "--out", "OUT"],
+        ["audit", "STORE"],
+        ["audit", "STORE", "--reward"],
+        ["check", "STORE"],
+        ["gaps", "STORE"],
+    ],
+    ids=" ".join,
+)
+def test_verbs_refuse_damaged_rows(
+    verb: list[str], store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, out = rows_file(store), tmp_path / "out.npz"
+    flip(file, 1000)
+    argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]
+    assert cli.main(argv) == 2
+    said = capsys.readouterr().err
+    assert f"its file {file.relative_to(store)}: damaged" in said
+    assert "--drop-damaged" in said
+    assert not out.exists()
+
+
+def test_verify_lists_what_is_damaged(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["store", "verify", str(store)]) == 0
+    assert "2 of 2 files whole" in capsys.readouterr().err
+    file, gone = rows_file(store), next(store.glob("recordings/compacted/*.parquet"))
+    flip(file, 1000)
+    gone.unlink()
+    assert cli.main(["store", "verify", str(store), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["files"] == 2
+    assert [one["file"] for one in told["damaged"]] == [
+        str(one.relative_to(store)) for one in (file, gone)
+    ]
+
+
+def test_a_damaged_manifest_is_found_where_the_store_cannot_be_opened(store: Path) -> None:
+    file = next(store.glob("recordings/compacted/*.parquet"))
+    flip(file, 1000)
+    assert [Path(one.file).name for one in verify_store(store).damaged] == [file.name]
+
+
+def test_a_file_is_read_once_while_its_size_and_time_are_the_same(store: Path) -> None:
+    file = rows_file(store)
+    with Store(store) as opened:
+        assert opened.unverified() == 2
+        opened.verify()
+        assert opened.unverified() == 0
+        told = file.stat()
+        flip(file, 1000)
+        os.utime(file, ns=(told.st_atime_ns, told.st_mtime_ns))
+        opened.verify()  # remembered, as the file seems unchanged
+        assert len(verify_store(store).damaged) == 1  # which reads every file
+        assert opened.unverified() == 1
+        with pytest.raises(StoreError, match="damaged"):
+            opened.verify()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"transitions": 3}'])
+def test_a_damaged_memory_is_as_none(text: str, store: Path) -> None:
+    (store / VERIFIED).write_text(text)
+    with Store(store) as opened:
+        assert opened.unverified() == 2
+        opened.verify()
+        assert opened.unverified() == 0
+
+
+def test_other_verbs_say_that_they_did_not_verify(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verbs = (["sql", str(store), "SELECT 1"], ["coverage", str(store)])
+    for argv in verbs:
+        assert cli.main(argv) == 0
+        assert f"2 files of {store} {NOTE} {store}`" in capsys.readouterr().err
+    assert cli.main(["store", "verify", str(store)]) == 0
+    capsys.readouterr()
+    for argv in verbs:
+        assert cli.main(argv) == 0
+        assert NOTE not in capsys.readouterr().err
+
+
+def test_a_log_that_names_an_impossible_file_is_refused(store: Path) -> None:
+    """One bit makes a percent sign of a 5: `%00` is a character that no path can hold."""
+    log = max(store.glob("transitions/_delta_log/*.json"))
+    log.write_bytes(log.read_bytes().replace(b".parquet", b"%00.parquet"))
+    with pytest.raises(StoreError, match="names a file that cannot be"):
+        Store(store)
