@@ -77,8 +77,8 @@ MAY_IMPORT = {
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
     ),
     "train/diagnosis": (
-        "feed run twin/calibration twin/drivers twin/env twin/physics replay/panel replay/store"
-        " ingest/profile ingest/store ingest/task"
+        "evaluation/off_policy feed run twin/calibration twin/drivers twin/env twin/physics"
+        " replay/panel replay/store ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
@@ -129,7 +129,8 @@ MAY_IMPORT = {
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
-        " replay/mixture replay/panel replay/trace train/dqn train/evaluation train/run"
+        " replay/mixture replay/panel replay/store replay/trace train/diagnosis train/dqn"
+        " train/evaluation train/evaluation/off_policy train/run train/twin/calibration"
         " train/twin/env train/twin/floors"
     ),
     "cli/upkeep": "cli ingest ingest/store",

@@ -24,6 +24,7 @@ from restock.stats import (
     NOT_KNOWN,
     ConfidenceInterval,
 )
+from restock.train.diagnosis.evidence_needed import twin_evidence
 from restock.train.twin.calibration.gap import AFTER, BEFORE, measure_gap
 from restock.train.twin.calibration.logged_steps import (
     logged_steps,
@@ -98,6 +99,23 @@ def test_the_true_parameters_close_the_gap_to_near_the_floor(
     assert after < 1.6 * floor
     odometry = position(gap, "nominal", "odometry", horizon_s)["median"]
     assert after < odometry  # whose wheels are not as large as it takes them to be
+
+
+def test_evidence_that_is_missing_is_counted_as_the_gap_counts_it(
+    stored: Path, gap: TwinGap
+) -> None:
+    nominal = next(verdict for verdict in gap.verdicts if verdict.condition == "nominal")
+    twice = msgspec.structs.replace(
+        CONFIG, limits=TrustLimits(segments=2 * nominal.segments, episodes=3)
+    )
+    with Store(stored) as store:
+        enough, half = (twin_evidence(store, config) for config in (CONFIG, twice))
+    assert half.held == f"{nominal.segments} in {nominal.episodes}"
+    assert enough.more_h == 0
+    assert half.more_h == pytest.approx(gap.about["rows"] * 0.2 / 3600)  # as much again
+    none = msgspec.structs.replace(CONFIG, horizons_s=(300.0,), limits=TrustLimits(horizon_s=300.0))
+    with Store(stored) as store:
+        assert str(twin_evidence(store, none)).endswith("no drive is long enough")
 
 
 def test_a_slippery_floor_is_named_and_a_dry_one_is_not(gap: TwinGap) -> None:

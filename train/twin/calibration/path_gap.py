@@ -72,17 +72,12 @@ def path_gap(
 ) -> PathGap:
     """Replay segments of `horizon_s`, which overlap by half.
 
-    A segment counts for every condition that holds at any of its steps; for `nominal` where none
-    does. A gap of a pose is at the segment's end, of a signal its root mean square on the way.
+    A gap of a pose is at the segment's end, of a signal its root mean square on the way.
 
     Raises:
         ConfigError: a horizon that is not some control periods.
     """
-    period = steps.task.control_period_s
-    stride_s = max(round(horizon_s / 2 / period), 1) * period
-    cut = log_segments(steps, whole_periods_s(steps.task, horizon_s), stride_s=stride_s)
-    rng = np.random.default_rng([config.seed, cut.horizon_steps])
-    chosen = _choose(steps, cut, config.max_segments, rng)
+    cut, chosen = overlapping_segments(steps, horizon_s, config)
     used = np.flatnonzero(np.any(list(chosen.values()), axis=0))
     rng = np.random.default_rng([config.seed, cut.horizon_steps, 1])
     parts = [
@@ -96,6 +91,24 @@ def path_gap(
         gaps={key: np.concatenate([part[key] for part in parts]) for key in (parts or [{}])[0]},
         left_out=dict(cut.left_out),
     )
+
+
+def overlapping_segments(
+    steps: LoggedSteps, horizon_s: float, config: GapConfig
+) -> tuple[LoggedSegments, dict[str, Bools]]:
+    """Segments of `horizon_s` that overlap by half, and which (S,) count for each condition.
+
+    A segment counts for every condition that holds at any of its steps; for `nominal` where none
+    does. At most `max_segments` are drawn of each.
+
+    Raises:
+        ConfigError: a horizon that is not some control periods.
+    """
+    period = steps.task.control_period_s
+    stride_s = max(round(horizon_s / 2 / period), 1) * period
+    cut = log_segments(steps, whole_periods_s(steps.task, horizon_s), stride_s=stride_s)
+    rng = np.random.default_rng([config.seed, cut.horizon_steps])
+    return cut, _choose(steps, cut, config.max_segments, rng)
 
 
 def measured_noise(steps: LoggedSteps, twin: Perturbation) -> SensorNoise:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import shlex
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import FOLDER, Ended
 from restock.errors import ConfigError
 from restock.files import read_json
-from restock.words import counted
+from restock.words import counted, quoted
 
 if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand
@@ -230,6 +231,27 @@ def no_ways(to: Settings) -> str | None:
     except ConfigError as error:
         return error.what
     return None
+
+
+def evidence_lines(to: Settings) -> list[str]:
+    """What the logs lack for the twin and a policy to be judged by them, and what to record."""
+    from restock.replay.mixture.mixture import load_mixture
+    from restock.replay.store.store import Store
+    from restock.train.diagnosis.evidence_needed import policy_evidence, twin_evidence
+    from restock.train.evaluation.off_policy.estimators import EssGate
+    from restock.train.twin.calibration.twin_gap import GapConfig, TrustLimits
+
+    found, horizon_s = [], horizon(to.profile)
+    limits = TrustLimits(horizon_s=horizon_s)
+    with Store(to.store) as store:
+        with suppress(ConfigError):  # a robot that the twin cannot build: the fit will say so
+            found.append(twin_evidence(store, GapConfig((horizon_s,), limits=limits)))
+        if share := load_mixture(to.mixture).evaluation_split.share:
+            found.append(policy_evidence(store, share, EssGate()))
+    lines = [str(one) for one in found if one.more_h != 0]
+    if lines:
+        lines.append(f"which drives to record next: `restock gaps {quoted(to.store)}`")
+    return lines
 
 
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:

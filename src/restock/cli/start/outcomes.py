@@ -106,7 +106,9 @@ def coverage(document: Document) -> list[str]:
     unknown = [row["condition"] for row in rows if row["rows_held"] is None]
     lines = [f"rows that hold each condition: {', '.join(held)}"]
     lines += [f"no row of {', '.join(none)}"] if none else []
-    return lines + ([f"unknown, as a signal is missing: {', '.join(unknown)}"] if unknown else [])
+    return lines + (
+        [f"unknown (a signal or a plan is missing): {', '.join(unknown)}"] if unknown else []
+    )
 
 
 def audit(document: Document) -> list[str]:

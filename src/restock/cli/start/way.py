@@ -10,6 +10,7 @@ from restock.cli.start import stages
 from restock.cli.start.decisions import (
     OF_ONE_ROBOT,
     edited,
+    evidence_lines,
     fit_is_worse,
     floor_settings,
     fullest,
@@ -185,6 +186,9 @@ class Way:
         if not do(stages.ingest(to)).good:
             raise Stopped("nothing could be ingested", f"edit {to.profile}", self.again)
         covered = do(stages.coverage(to))
+        if not self.work.plan:
+            for line in evidence_lines(to):
+                self._warn(line)
         do(stages.audit(to))
         mixed = do(stages.mix(to))
         if not mixed.good:
