@@ -7,6 +7,7 @@ Ingest, `profile new` and `profile check` share these findings; the store keeps 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -15,6 +16,7 @@ import numpy as np
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.steps.align import NS, ClockReport
 from restock.ingest.steps.aligned_inputs import AlignedInputs
+from restock.ingest.steps.input_columns import InputColumns
 from restock.ingest.task.signals import Signals, wrap_angle
 from restock.words import counted
 
@@ -112,8 +114,11 @@ def findings_of(
     topics.setdefault("pose", profile.frames.topic if profile.frames else "")
     fastest_mps = float(np.abs(signals["command_speed_mps"]).max(initial=0.0))
     noise_mps = 2 * profile.noise.localiser_m / period_s
-    jumps = _jumping_poses(drive, topics["pose"], fastest_mps, noise_mps)
-    found += jumps
+    found += _frames(aligned.inputs, len(problem))
+    jumps = [one for one in found if (one.kind, one.topic) == ("sources", topics["pose"])]
+    if not jumps:
+        jumps = _jumping_poses(drive, topics["pose"], fastest_mps, noise_mps)
+        found += jumps
     if profile.motion is None and not jumps:
         found += _wheels(drive, topics["wheels"], topics["pose"], fastest_mps)
     if "imu" in topics and not jumps:
@@ -145,6 +150,27 @@ def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
         remedy = "synchronise the clocks (chrony, PTP)"
         found.append(Finding("clock", topic, what, steps, cause, remedy, repaired=True))
     return found
+
+
+def _frames(inputs: InputColumns, steps: int) -> list[Finding]:
+    """Find topics whose messages are of several frames: each publisher names its own."""
+    found: dict[str, Finding] = {}
+    for name in ("pose", "wheels"):
+        counts = Counter(frame for frame in inputs.frames_of(name) if frame)
+        often = [one for one in counts.most_common() if one[1] >= OFTEN * counts.total()]
+        if len(often) < 2:
+            continue
+        topic = inputs.by_name[name].topic
+        frames = ", ".join(f"{frame} ({counted(count, 'message')})" for frame, count in often)
+        found[topic] = Finding(
+            "sources",
+            topic,
+            f"its messages are in several frames: {frames}",
+            steps,
+            "two publishers on one topic",
+            "record each publisher on a topic of its own",
+        )
+    return [*found.values()]
 
 
 def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: float) -> list[Finding]:

@@ -123,7 +123,7 @@ def wanted_fields(
         paths = wanted.setdefault(source.topic, [])
         if name not in SCANS:
             paths += field_paths(source)
-        if name in ("pose", "goal", "plan"):
+        if name in ("pose", "wheels", "goal", "plan"):
             frame = frame_path(source, {leaf.path for leaf in leaves[source.topic]})
             paths += [frame] if frame else []
         optional.add(aside := sideways_path(source) if name == "command" else "")

@@ -98,6 +98,14 @@ def two_publishers(topics: Topics) -> Topics:
     return {**topics, "/odom": replace(one, fields=fields)}
 
 
+def two_frames(topics: Topics) -> Topics:
+    """The same, with every third message of the odometry in the frame of another publisher, who
+    agrees with the first one by now."""
+    one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
+    frames = np.where(third, "map", "odom").astype(object)
+    return {**topics, "/odom": replace(one, fields={**one.fields, "header.frame_id": frames})}
+
+
 def slipping(topics: Topics) -> Topics:
     """The same, with wheels that turn twice as fast for a third of the time."""
     one = topics["/odom"]
@@ -219,6 +227,7 @@ SPEED, RATE = "twist.twist.linear.x", "twist.twist.angular.z"
 GYRO = "angular_velocity.z"
 WRONG = {
     "two publishers": (two_publishers, "sources", "/odom", "two publishers"),
+    "two frames": (two_frames, "sources", "/odom", "in several frames: odom ("),
     "no speed": (lambda t: scaled(t, "/odom", 0, SPEED, RATE), "wheels", "/odom", "stays at 0"),
     "km/h": (lambda t: scaled(t, "/odom", 3.6, SPEED), "wheels", "/odom", "is 3.6 times"),
     "sign": (lambda t: scaled(t, "/odom", -1, SPEED), "wheels", "/odom", "another sign"),
