@@ -252,10 +252,13 @@ class Recording:
     def lost_messages(self) -> list[LostMessages]:
         """What is missing, each once: of the files, and, for other reasons, of the topics read."""
         damaged = {item.what for item in self.damage}
-        lost = [
-            LostMessages(None, sum(item.messages.values()) or None, item.what)
-            for item in self.damage
-        ]
+        lost = [LostMessages(None, _count(item), item.what) for item in self._bag_damage]
+        for storage in self._storages:
+            for item in storage.damage:
+                of = {storage.channels.get(number) for number, n in item.messages.items() if n}
+                channel = of.pop() if len(of) == 1 else None
+                topic = channel.topic if channel else None
+                lost.append(LostMessages(topic, _count(item), item.what))
         for account in self.accounts.values():
             lost += [
                 LostMessages(account.topic, count, why)
@@ -423,6 +426,11 @@ class Recording:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _count(damage: Damage) -> int | None:
+    """How many messages it cost; None where that is not known."""
+    return sum(damage.messages.values()) or None
 
 
 def _messages(channel: Channel, batch: MessageBatch, rows: NDArray[Any]) -> Iterator[RawMessage]:

@@ -44,7 +44,7 @@ from restock.ingest.store.location import (
 )
 from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.writer import StoreWriter
-from restock.words import quoted
+from restock.words import counted, quoted
 
 OPERATION = "restock compact --drop-damaged"
 READ_AT_ONCE = 4  # files, of each of which a row group may be in memory
@@ -177,13 +177,17 @@ def unverified_files(place: Location, paths: Iterable[str]) -> int:
 
 def damaged_error(place: Location, damaged: Sequence[str]) -> StoreError:
     """What is wrong with files of a store that `verify_files` found, and what to do."""
-    more = f" and {len(damaged) - 1:,} more" if len(damaged) > 1 else ""
+    more = ""
+    if len(damaged) > 1:
+        count = counted(len(damaged) - 1, "more file")
+        more = f"; `restock store verify {quoted(place)}` lists {count}"
+    why = "cannot be read: it was cut, or a page does not match its checksum"
+    if damaged[0] not in _stamps(place):
+        why = "is missing"
     return StoreError(
-        f"its file {damaged[0]}{more}: damaged or missing (a page does not match its checksum, or"
-        " it cannot be read)",
+        f"its file {damaged[0]} {why}",
         where=str(place),
-        remedy=damage_remedy(place, damaged[0])
-        + (f"; `restock store verify {quoted(place)}` lists all" if more else ""),
+        remedy=damage_remedy(place, damaged[0]) + more,
     )
 
 

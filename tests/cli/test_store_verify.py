@@ -97,7 +97,7 @@ def test_verbs_refuse_damaged_rows(
     argv = [{"STORE": str(store), "OUT": str(out)}.get(word, word) for word in verb]
     assert cli.main(argv) == 2
     said = capsys.readouterr().err
-    assert f"its file {file.relative_to(store)}: damaged" in said
+    assert f"its file {file.relative_to(store)} cannot be read" in said
     assert "--drop-damaged" in said
     assert not out.exists()
 
@@ -134,7 +134,7 @@ def test_a_file_is_read_once_while_its_size_and_time_are_the_same(store: Path) -
         opened.verify()  # remembered, as the file seems unchanged
         assert len(verify_store(store).damaged) == 1  # which reads every file
         assert opened.unverified() == 1
-        with pytest.raises(StoreError, match="damaged"):
+        with pytest.raises(StoreError, match="cannot be read"):
             opened.verify()
 
 

@@ -256,7 +256,6 @@ def test_every_common_type_can_be_gone_through(kind, capsys):
     parse_profile(with_all_signals(said["toml"]), where="p")
 
 
-@pytest.mark.parametrize("bumper", [True, False])
 class Utm(Drive):
     """Its poses are UTM coordinates; it has neither goal nor plan."""
 
@@ -290,6 +289,7 @@ def test_poses_in_utm_coordinates_are_stored_to_the_millimetre(tmp_path, capsys)
     assert surveyed.places_m[0] == pytest.approx([x[0], y[0]], abs=1e-3)
 
 
+@pytest.mark.parametrize("bumper", [True, False])
 def test_a_contact_ends_an_episode_whether_a_bumper_was_recorded_or_not(bumper, tmp_path, capsys):
     class Robot(Drive):
         def topics(self):

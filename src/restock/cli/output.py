@@ -76,9 +76,9 @@ def say(message: str) -> None:
 def say_unverified(store: Store) -> None:
     """Say how many files a store has whose checksums nobody has verified; nothing if none."""
     if files := store.unverified():
-        say(
-            f"note: {counted(files, 'file')} of {store.path} not verified:"
-            f" `restock store verify {quoted(store.path)}` compares their checksums"
+        sys.stderr.write(  # `sql` does not wait for rich
+            f"note: {counted(files, 'file')} of {visible(str(store.path))} not verified:"
+            f" `restock store verify {visible(quoted(store.path))}` compares their checksums\n"
         )
 
 
