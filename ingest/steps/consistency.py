@@ -285,10 +285,10 @@ def _scans(
 ) -> list[Finding]:
     """Find lidars that turn at another time than the poses."""
     sectors = np.asarray(drive.signals["sector_clearance_m"], np.float64)
-    seen = drive.joined & np.isfinite(sectors).all(axis=1)
-    seen &= np.roll(np.isfinite(sectors).all(axis=1), 1)
     if not scans or sectors.shape[1] < LEAST_SECTORS:
         return []
+    known = np.isfinite(sectors).all(axis=1)
+    seen = drive.joined & known & np.roll(known, 1)
     yaw = np.asarray(drive.signals["pose_yaw_rad"], np.float64)
     by_poses, by_scans = wrap_angle(yaw - np.roll(yaw, 1)), _turned(sectors)
     by_lag, most = _by_lag(by_poses, by_scans, seen, period_s)

@@ -106,7 +106,8 @@ def drop_damaged(store: StoreWriter, *, dry_run: bool = False) -> Dropped:
     for name in (TRANSITIONS, RECORDINGS):  # of manifests, those of the rows that stay are needed
         table = store.path.open_table(name)
         rows = {path: count or 0 for path, count, *_ in active_files(table)}
-        damaged = _damaged(store.path, {f"{name}/{path}": path for path in rows})
+        broken = _damaged(store.path, _below(name, rows))
+        damaged = [path.removeprefix(f"{name}/") for path in broken]
         readable[name] = stored_files(store.path, name, table, without=damaged)
         for path in damaged:
             sources = _sources(store.path, name, path, rows[path], readable)
@@ -157,15 +158,16 @@ def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) 
     Raises:
         StoreError: a file cannot be read for another reason than damage.
     """
-    paths, stamps = list(paths), _stamps(place)
-    known = {} if again else _remembered(place, stamps)
-    unread = [path for path in paths if path not in known]
-    damaged = _damaged(place, {path: path for path in unread})
+    stamps = _stamps(place)
+    known = _remembered(place, stamps)
+    unread = [path for path in paths if again or path not in known]
+    damaged = _damaged(place, unread)
     if unread:
-        whole = {path: stamps[path] for path in unread if path in stamps}
-        whole = {path: stamp for path, stamp in whole.items() if path not in damaged}
+        for path in unread:
+            known.pop(path, None)
+        known |= {path: stamps[path] for path in unread if path in stamps and path not in damaged}
         with suppress(OSError, StoreError), place.writing(VERIFIED) as out:  # may be read-only
-            out.write(json.dumps(_remembered(place, stamps) | whole).encode())
+            out.write(json.dumps(known).encode())
     return damaged
 
 
@@ -211,11 +213,11 @@ def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, l
     return {path: stamp for path, stamp in stamps.items() if told.get(path) == stamp}
 
 
-def _damaged(place: Location, paths: Mapping[str, str]) -> list[str]:
-    """The names of those files that are damaged, of files and their names."""
+def _damaged(place: Location, paths: Sequence[str]) -> list[str]:
+    """Return those of these files that are damaged."""
     with ThreadPoolExecutor(READ_AT_ONCE) as pool:
         broken = pool.map(lambda path: is_damaged(place, path), paths)
-        return [name for name, one in zip(paths.values(), broken, strict=True) if one]
+        return [path for path, one in zip(paths, broken, strict=True) if one]
 
 
 def is_damaged(place: Location, path: str) -> bool:

@@ -14,7 +14,7 @@ from restock.cli.start.outcomes import of_nominal
 from restock.cli.start.settings import Settings
 from restock.cli.start.stage import Document, Stop
 from restock.cli.start.work import FOLDER, Ended
-from restock.errors import ConfigError
+from restock.errors import ConfigError, StoreError
 from restock.files import read_json
 from restock.words import counted, quoted
 
@@ -244,10 +244,12 @@ def evidence_lines(to: Settings) -> list[str]:
     found, horizon_s = [], horizon(to.profile)
     limits = TrustLimits(horizon_s=horizon_s)
     with Store(to.store) as store:
-        with suppress(ConfigError):  # a robot that the twin cannot build: the fit will say so
+        # A robot that the twin cannot build, or rows of several tasks: later stages say so.
+        with suppress(ConfigError, StoreError):
             found.append(twin_evidence(store, GapConfig((horizon_s,), limits=limits)))
-        if share := load_mixture(to.mixture).evaluation_split.share:
-            found.append(policy_evidence(store, share, EssGate()))
+        share = load_mixture(to.mixture).evaluation_split.share
+        with suppress(StoreError):
+            found += [policy_evidence(store, share, EssGate())] if share else []
     lines = [str(one) for one in found if one.more_h != 0]
     if lines:
         lines.append(f"which drives to record next: `restock gaps {quoted(to.store)}`")
