@@ -1,0 +1,28 @@
+"""The values of the sample logs' rows, panel, run and evaluation are those that were written down."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.goldens import KEPT, Hashes, compute_hashes, made_on
+
+pytestmark = pytest.mark.long
+GOLDEN = json.loads(KEPT.read_text())
+
+
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory: pytest.TempPathFactory) -> Hashes:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RESTOCK_NATIVE", "0")
+        patch.setattr("restock.train.prepare.update_path", lambda *_: "autograd", raising=False)
+        return compute_hashes(Path(tmp_path_factory.mktemp("goldens")))
+
+
+@pytest.mark.parametrize("table", GOLDEN["hashes"])
+def test_values_are_as_written_down(table: str, computed: Hashes) -> None:
+    golden, found = GOLDEN["hashes"][table], computed[table]
+    if made_on() != GOLDEN["made_on"]:
+        golden, found = golden["number of rows"], found["number of rows"]
+    assert found == golden
