@@ -1,4 +1,4 @@
-"""The values of the sample logs' rows, panel, run and evaluation are those that were written down."""
+"""The values that the sample logs become are those that were written down."""
 
 from __future__ import annotations
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
 from support.paths import ROOT
 
 KEPT = ROOT / "tests/golden/sample_logs.json"
