@@ -50,7 +50,8 @@ test-docs: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m 'docs and not slow'
 
 site: $(VENV)/.dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	$(BIN)/python docs/build.py build/pages
+	$(BIN)/zensical build --strict
 
 test-slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m ''

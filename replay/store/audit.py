@@ -8,15 +8,12 @@ The header of an audit's file says what it is:
     -- needs: run | panel          (only where it looks at one; run.TABLE: that must have TABLE)
 
 `$name` in the query is a threshold, from `audits.toml` or a file of the user's.
-
-`python -m restock.replay.store.audit docs/audit.md` rewrites the table of the page.
 """
 
 from __future__ import annotations
 
 import math
 import re
-import sys
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,7 +34,6 @@ from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import found, interruptible
 from restock.toml import read_toml
-from restock.words import between
 
 Severity = Literal["error", "warning", "info"]
 Status = Literal["pass", "fail", "warn", "info", "skipped"]
@@ -52,8 +48,6 @@ RENAMED = {
     "observation_drift": "signal_drift",
     "max_flattery": "max_bias",
 }
-BEGIN = "<!-- audits: written by `python -m restock.replay.store.audit docs/audit.md` -->"
-END = "<!-- end of audits -->"
 OFFENDED: Mapping[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
 WORST_FIRST: tuple[Status, ...] = ("fail", "warn", "info", "pass", "skipped")
 
@@ -329,22 +323,3 @@ def _parse(name: str, text: str, where: str) -> Audit:
         needs=header.get("needs"),
         sql=text,
     )
-
-
-def rewrite(text: str) -> str:
-    """A page with the table between its two markers written again."""
-    thresholds = load_thresholds()
-    lines = ["| audit | severity | finds | thresholds |", "| --- | --- | --- | --- |"]
-    for audit in shipped_audits():
-        table = thresholds.get(audit.name, {})
-        given = ", ".join(f"{name} = {value}" for name, value in table.items())
-        doc = audit.doc + (f" Needs `--{audit.place}`." if audit.needs else "")
-        lines.append(
-            f"| {audit.name} | {audit.severity} | {doc} | {given} |".replace("|  |", "| |")
-        )
-    return between(text, BEGIN, END, "\n".join([*lines, ""]))
-
-
-if __name__ == "__main__":
-    page = Path(sys.argv[1])
-    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -1,14 +1,9 @@
-"""What each column of each view means: the view `columns`, and the tables in docs/sql.md.
-
-`python -m restock.replay.store.column_docs docs/sql.md` rewrites the tables of the page.
-"""
+"""Describe each column of each view: the view `columns`."""
 
 from __future__ import annotations
 
-import sys
 import tomllib
 from importlib.resources import files
-from pathlib import Path
 
 import duckdb
 import pyarrow as pa
@@ -17,14 +12,7 @@ from restock.ingest.task.schema import (
     COLUMNS,
     FRAME_COLUMNS,
     RECORDING_COLUMNS,
-    frame_schema,
-    recording_schema,
-    transition_schema,
 )
-from restock.words import between
-
-BEGIN = "<!-- columns: written by `python -m restock.replay.store.column_docs docs/sql.md` -->"
-END = "<!-- end of columns -->"
 
 HELD = "held_conditions"  # has every column of `transitions`, and `condition`
 
@@ -120,43 +108,7 @@ def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
     ).fetchall()
 
 
-def markdown() -> str:
-    """The tables of docs/sql.md: every view and column."""
-    from restock.replay.store.definitions import FRAMES, definitions
-
-    with duckdb.connect() as connection:
-        connection.register("stored_transitions", transition_schema(2).empty_table())
-        connection.register("stored_recordings", recording_schema().empty_table())
-        connection.register("stored_frames", frame_schema().empty_table())
-        connection.execute(definitions("FLOAT[]") + definitions(names=[FRAMES]))
-        install_columns(connection)
-        rows = connection.sql("FROM columns").fetchall()
-    parts = []
-    for view, doc in view_docs().items():
-        doc += ". It has the columns of `transitions`, and" if view == HELD else ""
-        parts.append(f"### {view}\n\n{doc[0].upper() + doc[1:]}{':' if view == HELD else '.'}\n")
-        parts.append("| column | type | unit | meaning |\n| --- | --- | --- | --- |")
-        for of_view, column, kind, of_unit, meaning in rows:
-            if of_view == view and (view != HELD or column == "condition"):
-                kind = "STRUCT(…)[]" if kind.startswith("STRUCT") else kind
-                kind = "FLOAT[D]" if column.endswith("observation") else kind
-                line = f"| {column} | {kind} | {of_unit} | {meaning} |"
-                parts.append(line.replace("|  |", "| |").replace("<", "&lt;"))
-        parts.append("")
-    return "\n".join(parts)
-
-
-def rewrite(text: str) -> str:
-    """A page with the tables between its two markers written again."""
-    return between(text, BEGIN, END, markdown())
-
-
 def _read() -> dict[str, dict[str, str]]:
     text = (files("restock.replay.store") / "columns.toml").read_text(encoding="utf-8")
     tables: dict[str, dict[str, str]] = tomllib.loads(text)
     return tables
-
-
-if __name__ == "__main__":
-    page = Path(sys.argv[1])
-    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")

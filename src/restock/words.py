@@ -53,12 +53,6 @@ def verdict_said(verdict: str, *, decides: bool) -> str:
     return verdict if decides else allowed.get(verdict, verdict)
 
 
-def between(text: str, begin: str, end: str, written: str) -> str:
-    """A page's text with what is `written` between two of its markers, in place of what was."""
-    before, rest = text.split(begin, 1)
-    return f"{before}{begin}\n\n{written}\n{end}{rest.split(end, 1)[1]}"
-
-
 def policy_words(policies: Iterable[str]) -> dict[str, str]:
     """Policies as people read them, by the names that `restock eval --policies` takes.
 

@@ -15,7 +15,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.panels import panel_of
-from support.paths import ROOT
 from support.stores import TASK, manifest, recording_transitions, views_over, write_store
 
 from restock import cli
@@ -32,7 +31,6 @@ from restock.replay.store.audit import (
     junit_xml,
     load_audits,
     load_thresholds,
-    rewrite,
     run_audits,
     shipped_audits,
 )
@@ -824,8 +822,3 @@ def test_junit_is_as_its_readers_expect() -> None:
     assert "<&>" in str(failure.text)
     assert root[1].find("failure") is None
     assert root[3].find("skipped") is not None
-
-
-def test_the_page_lists_every_audit_as_it_is() -> None:
-    page = (ROOT / "docs" / "audit.md").read_text(encoding="utf-8")
-    assert rewrite(page) == page, "run: python -m restock.replay.store.audit docs/audit.md"

@@ -14,7 +14,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from deltalake import write_deltalake
-from support.paths import ROOT
 from support.stores import TASK, manifest, one, recording_transitions, write_store
 
 import restock
@@ -24,7 +23,7 @@ from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.tags import NAMED
 from restock.ingest.task.task import Task
-from restock.replay.store.column_docs import column_docs, rewrite, view_docs
+from restock.replay.store.column_docs import column_docs, view_docs
 from restock.replay.store.store import Store, is_store
 
 
@@ -461,11 +460,6 @@ def test_the_views_run_over_tables_in_memory_too(transitions: pa.Table) -> None:
         connection.execute(definitions())
         ((count,),) = connection.sql("SELECT count(*) FROM transitions").fetchall()
     assert count == len(recording_transitions(1))
-
-
-def test_the_page_lists_every_column_as_it_is() -> None:
-    page = (ROOT / "docs" / "sql.md").read_text(encoding="utf-8")
-    assert rewrite(page) == page, "run: python -m restock.replay.store.column_docs docs/sql.md"
 
 
 def test_a_store_may_lie_in_a_folder_with_spaces_and_umlauts(tmp_path: Path) -> None:

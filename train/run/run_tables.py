@@ -2,21 +2,14 @@
 
 Every table is there from the first flush on, if only with no rows, so that a reader of a young or
 killed run finds what it expects. The meanings go into the files: `restock sql RUN "FROM columns"`
-lists them, and `python -m restock.train.run.run_tables docs/run.md` writes them into the page.
+lists them.
 """
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pyarrow as pa
 
 from restock.ingest.task.perturbation_columns import VALUES
-from restock.words import between
-
-BEGIN = "<!-- tables: written by `python -m restock.train.run.run_tables docs/run.md` -->"
-END = "<!-- end of tables -->"
 
 _F, _I, _S, _B = pa.float64(), pa.int64(), pa.string(), pa.bool_()
 _STEPS = [
@@ -498,28 +491,3 @@ EVAL_CLONES = _schema(
     ("changed_agreement", _F, "agreement in the rows in which the driver changed the action"),
     ("note", _S, "why held-out rows could not be read, or null"),
 )
-
-
-def markdown() -> str:
-    """The tables of docs/run.md: every column of every table."""
-    parts = []
-    evaluated = {"eval/episodes": EVAL_EPISODES, "eval/clones": EVAL_CLONES}
-    for name, schema in {**TABLES, **evaluated}.items():
-        parts.append(f"## {name}.parquet\n\nA row is {schema.metadata[b'doc'].decode()}.\n")
-        parts.append("| column | type | meaning |\n| --- | --- | --- |")
-        for field in schema:
-            meaning = field.metadata[b"meaning"].decode().replace("|", "\\|")
-            kind = "map" if field.type == VALUES else str(field.type)
-            parts.append(f"| `{field.name}` | {kind} | {meaning} |".replace("<", "&lt;"))
-        parts.append("")
-    return "\n".join(parts)
-
-
-def rewrite(text: str) -> str:
-    """A page with the tables between its two markers written again."""
-    return between(text, BEGIN, END, markdown())
-
-
-if __name__ == "__main__":
-    page = Path(sys.argv[1])
-    page.write_text(rewrite(page.read_text(encoding="utf-8")), encoding="utf-8")
