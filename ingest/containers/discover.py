@@ -8,31 +8,33 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 from ruamel.yaml import YAML
 
 from restock.errors import RecordingError, visible
-from restock.ingest.containers import sqlite_file
-from restock.ingest.containers.formats import mcap_records
+from restock.ingest.containers import known
 from restock.ingest.containers.storage import (
+    HEAD_BYTES,
     INVALID_YAML,
     NOT_KEPT,
+    Container,
     Metadata,
     custom_data,
 )
 
 T = TypeVar("T")
-Kind = Literal["mcap", "sqlite3", "ros1"]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-ROS1_MAGIC = b"#ROSBAG V"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
 LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
 _PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
+_NAMES = (
+    f"recordings end in {', '.join(name for one in known.CONTAINERS for name in one.endings)}"
+    " or are rosbag2 folders"
+)
 _ZSTD = re.compile(r"\.zstd?$")
-ENDINGS = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd", ".mcap.zst", ".db3.zst")
 
 
 def recording_path(path: Path | str) -> Path:
@@ -86,7 +88,7 @@ def _found(path: Path) -> list[Path]:
                 remedy=f"links to folders ({links} in it) are not followed: give them directly, "
                 f"as {path}/*"
                 if links
-                else f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
+                else _NAMES,
             )
         return recordings
     matches = sorted(Path(name) for name in glob.glob(str(path), recursive=True))  # noqa: PTH207
@@ -95,7 +97,7 @@ def _found(path: Path) -> list[Path]:
         raise RecordingError(
             f"none of the {len(matches):,} files and folders that match is a recording",
             where=str(path),
-            remedy=f"recordings end in {', '.join(ENDINGS[:3])} or are rosbag2 folders",
+            remedy=_NAMES,
         )
     if every:
         return every
@@ -142,7 +144,7 @@ def _within(folder: Path) -> list[Path]:
 
 def is_storage_name(path: Path) -> bool:
     """Whether a file is named like a recording."""
-    return path.name.endswith(ENDINGS)
+    return path.name.endswith(known.endings())
 
 
 def is_bag(folder: Path) -> bool:
@@ -274,8 +276,8 @@ def _of_type(value: object, kind: type[T]) -> T | None:
     return value if isinstance(value, kind) else None
 
 
-def kind_of(path: Path) -> Kind | Literal["zstd"]:
-    """What a file is, by its first bytes.
+def container_of(path: Path) -> Container | None:
+    """Return the container that claims a file by its first bytes; None if it is compressed.
 
     Raises:
         RecordingError: it is missing, empty, a Git LFS pointer or not a recording.
@@ -284,7 +286,7 @@ def kind_of(path: Path) -> Kind | Literal["zstd"]:
     _refuse_special(path)
     try:
         with path.open("rb") as file:
-            head = file.read(64)
+            head = file.read(HEAD_BYTES)
     except OSError as error:
         raise RecordingError(f"cannot be read: {error.strerror}", where=where) from error
     if not head:
@@ -299,14 +301,10 @@ def kind_of(path: Path) -> Kind | Literal["zstd"]:
             where=where,
             remedy="`git lfs pull` fetches the recording",
         )
-    if head.startswith(mcap_records.MAGIC):
-        return "mcap"
-    if head.startswith(sqlite_file.MAGIC):
-        return "sqlite3"
-    if head.startswith(ROS1_MAGIC):
-        return "ros1"
     if head.startswith(ZSTD_MAGIC):
-        return "zstd"
+        return None
+    if container := known.claiming(head):
+        return container
     raise RecordingError(
         "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",
         where=where,

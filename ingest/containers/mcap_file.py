@@ -23,6 +23,7 @@ from restock.ingest.containers.mcap_group import Checks, ChunkReader, batch_of
 from restock.ingest.containers.mcap_salvage import resume
 from restock.ingest.containers.storage import (
     NOT_KEPT,
+    Container,
     Integrity,
     Metadata,
     Packed,
@@ -53,7 +54,7 @@ class McapFile:
         if self._file[: len(MAGIC)] != MAGIC:
             raise RecordingError("not an MCAP file: its first bytes are wrong", where=str(path))
         self._contents = survey(self._file, watch)
-        self.profile = self._contents.profile
+        self.from_ros2 = self._contents.profile == "ros2"
         for what in self._contents.damaged:
             self._checks.damaged(what, {})
         self._refuse_cut(salvage)
@@ -271,3 +272,13 @@ class McapFile:
 
 def _record_end(file: FileBytes, at: int) -> int:
     return at + PREFIX + int.from_bytes(file[at + 1 : at + PREFIX], "little")
+
+
+CONTAINER = Container(
+    name="mcap",
+    endings=(".mcap",),
+    claims=lambda head: head.startswith(MAGIC),
+    open=McapFile,
+    format="mcap",
+    bag_format="rosbag2-mcap",
+)

@@ -16,11 +16,8 @@ from restock.errors import RecordingError, visible
 from restock.ingest.containers import discover
 from restock.ingest.containers.compression import decompress_file
 from restock.ingest.containers.discover import METADATA, BagMetadata, recordings_in
-from restock.ingest.containers.mcap_file import McapFile
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.sqlite_file import SqliteFile, open_sqlite
-from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
-from restock.ingest.containers.storage import Damage, Storage, Watch, unwatched
+from restock.ingest.containers.storage import Container, Damage, Storage, Watch, unwatched
 from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE
@@ -64,7 +61,7 @@ def refuse_no_recording(path: Path) -> None:
     """
     opening = _Opening(path, DEFAULT_DISTRO, False, unwatched)
     for file in opening.files():
-        discover.kind_of(file)
+        discover.container_of(file)
 
 
 def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
@@ -87,7 +84,7 @@ class _Opening:
         self.path, self.distro, self.salvage = path, distro, salvage
         self.watch = watch
         self.storages: list[Storage] = []
-        self.kinds: list[str] = []
+        self.containers: list[Container] = []
         self.damage: list[Damage] = []
         self.missing: list[str] = []  # files that metadata.yaml lists
         self.notes: list[str] = []
@@ -182,19 +179,14 @@ class _Opening:
         return files, metadata
 
     def _open_file(self, file: Path, *, inner: bool = False) -> None:
-        kind = discover.kind_of(file)
-        if kind == "zstd":
-            if inner:
-                raise RecordingError("compressed twice", where=str(self.path))
-            self._open_compressed(file)
-        elif kind == "mcap":
-            self._add("mcap", McapFile(file, salvage=self.salvage, watch=self.watch))
-        elif kind == "sqlite3":
-            self._add("sqlite3", open_sqlite(file, salvage=self.salvage))
+        container = discover.container_of(file)
+        if container is not None:
+            self.storages.append(container.open(file, salvage=self.salvage, watch=self.watch))
+            self.containers.append(container)
+        elif inner:
+            raise RecordingError("compressed twice", where=str(self.path))
         else:
-            from restock.ingest.containers.ros1_file import Ros1File
-
-            self._add("ros1", Ros1File(file, salvage=self.salvage, watch=self.watch))
+            self._open_compressed(file)
 
     def _open_compressed(self, file: Path) -> None:
         folder = tempfile.TemporaryDirectory(prefix="restock-")
@@ -209,30 +201,20 @@ class _Opening:
                 f"{error.what} (decompressed)", where=str(file), remedy=error.remedy
             ) from error
 
-    def _add(self, kind: str, storage: Storage) -> None:
-        self.storages.append(storage)
-        self.kinds.append(kind)
-
     def _format(self) -> str:
-        kind = self.kinds[0]
-        if any(other != kind for other in self.kinds):
+        names = {container.name for container in self.containers}
+        if len(names) > 1:
             raise RecordingError(
-                f"a bag that mixes {' and '.join(sorted(set(self.kinds)))} files",
+                f"a bag that mixes {' and '.join(sorted(names))} files",
                 where=str(self.path),
                 remedy="give its files one by one",
             )
-        if kind == "mcap":
-            return "rosbag2-mcap" if self.path.is_dir() else "mcap"
-        return {"sqlite3": "rosbag2-sqlite3", "ros1": "ros1"}[kind]
+        container = self.containers[0]
+        return container.bag_format if self.path.is_dir() else container.format
 
     def _refuse_serialisation(self, metadata: BagMetadata) -> None:
         """rosbag2 can store what other middlewares serialise: only CDR can be decoded."""
-        ros2 = [
-            storage
-            for storage in self.storages
-            if isinstance(storage, SqliteFile | SalvagedSqliteFile)
-            or (isinstance(storage, McapFile) and storage.profile == "ros2")
-        ]
+        ros2 = [storage for storage in self.storages if storage.from_ros2]
         encodings = {channel.encoding for storage in ros2 for channel in storage.channels.values()}
         claimed = {topic.serialization for topic in metadata.topics if topic.serialization}
         for names in (encodings, claimed):

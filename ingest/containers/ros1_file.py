@@ -13,6 +13,7 @@ from restock.arrays import Ints
 from restock.errors import RecordingError
 from restock.ingest.containers.ros1_bag import BROKEN, Bag, Walked, walk
 from restock.ingest.containers.storage import (
+    Container,
     Damage,
     Extra,
     Integrity,
@@ -25,7 +26,7 @@ from restock.ingest.decoding.messages import Channel, MessageBatch
 
 # Whose places are remembered, of 24 bytes: who proposes a profile reads topic after topic, and
 # walking a chunk takes longer than inflating it.
-MOST_REMEMBERED = 1 << 20  # messages
+MAX_REMEMBERED = 1 << 20  # messages
 # Start, end and stamp of a chunk's messages (N, 3), by connection; and where it is damaged.
 _Places: TypeAlias = tuple[dict[int, Ints], int | None]
 
@@ -38,6 +39,8 @@ class Ros1File:
             only with `salvage`.
     """
 
+    from_ros2 = False
+
     def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
         self.integrity: Integrity = "unverified"
         self.damage: list[Damage] = []
@@ -46,7 +49,7 @@ class Ros1File:
         self.metadata: list[Metadata] = []  # the format has no place for it
         self.packed: list[Packed] = []
         self._places: dict[int, _Places] = {}  # by the position of the chunk
-        self._room = MOST_REMEMBERED
+        self._room = MAX_REMEMBERED
         self._reader = Bag(path)
         try:
             self._reader.open()
@@ -188,3 +191,13 @@ def _batch(data: bytes, places: Ints) -> MessageBatch:
     """The messages that lie at these places of a chunk."""
     start, stop, times = places.T
     return MessageBatch(np.frombuffer(data, np.uint8), start, stop, times, times)
+
+
+CONTAINER = Container(
+    name="ros1",
+    endings=(".bag",),
+    claims=lambda head: head.startswith(b"#ROSBAG V"),
+    open=Ros1File,
+    format="ros1",
+    bag_format="ros1",
+)

@@ -25,12 +25,15 @@ from restock.errors import RecordingError
 from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
 from restock.ingest.containers.storage import (
     NOT_KEPT,
+    Container,
     Damage,
     Extra,
     Integrity,
     Metadata,
     Packed,
+    Watch,
     custom_data,
+    unwatched,
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
@@ -51,7 +54,9 @@ _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
 _Row: TypeAlias = tuple[int, int, Any, int | None, int]  # topic, stamp, data, its size, row number
 
 
-def open_sqlite(path: Path, *, salvage: bool) -> SqliteFile | SalvagedSqliteFile:
+def open_sqlite(
+    path: Path, *, salvage: bool = False, watch: Watch = unwatched
+) -> SqliteFile | SalvagedSqliteFile:
     """Open a sqlite3 storage file.
 
     Raises:
@@ -85,6 +90,8 @@ class SqliteFile:
         DamagedSqliteError: its check fails.
         RecordingError: it is not rosbag2's.
     """
+
+    from_ros2 = True
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -389,3 +396,13 @@ def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> 
         # Not as a function in FROM: in a schema that is not trusted, that is not allowed.
         if any(row[6] for row in connection.execute(f"PRAGMA table_xinfo({table})")):
             raise sqlite3.DatabaseError(f"{table} has computed columns")
+
+
+CONTAINER = Container(
+    name="sqlite3",
+    endings=(".db3",),
+    claims=lambda head: head.startswith(MAGIC),
+    open=open_sqlite,
+    format="rosbag2-sqlite3",
+    bag_format="rosbag2-sqlite3",
+)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
 from ruamel.yaml import YAML
@@ -20,6 +21,7 @@ Watch = Callable[[str, int, int], None]  # what is being done, how much of it is
 MOST_ENTRIES = 1_000
 LONGEST_TEXT = 4_096  # characters of a name or value
 LONGEST_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
+HEAD_BYTES = 64  # by which a container claims a file
 NOT_KEPT = f"not text, longer than {LONGEST_TEXT:,} characters, or beyond entry {MOST_ENTRIES:,}"
 # What the YAML library raises of an invalid document, or of one that it does not expect.
 INVALID_YAML = (
@@ -132,7 +134,7 @@ class Storage(Protocol):
     last log time, or None when it holds no message. `damage` is final once everything wanted
     has been read. `notes` are for the user to know and lose nothing. `extras` are listed, not read;
     `metadata` is what of them says something of the whole recording. `packed` is empty where a file
-    has no chunks.
+    has no chunks. `from_ros2` says whether a ROS 2 middleware serialised its messages.
     """
 
     channels: dict[int, Channel]
@@ -143,6 +145,7 @@ class Storage(Protocol):
     extras: list[Extra]
     metadata: list[Metadata]
     packed: list[Packed]
+    from_ros2: bool
 
     @property
     def integrity(self) -> Integrity:
@@ -156,3 +159,21 @@ class Storage(Protocol):
     def close(self) -> None:
         """Close the file."""
         ...
+
+
+class Opener(Protocol):
+    """Opens one file of a container; with `salvage`, what can be read of a damaged one."""
+
+    def __call__(self, path: Path, *, salvage: bool, watch: Watch) -> Storage: ...
+
+
+@dataclass(frozen=True)
+class Container:
+    """A file format of recordings: a row of `containers.known.CONTAINERS`."""
+
+    name: str
+    endings: tuple[str, ...]  # of its files' names
+    claims: Callable[[bytes], bool]  # by a file's first `HEAD_BYTES`
+    open: Opener
+    format: str  # what a store calls a recording that is one such file
+    bag_format: str  # and one that is a folder of them

@@ -160,12 +160,12 @@ def transitions(
         residual=steps.residual[tick],
         terminates=terminates[rows.episode[begin]],
         zone=profile.zone_of(now["pose_x_m"], now["pose_y_m"]),
-        truth=[_sorted_truth(steps.truth[index]) for index in tick],
+        truth=_sorted_truths(steps.truth, tick),
         policy=[steps.policy[index] for index in tick],
         policy_version=[steps.policy_version[index] for index in tick],
         probability=[steps.probability[index] for index in tick],
         perturbation=steps.perturbed.columns(tick),
-        true_exposure=[_sorted_truth(steps.true_exposure[index]) for index in tick],
+        true_exposure=_sorted_truths(steps.true_exposure, tick),
         goal_source=profile.goal_source,
         logged_ns=steps.logged_ns[tick],
     )
@@ -238,8 +238,14 @@ def transition_table(
     return table.replace_schema_metadata({ENDS: packed(rows.ends_table())})
 
 
-def _sorted_truth(text: str | None) -> str | None:
-    return None if text is None else truth_text(true_names(text))
+def _sorted_truths(truth: Sequence[str | None], tick: Ints) -> list[str | None]:
+    """Return the true conditions at these ticks (N,), their names sorted in each text.
+
+    A recording has a few different texts, each of which is read once.
+    """
+    texts = [truth[index] for index in tick]
+    ordered = {text: truth_text(true_names(text)) for text in set(texts) if text is not None}
+    return [None if text is None else ordered[text] for text in texts]
 
 
 def _vectors(

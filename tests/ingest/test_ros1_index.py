@@ -197,12 +197,12 @@ def test_a_damaged_chunk_is_lost_once_whatever_is_read_first(tmp_path: Path) -> 
         assert sum(one[lost.reason] for one in reasons) == lost.messages
 
 
-@pytest.mark.parametrize("most", [ros1_file.MOST_REMEMBERED, 150])
+@pytest.mark.parametrize("most", [ros1_file.MAX_REMEMBERED, 150])
 def test_a_chunk_is_walked_once_while_there_is_room(bag, monkeypatch, most: int) -> None:
     walked = []
     real = ros1_file.walk
     monkeypatch.setattr(ros1_file, "walk", lambda data: walked.append(data) or real(data))
-    monkeypatch.setattr(ros1_file, "MOST_REMEMBERED", most)
+    monkeypatch.setattr(ros1_file, "MAX_REMEMBERED", most)
     with Reader(bag) as reader:
         chunks = len(reader.chunks)
     with open_recording(bag) as recording:

@@ -98,10 +98,10 @@ def compression_of(entry: Mapping[str, Any], *, salvage: bool = False) -> dict[s
     None where it compressed neither; MCAP chunks are another matter. Messages are looked at only
     where there may be compressed ones: rosbag2's metadata says so, or there is no metadata.
     """
-    from restock.ingest.containers.discover import kind_of
+    from restock.ingest.containers.discover import container_of
 
     files = [Path(name) for name in entry["files"]]
-    packed = [file for file in files if kind_of(file) == "zstd"]
+    packed = [file for file in files if container_of(file) is None]
     if packed:
         return _document("file", map(_file_sizes, packed))
     if not _may_have_messages(entry, files[0]):
@@ -142,13 +142,13 @@ def _file_sizes(file: Path) -> tuple[int, int]:
 
 def _message_sizes(file: Path, salvage: bool) -> Iterator[tuple[int, int | None]]:
     """The compressed messages of a file; none where there is none among the first that are read."""
-    from restock.ingest.containers.discover import ZSTD_MAGIC, kind_of
-    from restock.ingest.containers.mcap_file import McapFile
-    from restock.ingest.containers.sqlite_file import open_sqlite
+    from restock.ingest.containers.discover import ZSTD_MAGIC, container_of
+    from restock.ingest.containers.storage import unwatched
 
-    sqlite = kind_of(file) == "sqlite3"
-    storage = open_sqlite(file, salvage=salvage) if sqlite else McapFile(file, salvage=salvage)
-    with closing(storage):
+    container = container_of(file)
+    if container is None:
+        return
+    with closing(container.open(file, salvage=salvage, watch=unwatched)) as storage:
         for _, batch in storage.batches(list(storage.channels)):
             payloads = [one for one in batch.payloads() if one.startswith(ZSTD_MAGIC)]
             if not payloads:

@@ -1,0 +1,78 @@
+"""A container that this test adds: one class, one row of `CONTAINERS`, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+import pytest
+
+from restock.ingest.containers import known
+from restock.ingest.containers.discover import recordings_in
+from restock.ingest.containers.open_recording import open_recording
+from restock.ingest.containers.storage import (
+    Container,
+    Damage,
+    Extra,
+    Integrity,
+    Metadata,
+    Packed,
+    Watch,
+    unwatched,
+)
+from restock.ingest.decoding.messages import Channel, MessageBatch
+
+MAGIC = b"#JSONLINES\n"
+
+
+class JsonLines:
+    """A line a message: its time and its JSON; all of one topic."""
+
+    from_ros2 = False
+    integrity: Integrity = "unverified"
+
+    def __init__(self, path: Path, *, salvage: bool = False, watch: Watch = unwatched) -> None:
+        lines = [json.loads(line) for line in path.read_text().splitlines()[1:]]
+        self.stamps = [line["ns"] for line in lines]
+        self.payloads = [json.dumps(line["message"]).encode() for line in lines]
+        self.channels = {1: Channel(1, "/speed", "Speed", "json")}
+        self.counts = {1: len(lines)}
+        self.span_ns = (min(self.stamps), max(self.stamps)) if lines else None
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+        self.extras: list[Extra] = []
+        self.metadata: list[Metadata] = []
+        self.packed: list[Packed] = []
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
+        if 1 in channels:
+            yield 1, MessageBatch.of(self.payloads, self.stamps, self.stamps)
+
+    def close(self) -> None:
+        pass
+
+
+ROW = Container(
+    name="jsonlines",
+    endings=(".jsonl",),
+    claims=lambda head: head.startswith(MAGIC),
+    open=JsonLines,
+    format="jsonlines",
+    bag_format="jsonlines",
+)
+
+
+def test_a_container_is_one_class_and_one_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known, "CONTAINERS", (*known.CONTAINERS, ROW))
+    lines = [json.dumps({"ns": ns, "message": {"mps": ns / 10}}) for ns in (10, 20, 30)]
+    path = tmp_path / "run.jsonl"
+    path.write_bytes(MAGIC + "\n".join(lines).encode())
+    assert recordings_in(tmp_path) == [path]
+    with open_recording(path) as recording:
+        assert recording.format == "jsonlines"
+        speed = recording.read({"/speed": ["mps"]})["/speed"]
+    assert speed.fields["mps"].tolist() == [1.0, 2.0, 3.0]
+    assert speed.log_time_ns.tolist() == [10, 20, 30]
