@@ -15,7 +15,7 @@ help:
 	@echo "make test-lowest  the tests with the oldest releases of libraries that Restock runs with"
 	@echo "make neighbours   a Python with d3rlpy and lerobot, for the tests that read exports with them"
 	@echo "make lint         ruff and mypy"
-	@echo "make notebook     run docs/tutorial.md, and write its outputs and docs/tutorial.ipynb"
+	@echo "make notebook     run docs/tutorial.md, write its outputs again and build/tutorial.ipynb"
 	@echo "make sample-logs  record sample_logs/ again from its seed"
 
 # The stamp files make each target install only what it needs, once per change of pyproject.toml or of
@@ -82,9 +82,8 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The page is the source of both; a test fails where they no longer agree.
 notebook: $(VENV)/.dev
-	PYTHONPATH=tests $(BIN)/python -m support.notebook docs/tutorial.md
+	PYTHONPATH=tests $(BIN)/python -m support.notebook docs/tutorial.md build
 
 sample-logs: $(VENV)/.runtime
 	$(BIN)/python sample_logs/make.py

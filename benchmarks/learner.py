@@ -3,7 +3,7 @@
     python benchmarks/learner.py --out /tmp/learner [--arms NAME,NAME] [--seeds 0,1] [--quick]
     python benchmarks/learner.py --out /tmp/learner --table      # of what is there
 
-Arms are those of benchmarks/learner/arms.toml, a study's file (docs/study.md): settings of
+Arms are those of benchmarks/learner/arms.toml, a study's file (docs/compare.md): settings of
 `restock train`. Each run is trained and then judged by the policy that it kept, on episodes that no
 choice was made on, with one process at a time, whose CPU seconds are counted: wall time says little
 on a machine that does other work. What is done is not done again; a run that was cut off goes on.

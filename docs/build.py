@@ -23,7 +23,7 @@ import duckdb
 
 DOCS = Path(__file__).parent
 FACES = ("restock.ingest", "restock.replay", "restock.train", "restock.twin", "restock.report")
-NOT_PAGES = ("build.py", "__pycache__", "tutorial")
+NOT_PAGES = ("build.py", "__pycache__")
 
 
 def list_verbs() -> Iterator[str]:

@@ -91,7 +91,7 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
             where="teacher.successes",
             remedy="leave it out, or add drivers to teacher.policies",
         )
-    # Where the twin's operator answers from the first step on, they slow it down: docs/teacher.md.
+    # Where the twin's operator answers from the first step on, they slow it down: docs/train.md.
     return logged and not teacher.asks if teacher.successes is None else teacher.successes
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from restock.replay.fleet.shopping_list import ShoppingList
 
 FORMAT = "restock-missions/1"
-_REMEDY = "docs/diff.md lists the keys of a missions file"
+_REMEDY = "docs/coverage.md lists the keys of a missions file"
 
 
 class MissionOrder(Checked, frozen=True, kw_only=True):

@@ -1,5 +1,5 @@
 -- What drift is looked for in: one value an episode of each signal (episode_signals), and how often
--- each condition began (episode_conditions). drift.sql compares them over weeks. docs/drift.md says what
+-- each condition began (episode_conditions). drift.sql compares them over weeks. docs/coverage.md says what
 -- each signal tells. Not in Spark's list of views.
 
 -- The names of the profiles' own signals.

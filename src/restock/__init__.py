@@ -1,7 +1,7 @@
 """Robot logs to coverage-labelled transitions, replay mixtures, and a DQN in a twin.
 
 The rooms `restock.ingest`, `restock.replay`, `restock.train` and `restock.twin` hold the public
-names, docs/api.md lists them; `restock.report` writes the pages about a run. Importing any of
+names, docs/reference.md lists them; `restock.report` writes the pages about a run. Importing any of
 them is cheap; `torch`, `mujoco` and `duckdb` load with what needs them.
 The Gymnasium environment `restock/Warehouse-v0` is registered here, by name only, and as soon as
 Gymnasium is imported, before or after this.

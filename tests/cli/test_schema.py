@@ -23,10 +23,10 @@ from restock.train.twin.physics.perturbation import PERTURBATIONS
 SCHEMAS = {name: json.loads(schema_of(name)) for name in CONFIGS}
 # Of a page's blocks of TOML that are whole files: what they are.
 WRITTEN = {
-    ("docs/study.md", "study.toml"): "study",
-    ("docs/tune.md", "search.toml"): "search",
-    ("docs/schema.md", "recipe.toml"): "train",
-    ("docs/record.md", "next.toml"): "missions",
+    ("docs/compare.md", "study.toml"): "study",
+    ("docs/compare.md", "search.toml"): "search",
+    ("docs/profile.md", "recipe.toml"): "train",
+    ("docs/twin.md", "next.toml"): "missions",
 }
 
 

@@ -10,6 +10,7 @@ import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -31,9 +32,9 @@ LANGUAGES = (
     "text",
     "xml",
     "py",
-)  # py: signatures in docs/api.md
+)  # py: signatures in docs/reference.md
 ALL = {page: blocks(page) for page in PAGES}
-NOTEBOOKS = [page for page in PAGES if page.with_suffix(".ipynb").exists()]  # test_tutorial.py's
+NOTEBOOKS = [ROOT / "docs/tutorial.md"]  # test_tutorial.py runs it
 PAGES_RUN = [p for p in PAGES if p not in NOTEBOOKS and any(block.is_run for block in ALL[p])]
 PAGES_SLOW = [page for page in PAGES if any("slow" in block.marks for block in ALL[page])]
 TOML = [b for told in ALL.values() for b in told if b.language == "toml" and "file" not in b.marks]
@@ -71,8 +72,14 @@ def prepared(server: Reader, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_page(page: Path, server: Reader, prepared: Path, folder: Path, *, slow: bool) -> None:
+    for number, told in groupby(blocks(page), lambda block: block.folder):
+        run_blocks(list(told), server, prepared, folder / str(number), slow=slow)
+
+
+def run_blocks(
+    told: list[Block], server: Reader, prepared: Path, folder: Path, *, slow: bool
+) -> None:
     shutil.copytree(prepared, folder, symlinks=True)
-    told = blocks(page)
     for block in told:
         if target := block.marks.get("file"):
             (folder / target).parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +128,7 @@ def check_mixture(block: Block, folder: Path) -> None:
 
 def check_study(block: Block, folder: Path) -> None:
     """A part of a study is checked with what it leaves out taken from the page's whole one."""
-    (whole,) = [other for other in blocks(ROOT / block.page) if other.marks.get("file")]
+    whole = next(b for b in blocks(ROOT / block.page) if b.marks.get("file") == "study.toml")
     own = tomllib.loads(block.text)
     left_out = {
         key: value
@@ -165,7 +172,7 @@ def check_profile(block: Block, folder: Path) -> None:
 # Blocks of TOML that are no file of a page's commands: how a page's are checked.
 CHECKS: dict[str, Callable[[Block, Path], None]] = {
     "docs/mixture.md": check_mixture,
-    "docs/study.md": check_study,
+    "docs/compare.md": check_study,
     "docs/layouts.md": check_floor,
     "docs/profile.md": check_profile,
     "docs/robot.md": check_profile,

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from support.notebook import cells_of, executed, filled, notebook_of, pictures_of, text_of
+from support.notebook import cells_of, executed, filled, notebook_of, text_of
 from support.paths import ROOT
 
 PAGE = ROOT / "docs/tutorial.md"
-REMEDY = "`make notebook` writes both again"
 
 
 def check_verdicts(notebook: nbformat.NotebookNode) -> None:
@@ -31,17 +30,6 @@ def check_verdicts(notebook: nbformat.NotebookNode) -> None:
     lag, supply = ({row[0]: float(row[at]) for row in figures} for at in (1, 2))
     assert max(lag["sound"], lag["dry"]) < 0.25 < lag["frozen"]
     assert supply["dry"] < 0.1 < min(supply["sound"], supply["frozen"])
-
-
-def test_page_and_notebook_have_the_same_cells_and_outputs() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-    notebook = nbformat.read(PAGE.with_suffix(".ipynb"), as_version=4)
-    nbformat.validate(notebook)
-    assert [(c.cell_type, c.source) for c in notebook.cells] == cells_of(page), REMEDY
-    assert filled(page, notebook, "tutorial") == page, REMEDY
-    check_verdicts(notebook)
-    for name, picture in pictures_of(page, notebook).items():
-        assert (PAGE.with_suffix("") / name).read_bytes() == picture, REMEDY
 
 
 def test_a_page_becomes_cells_and_takes_their_outputs() -> None:

@@ -1,4 +1,4 @@
-"""docs/profile-keys.md has every key of the tables that it is of, with its default."""
+"""docs/profile.md has every key of the tables that it is of, with its default."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Rewards, Task
 
-PAGE = (ROOT / "docs" / "profile-keys.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "profile.md").read_text("utf-8").partition("## Keys of a profile")[2]
 TABLES_WITHIN = {"body", "rewards"}
 
 

@@ -1,4 +1,4 @@
-"""Public names: cheap to import, never shadowed, listed in docs/api.md, and all that docs teach."""
+"""Public names: cheap to import, never shadowed, and all that docs teach."""
 
 from __future__ import annotations
 

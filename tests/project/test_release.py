@@ -34,7 +34,7 @@ def test_the_version_is_the_same_wherever_it_is_told() -> None:
     assert re.search(r"^version: (.*)$", citation, re.MULTILINE)[1] == version  # type: ignore[index]
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(r"^## (\S+?),? ", changes, re.MULTILINE)[1] == version  # type: ignore[index]
-    for path in (ROOT / ".github" / "workflows" / "restock-check.yml", ROOT / "docs" / "ci.md"):
+    for path in (ROOT / ".github" / "workflows" / "restock-check.yml", ROOT / "docs" / "audit.md"):
         named = re.findall(r"restock-check\.yml@v([\d.]+\d)", path.read_text(encoding="utf-8"))
         assert set(named) == {version}, path
 
@@ -56,7 +56,7 @@ def test_the_workflow_to_copy_gives_what_must_be_given() -> None:
     inputs = workflow("restock-check")["on"]["workflow_call"]["inputs"]
     required = {name for name, of in inputs.items() if of.get("required")}
     assert required == {"restock", "store"}  # there is no index that has a `restock` to install
-    page = (ROOT / "docs/ci.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/audit.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     given = YAML(typ="safe", pure=True).load(block)["jobs"]["gate"]["with"]
     assert required <= set(given) <= set(inputs)

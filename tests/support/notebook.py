@@ -6,9 +6,9 @@ becomes text. Executing writes what the cells put out into the page, between the
     <!-- output: clocks.png: what the picture shows -->     a picture's name, where there is one
     <!-- end of output -->
 
-and into the notebook, so that neither says anything that was not computed:
+and into a notebook beside the other things that are built:
 
-    python -m support.notebook docs/tutorial.md      (in tests/; `make notebook` does it)
+    python -m support.notebook docs/tutorial.md build   (in tests/; `make notebook` does it)
 """
 
 from __future__ import annotations
@@ -127,8 +127,8 @@ def pictures_of(page: str, notebook: nbformat.NotebookNode) -> dict[str, bytes]:
     return found
 
 
-def main(path: Path) -> None:
-    """Execute a page and write it, its notebook and its pictures."""
+def main(path: Path, out: Path) -> None:
+    """Execute a page; write it and its pictures, and its notebook into the folder `out`."""
     page = path.read_text(encoding="utf-8")
     notebook = executed(notebook_of(page), path.parent)
     pictures = path.with_suffix("")
@@ -136,8 +136,9 @@ def main(path: Path) -> None:
     for name, content in pictures_of(page, notebook).items():
         (pictures / name).write_bytes(content)
     path.write_text(filled(page, notebook, pictures.name), encoding="utf-8")
-    nbformat.write(notebook, path.with_suffix(".ipynb"))
+    out.mkdir(parents=True, exist_ok=True)
+    nbformat.write(notebook, out / f"{path.stem}.ipynb")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -7,6 +7,8 @@ A block is fenced and names its language. A comment on the line before it may sa
     <!-- exit codes: 1 3 -->   besides 0, how its commands may end
     <!-- file: wet.toml -->    the block is that file, which later blocks of the page read
     <!-- before: COMMANDS -->  what a reader did before, in the shell
+
+`<!-- new folder -->` on a line of its own: the blocks after it run in a folder of their own.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ class Block:
     language: str  # "" where it names none
     text: str
     marks: dict[str, str] = field(default_factory=dict)
+    folder: int = 0  # number of the page's folder in which it runs
 
     @property
     def place(self) -> str:
@@ -64,8 +67,9 @@ def blocks(path: Path) -> list[Block]:
     page = str(path.relative_to(ROOT))
     lines = path.read_text(encoding="utf-8").splitlines()
     found = []
-    number = 0
+    number = folder = 0
     while number < len(lines):
+        folder += lines[number] == "<!-- new folder -->"
         if lines[number].startswith("```"):
             first, number = number, number + 1
             while lines[number] != "```":
@@ -76,7 +80,7 @@ def blocks(path: Path) -> list[Block]:
                 marks[mark[1]] = mark[2] or ""
                 above -= 1
             text = "".join(line + "\n" for line in lines[first + 1 : number])
-            found.append(Block(page, first + 2, lines[first][3:], text, marks))
+            found.append(Block(page, first + 2, lines[first][3:], text, marks, folder))
         number += 1
     return found
 

@@ -34,7 +34,7 @@ from restock.train.twin.physics.perturbation import (
     find_perturbation,
 )
 
-PAGE = ROOT / "docs" / "perturbations.md"
+PAGE = ROOT / "docs" / "twin.md"
 COLUMNS = ["perturbation", "perturbation_values"]
 
 

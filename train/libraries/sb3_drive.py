@@ -60,7 +60,7 @@ def _made(kind: Any, config: TrainConfig, arguments: dict[str, Any], **ours: Any
         raise ConfigError(
             f"Stable-Baselines3's {kind.__name__} refused its arguments: {error}",
             where="arguments",
-            remedy="see its documentation for its arguments, and docs/study.md for those that "
+            remedy="see its documentation for its arguments, and docs/compare.md for those that "
             "Restock sets",
         ) from error
 

@@ -121,7 +121,7 @@ def load_search(path: Path) -> Search:
     Raises:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
-    remedy = "docs/tune.md lists every key with its meaning"
+    remedy = "docs/compare.md lists every key with its meaning"
     search = typed(read_toml(path), Search, where=str(path), remedy=remedy)
     refuse_unknown_names(search.evaluation, str(path))
     for name, parameter in search.parameters.items():

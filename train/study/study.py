@@ -204,7 +204,7 @@ def load_study(path: Path | str) -> Study:
     Raises:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
-    remedy = "docs/study.md lists every key with its meaning"
+    remedy = "docs/compare.md lists every key with its meaning"
     study = typed(read_toml(Path(path)), Study, where=str(path), remedy=remedy)
     refuse_unknown_names(study.evaluation, str(path))
     for arm in study.arms:

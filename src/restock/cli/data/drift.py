@@ -23,7 +23,8 @@ class DriftCommand:
     signal (odometry scale, lidar noise, gyroscope bias, …) and the rate at which each condition
     begins gets a two-sample test over recordings or episodes, with an effect size and a p-value
     corrected over all tests. A change that all robots of a site share is reported for the site.
-    Robots and sites are tags of recordings (`restock ingest --tag robot=amr-1`). See docs/drift.md.
+    Robots and sites are tags of recordings (`restock ingest --tag robot=amr-1`). See
+    docs/coverage.md.
 
         restock drift store/
         restock drift store/ --out drift.html

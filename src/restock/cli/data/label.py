@@ -31,7 +31,7 @@ class LabelCommand:
 
     With --review, nothing is labelled: it lists the events whose label is most uncertain, each with
     its time, the command that opens it, and a column for a verdict. --corrections writes verdicts
-    to the store: they stay when recordings are labelled or ingested again. See docs/review.md.
+    to the store: they stay when recordings are labelled or ingested again. See docs/ingest.md.
     """
 
     store: Annotated[Path, tyro.conf.Positional]

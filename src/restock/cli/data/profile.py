@@ -66,7 +66,7 @@ class ProfileCommand:
     stands for the commanded motion."""
     hindsight_goals: bool = False
     """For `new`: take goals in hindsight even if most of the drive has none, as when the robot
-    mostly stood. Rows without a goal are then left out. See docs/goals.md."""
+    mostly stood. Rows without a goal are then left out. See docs/task.md."""
     out: Path | None = None
     """Where `new` writes the profile. An existing file is not overwritten."""
     typestore: str | None = None

@@ -40,7 +40,7 @@ class StudyCommand:
     The study is a TOML file with a store, arms (a mixture or a panel, and settings), seeds and the
     treatment. Each run is a directory under OUT/runs. Finished runs are kept, so the same command
     continues an interrupted study. Ends with OUT/study.md, study.json and a page, study.html.
-    --power prints beforehand which effects this number of seeds can detect. See docs/study.md.
+    --power prints beforehand which effects this number of seeds can detect. See docs/compare.md.
 
     A file with [space] instead of arms is a search for settings with Optuna (`restock[tune]`). The
     best trial is the one with the highest success in its worst condition. It also writes
@@ -101,7 +101,7 @@ class StudyCommand:
                     if plan.study.primary is None
                     else "does not give the spread between seeds, and no seeds are finished",
                     where=str(self.study),
-                    remedy="give `primary` and `power = { sd = …, effect = … }`: docs/study.md",
+                    remedy="give `primary` and `power = { sd = …, effect = … }`: docs/compare.md",
                 )
             document = power.as_json()
             print_json(document) if self.json else sys.stdout.write(power_sentence(document) + "\n")

@@ -22,7 +22,7 @@ class CheckCommand:
     continuous integration: as JUnit XML for its test view, as Markdown for its page. What fails: an
     audit of severity error, recordings or episodes that were lost, a condition in which the run is
     worse than the baseline, and a comparison that is not possible. The command only reads.
-    docs/ci.md has a workflow to copy.
+    docs/audit.md has a workflow to copy.
 
     Example: `restock check store/ --against store@41 --run runs/a --baseline nightly`
     """

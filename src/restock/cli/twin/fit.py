@@ -23,7 +23,7 @@ class FitCommand:
     the friction, payload, wheel radius, track, latency and gain with which the twin moves as the
     robot did: first over the whole ranges on few segments, then by least squares on all. A
     parameter that the log does not identify keeps its value, and the reason is printed. A quarter
-    of the log is held out to measure the gap before and after. See docs/calibration.md.
+    of the log is held out to measure the gap before and after. See docs/robot.md.
 
     Example: `restock twin fit store/ --out fitted.toml`
     """

@@ -26,7 +26,7 @@ class GapCommand:
     of observation and reward after one step from each logged state: for the nominal twin and, with
     --perturbation, for a calibrated one. For comparison it shows dead-reckoned odometry, and the
     least error that localisation noise allows. It lists the conditions in which the twin should not
-    be trusted, by the limits below, with 95 % confidence over episodes. See docs/calibration.md.
+    be trusted, by the limits below, with 95 % confidence over episodes. See docs/robot.md.
 
     The exit code is 0 whatever the gap. With --check, it is 1 if a condition is untrusted.
 

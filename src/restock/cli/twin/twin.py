@@ -17,7 +17,7 @@ from restock.cli.twin.robot import RobotCommand
 class TwinCommand:
     """Fit the twin to logs, measure its gap to them, test its robot, and describe its floors.
 
-    See docs/calibration.md, docs/robot.md and docs/layouts.md. `restock twin JOB --help` explains
+    See docs/robot.md, docs/robot.md and docs/layouts.md. `restock twin JOB --help` explains
     one job.
     """
 

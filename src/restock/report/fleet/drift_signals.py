@@ -12,7 +12,7 @@ from restock.replay.store.column_docs import UNITS
 from restock.replay.store.column_docs import unit as unit_of
 from restock.report.look.blocks import Rows, words
 
-_MEANINGS = {  # what a signal tells of; docs/drift.md has how each is measured
+_MEANINGS = {  # what a signal tells of; docs/coverage.md has how each is measured
     "odometry_scale": "localised metres per metre that the wheels report, driving straight",
     "wheel_yaw_scale": "yaw rate of the gyroscope divided by that of the wheels, when turning",
     "wheel_pull_radpm": "turn that the wheels did not report, per metre of straight driving",
