@@ -1,4 +1,4 @@
-"""The columns of the transition table: names, types, units and meanings.
+"""The columns of a store: names, types, units and meanings; other types are derived from these.
 
 A row is one transition and stands alone: the observation after it is in the row, so rows stay
 whole under any filter, sort or engine.
@@ -391,3 +391,41 @@ def recording_schema() -> pa.Schema:
     return pa.schema(
         [pa.field(column.name, column.type, column.nullable) for column in RECORDING_COLUMNS]
     )
+
+
+_DUCKDB_TYPES = {
+    pa.int16(): "SMALLINT",
+    pa.int32(): "INTEGER",
+    pa.int64(): "BIGINT",
+    pa.float32(): "FLOAT",
+    pa.float64(): "DOUBLE",
+    pa.bool_(): "BOOLEAN",
+    pa.string(): "VARCHAR",
+    pa.binary(): "BLOB",
+    pa.timestamp("us", "UTC"): "TIMESTAMPTZ",
+}
+
+
+def duckdb_type(kind: pa.DataType) -> str:
+    """Return DuckDB's name of the type of a column."""
+    if pa.types.is_map(kind):
+        return f"MAP({duckdb_type(kind.key_type)}, {duckdb_type(kind.item_type)})"
+    if pa.types.is_list(kind):
+        return f"{duckdb_type(kind.value_type)}[]"
+    if pa.types.is_struct(kind):
+        fields = ", ".join(f'"{field.name}" {duckdb_type(field.type)}' for field in kind)
+        return f"STRUCT({fields})"
+    return _DUCKDB_TYPES[kind]
+
+
+def with_columns(sql: str) -> str:
+    """Replace `/* nulls: transitions */` and `/* nulls: recordings */` in SQL by a select list of
+    null for each nullable column of that table."""
+    for table, columns in (("transitions", COLUMNS), ("recordings", RECORDING_COLUMNS)):
+        nulls = ", ".join(
+            f"NULL::{duckdb_type(column.type)} AS {column.name}"
+            for column in columns
+            if column.nullable
+        )
+        sql = sql.replace(f"/* nulls: {table} */", nulls)
+    return sql

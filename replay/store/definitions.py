@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary, ref
 import duckdb
 
 from restock.ingest.store.summary import with_included
+from restock.ingest.task.schema import with_columns
 from restock.interrupts import was_interrupted
 from restock.replay.store.column_docs import install_columns
 from restock.replay.store.same_drives import install_same_drives
@@ -245,7 +246,7 @@ def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEW
     """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
-    whole = with_included("\n".join(text), folder)
+    whole = with_columns(with_included("\n".join(text), folder))
     return whole.replace("::FLOAT[] AS", f"::{observation_type} AS")
 
 

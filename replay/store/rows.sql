@@ -1,6 +1,7 @@
 -- The two tables of a store as views, over stored_transitions and stored_recordings (its Parquet as
--- it lies, or that of several stores): all other views are of these. Columns that newer software
--- writes are null in rows of an older store. Both are written for Spark in `spark.py`.
+-- it lies, or that of several stores): all other views are of these. A nullable column that no row has
+-- yet is null: the list is rendered from `ingest/task/schema.py`. Both are written for Spark in
+-- `spark.py`.
 
 -- A recording's manifest row is committed before its transitions: an ingest that was cut between
 -- the two is in stored_recordings and in no view.
@@ -19,23 +20,7 @@ SELECT
 FROM (
     FROM stored_recordings
     UNION ALL BY NAME
-    SELECT
-        NULL::MAP(VARCHAR, VARCHAR) AS tags,
-        NULL::VARCHAR AS exposures_json,
-        NULL::STRUCT(
-            condition VARCHAR, kind VARCHAR, signals VARCHAR[], because VARCHAR
-        )[] AS unknown_conditions,
-        NULL::VARCHAR[] AS uncertain_conditions,
-        NULL::STRUCT(
-            condition VARCHAR, known BIGINT, labelled BIGINT, support BIGINT, agreed BIGINT,
-            event_labelled BIGINT, event_right BIGINT, event_support BIGINT, event_found BIGINT
-        )[] AS label_counts,
-        NULL::STRUCT(
-            camera VARCHAR, topic VARCHAR, "type" VARCHAR, expected BIGINT, decoded BIGINT,
-            kept BIGINT, thinned BIGINT, unused BIGINT,
-            problems STRUCT(reason VARCHAR, count BIGINT)[], steps BIGINT, size_bytes BIGINT,
-            file VARCHAR
-        )[] AS cameras
+    SELECT /* nulls: recordings */
     WHERE false
 )
 WHERE ingest_id IN (SELECT ingest_id FROM stored_transitions);
@@ -63,18 +48,7 @@ SELECT
 FROM (
     FROM stored_transitions
     UNION ALL BY NAME
-    SELECT
-        NULL::BIGINT AS logged_ns,
-        NULL::MAP(VARCHAR, FLOAT) AS probabilities,
-        NULL::VARCHAR[] AS uncertain,
-        NULL::VARCHAR[] AS exposures,
-        NULL::VARCHAR AS true_exposure,
-        NULL::VARCHAR AS goal_source,
-        NULL::FLOAT AS came_nearer_m,
-        NULL::FLOAT AS plan_return_m,
-        NULL::FLOAT AS plan_gap_m,
-        NULL::VARCHAR AS perturbation,
-        NULL::MAP(VARCHAR, DOUBLE) AS perturbation_values
+    SELECT /* nulls: transitions */
     WHERE false
 ) AS stored
 JOIN (
@@ -90,6 +64,7 @@ JOIN (
     FROM (
         FROM stored_recordings
         UNION ALL BY NAME
-        SELECT NULL::MAP(VARCHAR, VARCHAR) AS tags WHERE false
+        SELECT /* nulls: recordings */
+        WHERE false
     )
 ) AS told USING (ingest_id);
