@@ -57,7 +57,7 @@ def test_settings_that_were_off_are_left_out() -> None:
 def test_settings_that_were_on_are_refused_by_name(setting: str, key: str) -> None:
     with pytest.raises(ConfigError, match=f"`{key}` was removed") as refused:
         load_config(None, [setting, "loss.munchausen_temperature=0.03"])
-    assert "docs/learning.md" in str(refused.value)
+    assert "docs/evidence.md" in str(refused.value)
     assert "leave it out" in str(refused.value)
 
 

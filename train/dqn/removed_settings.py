@@ -44,7 +44,7 @@ def refuse_removed(config: Mapping[str, Any], *, where: str) -> None:
         if isinstance(table, Mapping) and removed.key in table:
             raise ConfigError(
                 f"`{removed.table}.{removed.key}` was removed: no measurement showed it ahead of"
-                " the default recipe (docs/learning.md)",
+                " the default recipe (docs/evidence.md)",
                 where=where,
                 remedy="leave it out; a run that was trained with it needs an older Restock, but"
                 " its policy can still be used once exported to ONNX",

@@ -39,7 +39,7 @@ to the update that learned from it, and what to try with your own recordings."""
 
 _CELLS = 30  # of a bar of 100 %
 RARE = "all rare ones"
-FULL_STEPS = 128_000  # of docs/learning.md, "And three minutes"
+FULL_STEPS = 128_000  # of docs/evidence.md
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:
@@ -93,7 +93,7 @@ def trained(to: Settings) -> str:
     lines = [f"The agent is the fine-tuned policy: {most:,} steps in the twin here."]
     if most < FULL_STEPS / 2:
         lines += [
-            f"That is little: docs/learning.md says what {FULL_STEPS:,} steps gave. Give more",
+            f"That is little: docs/evidence.md says what {FULL_STEPS:,} steps gave. Give more",
             "--seconds, or run nothing else beside it.",
         ]
     if not most:
