@@ -51,7 +51,7 @@ SCALED = 32  # environments while something else is scaled
 UNDER_WAY = 20  # steps before anything is timed
 TRAFFIC = (0.0, 0.15, 0.5, 1.0)  # share of episodes
 BEAMS = (36, LIDAR_BEAMS, 180, 360)
-PIECES = 280  # boxes of a floor that is made from scans, as those of benchmarks/results/shared_robots.md
+PIECES = 280  # boxes of a floor that is made from scans
 TARGET = 1.7
 
 
