@@ -70,7 +70,8 @@ def _children(recording: Recording, topic: str) -> Iterator[str]:
     for times, fields in recording.batches(topic, [path]):
         column = fields[path]
         values = column.values if isinstance(column, Ragged) else column
-        yield from {plain(str(child)) for child in np.asarray(values, object).ravel()}
+        children = set(map(str, np.asarray(values, object).ravel()))
+        yield from {plain(child) for child in children}
         count += len(times)
         if count > MOST_TRANSFORMS:
             return

@@ -163,7 +163,11 @@ class InputColumns:
         source = self.by_name.get(name)
         fields = {} if source is None else self.topics[source.topic].fields
         path = None if source is None else frame_path(source, fields)
-        return [] if path is None else [plain(str(one)) for one in np.asarray(fields[path], object)]
+        if path is None:
+            return []
+        frames = [str(one) for one in np.asarray(fields[path], object)]
+        names = {frame: plain(frame) for frame in set(frames)}
+        return [names[frame] for frame in frames]
 
     def _yaw(self, name: str) -> F64:
         """Quaternions (N,) to yaw in (-pi, pi], REP 103: about z, counter-clockwise."""
