@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 from support.paths import ROOT
@@ -156,3 +157,15 @@ def test_the_verb_refuses_a_control_period_that_the_twin_cannot_drive(tmp_path: 
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"control_period_s = 0\.033 is not some physics"):
         RobotCommand(str(tmp_path / "mine.toml")).run()
+
+
+def test_a_warning_of_mujoco_writes_no_log_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    parent, child = mujoco.MjSpec(), mujoco.MjSpec()
+    child.option.gravity = [0, 0, 0]
+    child.worldbody.add_body(name="body").add_geom(size=[0.1, 0, 0])
+    parent.attach(child, frame=parent.worldbody.add_frame(), prefix="x")
+    parent.compile()
+    assert not list(tmp_path.iterdir())

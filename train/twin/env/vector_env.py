@@ -64,7 +64,7 @@ from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, with_r
 from restock.train.twin.physics.perturbation import Perturbation, Schedule, find_perturbation
 from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
-from restock.train.twin.physics.simulation import BodyState, Physics, Simulation
+from restock.train.twin.physics.simulation import BodyState, Simulation
 
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
@@ -104,11 +104,9 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         nav_command: bool = True,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         action: ActionKind = "discrete",
-        physics: Physics = "mujoco",
         camera: View | None = None,
     ) -> None:
-        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core; `physics`
-        "warp" steps on MuJoCo Warp's device: see docs/mjwarp.md.
+        """`conditions` are shares of episodes per kind; `nthread` 0 uses every core.
 
         A `perturbation` holds for every episode whose spec has none of its own; a schedule draws
         one for each such episode (fixed episodes get its base). `env.specs` tells them. It may be
@@ -181,7 +179,6 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         timestep = self.perturbation.timestep_s
         self.simulation = Simulation(
             *(num_envs, self.task, self.floors, timestep, nthread),
-            physics=physics,
             robot=robot_model(robot, self.task.body),
         )
         self.sensing = Sensing(self.simulation, self.task)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,8 +32,6 @@ from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot import RobotBody, SteeringController, base_controller
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, RobotModel, stand_in
 from restock.train.twin.physics.scenery import Scenery, quaternion, rotated
-
-Physics = Literal["mujoco", "warp"]  # warp: see `restock.train.twin.physics.warp_batch`
 
 BLOCK_S = 0.1
 OUTLINE_STEP_M = 0.05  # at most, between points on a robot's outline
@@ -84,7 +82,6 @@ class Simulation(Stateful):
         timestep_s: float,
         nthread: int,
         *,
-        physics: Physics = "mujoco",
         beams: int = LIDAR_BEAMS,
         robot: RobotModel | None = None,
     ) -> None:
@@ -101,8 +98,7 @@ class Simulation(Stateful):
         self.substeps = round(self.block_s / timestep_s)
         slots = max(len(floor.racks) for floor in floors)
         self.model, self.handles = build_model(floors[0], robot, timestep_s, slots)
-        _no_log_file()
-        self.batch = _batch(physics)(self.model, num_envs, nthread)
+        self.batch = Batch(self.model, num_envs, nthread)
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl = self.batch.bind("ctrl")
         self._slip_mps = task.slip_limit_mps
@@ -348,16 +344,6 @@ class Simulation(Stateful):
         self.batch.state[:] = state
 
 
-def _batch(physics: Physics) -> Any:
-    if physics == "mujoco":
-        return Batch
-    if physics == "warp":
-        from restock.train.twin.physics.warp_batch import WarpBatch
-
-        return WarpBatch
-    raise ConfigError(f"unknown physics {physics!r}", where="the twin", remedy="use mujoco or warp")
-
-
 def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
     """The blocks of a control period and their length: `BLOCK_S` where periods are some of these,
     else a part of a period.
@@ -384,11 +370,3 @@ def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
         remedy="use a control period of some hundredths of a second, even above .1 s, as .05, .08"
         " or .12, or a smaller timestep_s",
     )
-
-
-def _no_log_file() -> None:
-    """No MUJOCO_LOG.TXT in the working directory: divergence is counted and reported."""
-    config = mujoco.MjLogConfig.get()
-    if config.logto_file:
-        config.logto_file = False
-        config.set()
