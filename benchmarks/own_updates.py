@@ -11,8 +11,8 @@ from train_peers import ACTIONS, DISCOUNT, OBSERVATION, ROWS, Arrays
 
 from restock.replay.ring.ring import FreshRing
 from restock.train.dqn.config import TrainConfig, parse_config
+from restock.train.dqn.kernel import UpdatePath
 from restock.train.dqn.learner import Learner
-from restock.train.dqn.manual_backprop import UpdatePath
 from restock.train.feed.batch_record import FeedRecord
 from restock.train.feed.batches import Batches
 from restock.train.feed.held_rows import EpisodeLabels
@@ -59,7 +59,7 @@ class Restock:
         ring.by_condition.move(np.arange(ROWS), 1)  # as where episodes have ended
         self.blocks: UpdateBlocks | None = None
         if blocks:
-            none = LogTerms(None, None)
+            none = LogTerms(None)
             self.blocks = UpdateBlocks(settings, self.learner, self.batches, None, none)
         self.feed = None
         if run is not None:

@@ -43,7 +43,6 @@ from train_peers import (
 )
 
 from restock.train.dqn.config import TrainConfig
-from restock.train.dqn.products import product, product_into
 from restock.train.run.run import Run
 
 TARGETS = {"cleanrl": 2.5, "stable_baselines3": 3.0}  # times Restock's update, at least
@@ -64,28 +63,21 @@ def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:
     return update
 
 
-def products(batch: int, *, best: bool) -> Updates:
-    """The matrix products of an update alone: two passes forward, one backward.
-
-    By `torch.mm` as it comes, or, `best`, by the faster library for this processor.
-    """
+def products(batch: int) -> Updates:
+    """Return the matrix products of an update alone: two passes forward, one backward."""
     sizes = [OBSERVATION, 256, 256, ACTIONS]
     weights = [torch.randn(after, before) for before, after in itertools.pairwise(sizes)]
     values = [torch.randn(batch, size) for size in sizes]
     into = [torch.empty_like(weight) for weight in weights]
-    times = product if best else torch.mm
 
     def update(updates: int) -> None:
         for _ in range(updates):
             for layer in (0, 1, 2) * 2:
-                times(values[layer], weights[layer].t())
+                torch.mm(values[layer], weights[layer].t())
             for layer in (2, 1, 0):
-                if best:
-                    product_into(into[layer], values[layer + 1].t(), values[layer])
-                else:
-                    torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
+                torch.mm(values[layer + 1].t(), values[layer], out=into[layer])
                 if layer:
-                    times(values[layer + 1], weights[layer])
+                    torch.mm(values[layer + 1], weights[layer])
 
     return update
 
@@ -138,16 +130,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         run = Run.create(Path(folder) / "run", {})
         contenders: dict[str, Updates] = {
-            "products": products(batch, best=True),
-            "products_by_torch_mm": products(batch, best=False),
+            "products": products(batch),
             "restock_in_place": in_place(equal, arrays),
             "restock": Restock(equal, arrays),
-            "restock_manual": Restock(equal, arrays, path="manual"),
             "restock_autograd": Restock(equal, arrays, path="autograd"),
             **{name: peer for name, peer in peers.items() if peer is not None},
             "restock_layer_norm": Restock(normed, arrays),
             "restock_layer_norm_autograd": Restock(normed, arrays, path="autograd"),
-            "restock_default_manual": Restock(default, arrays, logs=True, path="manual"),
             "restock_default": Restock(default, arrays, logs=True),
             "restock_default_recorded": Restock(default, arrays, run=run, logs=True),
         }
@@ -157,7 +146,6 @@ def main() -> int:
         us = medians(in_turns(timed, rounds))
     ratios = {name: us[name] / us["restock"] for name in peers if name in us}
     over = us["restock"] / us["restock_in_place"]
-    floor = min(us["products"], us["products_by_torch_mm"])
     feed = us["restock_default_recorded"] / us["restock_default"] - 1
     missed = [
         f"{name}: {ratios[name]:.2f}x, target {target}x"
@@ -173,7 +161,7 @@ def main() -> int:
         "us_per_update": us,
         "ratios": ratios,
         "over_in_place": over,
-        "over_products": us["restock"] / floor,
+        "over_products": us["restock"] / us["products"],
         "left_out": [name for name, peer in peers.items() if peer is None],
         "record_share": feed,
     }

@@ -21,7 +21,7 @@ import numpy as np
 from restock.arrays import F32, Bools
 from restock.errors import RunError
 from restock.files import write_text
-from restock.train.dqn.loss import Loss
+from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batches import ReplayBatch
 from restock.train.session import Session
 

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from restock.errors import ExitCode, RestockError
 from restock.interrupts import interrupts_raised
+from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.config import GIVEN
-from restock.train.dqn.loss import Loss
 from restock.train.dqn.network import clone
 from restock.train.dqn.target import Hard
 from restock.train.evaluation.evaluate import (
@@ -292,13 +292,12 @@ def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
         return
     for _ in range(count):
         batch = draw()
-        expert, return_to_go = session.log_terms.rows(batch.log_rows)
+        expert = session.log_terms.expert_rows(batch.log_rows)
         loss = learner.update(
             batch.rows,
             weight=batch.weight,
             logged=batch.logged,
             conservative=conservative,
-            return_to_go=return_to_go,
             expert=expert,
             labelled=None if imitation is None else imitation.draw_online(),
         )

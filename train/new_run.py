@@ -27,7 +27,6 @@ def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
 
     Raises:
         ConfigError: as the module says; names the setting.
-        PanelError: `loss.calibrated` without a return-to-go in the panel.
     """
     _refuse_no_effect(config)
     check_terms(config.loss, panel)

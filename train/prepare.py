@@ -23,8 +23,8 @@ from restock.replay.panel.panel import Panel
 from restock.toml import read_toml
 from restock.train import loop
 from restock.train.dqn.config import GIVEN, TrainConfig, apply_overrides, load_config, parse_config
+from restock.train.dqn.kernel import update_path
 from restock.train.dqn.learner import open_device
-from restock.train.dqn.manual_backprop import update_path
 from restock.train.dqn.target import describe
 from restock.train.evaluation.evaluate import evaluation_time_s
 from restock.train.feed.collector import conditions_in_twin
@@ -422,7 +422,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
         "config": msgspec.to_builtins(config),
         "panel": fed,
         "target": describe(config.target),
-        "update_path": update_path(config.network, config.device, config.threads),
+        "update_path": update_path(config.device, config.threads),
         **profile_document(profile),
         # Conditions of logs alone, with the signals that the twin does not fill.
         "not_evaluated": conditions_in_twin(

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from restock.errors import MixtureError
 from restock.replay.ring.ring import FreshRing
+from restock.train.dqn.algorithm import Loss
 from restock.train.dqn.behaviour import Labelled
 from restock.train.dqn.captured_update import CapturedUpdates, Launched, UpdateBlock
 from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.learner import Learner
-from restock.train.dqn.loss import Loss
 from restock.train.feed.batches import Batches, ReplayBatch
 from restock.train.feed.imitation import Imitation
 from restock.train.feed.logs import LogTerms
@@ -78,10 +78,9 @@ class UpdateBlocks:
             self._table = DeviceTable(None if logs is None else logs.rows, ring, learner.device)
         self._logs = 0 if logs is None else len(logs)
 
-        def of_table(of_logs: Tensor | None) -> Tensor | None:
-            if of_logs is None:
-                return None
-            return torch.cat([of_logs, of_logs.new_zeros(ring.capacity)])
+        expert = log_terms.expert
+        if expert is not None:
+            expert = torch.cat([expert, expert.new_zeros(ring.capacity)])
 
         self._updates = CapturedUpdates(
             learner,
@@ -92,8 +91,7 @@ class UpdateBlocks:
             labelled=0 if imitation is None else imitation.batch_size,
             has_conservative=logs is not None
             and max(config.loss.conservative, config.loss.conservative_online) > 0,
-            expert=of_table(log_terms.expert),
-            return_to_go=of_table(log_terms.return_to_go),
+            expert=expert,
         )
 
     def make(

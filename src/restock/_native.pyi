@@ -11,18 +11,6 @@ class Network:
     def forward(self, inputs: tuple[Any, ...], out: Any, /) -> None: ...
     def backward(self, gradient: Any, /) -> None: ...
 
-def td_loss(
-    q: Any,
-    next_target_q: Any,
-    chooses: Any,
-    plausible: Any,
-    tail: Any,
-    weight: Any,
-    delta: float,
-    gradient: Any,
-    out: Any,
-    /,
-) -> None: ...
 def adam(
     values: Any,
     gradient: Any,

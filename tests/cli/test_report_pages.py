@@ -71,7 +71,7 @@ def arms(tmp_path: Path, success: tuple[float, float], **changes: Any) -> tuple[
 
 
 def test_a_comparison_has_a_page_with_the_verdict_first(tmp_path: Path) -> None:
-    plain, dueling = arms(tmp_path, (0.2, 0.7), config__network__dueling=True)
+    plain, dueling = arms(tmp_path, (0.2, 0.7), config__network__layer_norm=False)
     page = tmp_path / "deep" / "page.html"
     assert main(["compare", *plain, "--against", *dueling, "--page", str(page)]) == 0
     found = read(page)

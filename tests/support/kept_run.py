@@ -10,9 +10,10 @@ import torch
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.panel.panel import Panel
-from restock.train.dqn.config import NetworkConfig, TrainConfig
+from restock.train.dqn.algorithm import DQN
+from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
 from restock.train.dqn.fitted_q import FittedQConfig
-from restock.train.dqn.network import QNetwork, make_network
+from restock.train.dqn.network import QNetwork
 from restock.train.run import checkpoint
 from restock.train.run.run import Run, panel_document
 
@@ -24,7 +25,9 @@ QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloni
 def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> QNetwork:
     """What `kept_run` keeps: random weights, seed 0."""
     generator = torch.Generator().manual_seed(0)
-    return make_network(settings, task.observation_size, len(task.actions), generator)
+    return DQN(LossConfig()).make_network(
+        settings, task.observation_size, len(task.actions), generator
+    )
 
 
 def kept_run(

@@ -56,9 +56,7 @@ def learnt(settings: TrainConfig, updates: int = 500, **given: object) -> np.nda
         return learner.network(torch.eye(STATES)).numpy()
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"loss__double": False}, {"network__dueling": True}], ids=str
-)
+@pytest.mark.parametrize("settings", [{}, {"loss__double": False}], ids=str)
 def test_values_agree_with_value_iteration(settings: dict[str, object]) -> None:
     np.testing.assert_allclose(learnt(config(**settings)), corridor()[1], atol=0.06)
 
@@ -72,13 +70,3 @@ def test_the_margin_makes_the_experts_action_the_best_even_where_it_is_not() -> 
         config(loss__margin=5.0), logged=len(rows), expert=torch.zeros(8, dtype=torch.bool)
     )
     np.testing.assert_allclose(none, corridor()[1], atol=0.06)
-
-
-def test_calibration_keeps_values_up_to_what_the_logs_got() -> None:
-    rows, q = corridor()
-    to_go = torch.tensor(q.max(axis=1).repeat(2), dtype=torch.float32)
-    given = {"logged": len(rows), "conservative": 1.0}
-    held_down = learnt(config(), **given)
-    calibrated = learnt(config(), **given, return_to_go=to_go)
-    worst = np.abs(calibrated.max(axis=1) - q.max(axis=1)).max()
-    assert worst < np.abs(held_down.max(axis=1) - q.max(axis=1)).max()

@@ -45,11 +45,14 @@ def compared(
 
 def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3), success=0.2, update_path="manual")
-    dueling = {"config__network__dueling": True, "update_path": "autograd"}  # one follows the other
-    second = arm(tmp_path, "b", range(3, 6), success=0.7, **dueling)
+    other = {
+        "config__network__layer_norm": False,
+        "update_path": "autograd",
+    }  # one follows the other
+    second = arm(tmp_path, "b", range(3, 6), success=0.7, **other)
     code, found = compared(capsys, first, second)
     assert (code, found["verdict"], found["outcomes_from"]) == (0, "comparable", "training")
-    assert [d["setting"] for d in found["differences"]] == ["config.network.dueling"]
+    assert [d["setting"] for d in found["differences"]] == ["config.network.layer_norm"]
     slip = next(row for row in found["outcomes"] if row["condition"] == "wheel_slip")
     assert (slip["episodes"], slip["runs"]) == (40, [3, 3])
     assert slip["difference"] == pytest.approx(0.5, abs=0.12)
@@ -59,7 +62,7 @@ def test_algorithms_fed_alike_are_compared(tmp_path, capsys) -> None:
 
 def test_no_difference_has_an_interval_around_zero(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(3))
-    second = arm(tmp_path, "b", range(3, 6), config__network__dueling=True)
+    second = arm(tmp_path, "b", range(3, 6), config__network__layer_norm=False)
     _, found = compared(capsys, first, second)
     for row in found["outcomes"]:
         assert row["difference_low"] < 0 < row["difference_high"]
@@ -326,7 +329,7 @@ def test_a_comparison_without_runs_or_of_an_unknown_treatment_is_refused(tmp_pat
 
 def test_runs_that_are_not_independent_seeds_are_refused(tmp_path, capsys) -> None:
     first = arm(tmp_path, "a", range(2))
-    second = arm(tmp_path, "b", range(2, 4), config__network__dueling=True)
+    second = arm(tmp_path, "b", range(2, 4), config__network__layer_norm=False)
     copied = str(shutil.copytree(first[0], tmp_path / "copied"))
     again = str(make_run(tmp_path / "again", document(1, created_ns=1)))
     for words, said in (

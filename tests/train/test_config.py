@@ -123,7 +123,6 @@ def test_the_option_that_is_wrong_is_named_as_it_was_given(
         ("teacher={source='none', mirror=true}", r"teacher\.mirror: has no effect where"),
         ("env.missions_share=0.9", r"env\.missions_share: has no effect without missions"),
         ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
-        ("loss.calibrated=true", r"apply to logged rows, but this run has no logs"),
     ],
 )
 def test_what_a_run_could_not_do_is_refused_before_its_folder_is_made(

@@ -129,7 +129,6 @@ def test_the_clocks_of_dqn_are_the_configs() -> None:
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("network.dueling=true", "does not have network.dueling"),
         ("guard.margin=0.1", "does not have guard.margin"),
         ("jump_start.env_steps=100", "does not have jump_start.env_steps"),
     ],

@@ -651,9 +651,8 @@ def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:
         for strata in ((), ("wheel_slip",))
     }
     for strata, chosen in (((), operator), (("wheel_slip",), operator & slips)):
-        expert, to_go = terms[strata].rows(np.arange(len(shelf)))
+        expert = terms[strata].expert_rows(np.arange(len(shelf)))
         assert expert is not None
-        assert to_go is None
         np.testing.assert_array_equal(expert.numpy(), chosen)
 
 
@@ -662,7 +661,6 @@ def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:
     [
         ({"margin": 1.0, "margin_policies": ["nobody"]}, "have no 'nobody'"),
         ({"margin": 1.0, "margin_strata": ["ice"]}, "have no 'ice'"),
-        ({"calibrated": True}, "needs logs from a panel"),
     ],
 )
 def test_terms_that_the_logs_cannot_serve_are_refused(
@@ -685,7 +683,7 @@ def test_drivers_that_a_margin_may_name_are_listed_once(tmp_path: Path) -> None:
 def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
     settings = config(
         loss={"margin": 0.5, "conservative": 0.1},
-        network={"hidden": [16], "dueling": True},
+        network={"hidden": [16]},
         schedule={**SMALL["schedule"], "env_steps": 800},
     )
     whole = run_to_end(tmp_path / "whole", settings)

@@ -13,11 +13,8 @@ import torch
 from torch import Tensor
 
 from restock import native
-from restock.train.dqn.config import parse_config
 from restock.train.dqn.flat_adam import FlatParameters
-from restock.train.dqn.loss import dqn_gradient, dqn_loss, td_target
-from restock.train.dqn.manual_backprop import ManualBackprop, update_path
-from restock.train.dqn.native_backprop import NativeBackprop, native_td_loss
+from restock.train.dqn.kernel import Kernel, update_path
 from restock.train.dqn.network import QNetwork, clone
 
 compiled = pytest.mark.skipif(not native.is_used(), reason=f"native code is {native.state()}")
@@ -38,9 +35,9 @@ def network(hidden: tuple[int, ...], layer_norm: bool) -> QNetwork:
     return made
 
 
-def made_native(held: QNetwork, *, wide: bool = True) -> NativeBackprop:
+def made_native(held: QNetwork, *, wide: bool = True) -> Kernel:
     flat = FlatParameters(held, learns=True)
-    return NativeBackprop(held, flat.values, flat.gradient, wide=wide)
+    return Kernel(held, flat.values, flat.gradient, wide=wide)
 
 
 @compiled
@@ -64,8 +61,10 @@ def test_values_and_gradients_are_autograds(
         expected.backward(gradient.double())
         found = []
         for made, backprop in both:
-            q, next_q = backprop.forward(now, after)
-            backprop.backward(gradient)
+            made.zero_grad(set_to_none=False)
+            next_q = backprop(after).detach()
+            q = backprop(now)
+            q.backward(gradient)
             torch.testing.assert_close(q.double(), expected.detach(), rtol=1e-4, atol=1e-5)
             torch.testing.assert_close(
                 next_q.double(), exact(after.double()).detach(), rtol=1e-4, atol=1e-5
@@ -82,57 +81,20 @@ def test_values_and_gradients_are_autograds(
 
 
 @compiled
-@pytest.mark.parametrize("double", [False, True])
-@pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("filtered", [False, True])
-def test_the_loss_is_that_of_pytorchs_operations(
-    double: bool, weighted: bool, filtered: bool
-) -> None:
-    q, slow, fast = (3 * normal(21, ACTIONS, seed=seed) for seed in (1, 2, 3))
-    fast[4, 2] = slow[4, 2] = torch.nan  # the largest of all, as PyTorch has it
-    tail = normal(21, 9, seed=4)[:, 6:]
-    tail[:, 0] = torch.arange(21) % ACTIONS
-    action = tail[:, 0].long()
-    weight = normal(21, seed=5).abs() if weighted else None
-    plausible = normal(21, ACTIONS, seed=6) > -0.5 if filtered else None
-    if plausible is not None:
-        plausible[7] = False  # none at all: the first
-    chooses = fast if double else None
-    target = td_target(tail[:, 1], tail[:, 2], slow, chooses, plausible)
-    wanted = dqn_loss(q, action, target, weight=weight, huber_delta=1.0)
-    slope = dqn_gradient(wanted.td, action, ACTIONS, weight=weight, huber_delta=1.0)
-    loss, gradient = native_td_loss(
-        q, slow, chooses, plausible, tail, weight=weight, huber_delta=1.0
-    )
-    assert torch.isnan(wanted.td).sum() <= 1
-    for ours, theirs in ((loss.td, wanted.td), (loss.q, wanted.q), (gradient, slope)):
-        np.testing.assert_array_equal(ours.numpy(), theirs.numpy())
-    torch.testing.assert_close(loss.value, wanted.value, equal_nan=True)
-
-
-@compiled
 def test_a_network_that_does_not_learn_is_evaluated_alone() -> None:
     still = clone(network((16, 16), layer_norm=True))
-    backprop = NativeBackprop(still, FlatParameters(still, learns=False).values)
-    (q,) = backprop.forward(normal(3, OBSERVATION, seed=0))
+    backprop = Kernel(still, FlatParameters(still, learns=False).values)
+    q = backprop(normal(3, OBSERVATION, seed=0))
     torch.testing.assert_close(q, still(normal(3, OBSERVATION, seed=0)))
-    with pytest.raises(RuntimeError, match="does not learn"):
-        backprop.backward(q)
+    assert not q.requires_grad
 
 
 @compiled
 def test_no_rows_have_no_gradient() -> None:
     held = network((16, 16), layer_norm=True)
     backprop = made_native(held)
-    (q,) = backprop.forward(normal(0, OBSERVATION, seed=0))
-    backprop.backward(q)
+    backprop(normal(0, OBSERVATION, seed=0)).sum().backward()
     assert all(not bool(one.grad.any()) for one in held.parameters() if one.grad is not None)
-
-
-@compiled
-def test_a_dueling_network_is_refused() -> None:
-    with pytest.raises(TypeError, match="plain"):
-        NativeBackprop(QNetwork(OBSERVATION, ACTIONS, dueling=True), torch.zeros(1))
 
 
 def floats(*shape: int) -> np.ndarray:
@@ -189,18 +151,6 @@ def test_what_does_not_fit_is_refused() -> None:
         with pytest.raises((TypeError, ValueError)):
             made.backward(gradient)
     made.backward(floats(3, 4))
-    sound: list[Any] = [floats(3, 4), floats(3, 4), floats(3, 4), None, floats(3, 3), None, 1.0]
-    sound += [floats(3, 4), floats(7)]
-    module.td_loss(*sound)
-    wrong = {0: floats(0, 4), 1: floats(3, 3), 2: floats(2, 4), 3: floats(3, 4), 4: floats(3, 2)}
-    for at, value in {**wrong, 5: floats(4), 7: floats(4, 4), 8: floats(6)}.items():
-        with pytest.raises((TypeError, ValueError)):
-            module.td_loss(*sound[:at], value, *sound[at + 1 :])
-    for action in (4, -1, np.nan, np.inf):
-        sound[4] = floats(3, 3)
-        sound[4][1, 0] = action
-        with pytest.raises(IndexError, match="row 1"):
-            module.td_loss(*sound)
     settings = (0.9, 0.999, 1e-3, 1.0, 1e-8, 0.5)
     module.adam(*(floats(5) for _ in range(5)), settings)
     for at in range(5):
@@ -211,10 +161,9 @@ def test_what_does_not_fit_is_refused() -> None:
 
 @compiled
 def test_the_compiled_way_is_that_of_one_thread() -> None:
-    plain = parse_config({}, where="test").network
-    assert update_path(plain, "cpu") == "native"
-    assert update_path(plain, "cpu", threads=2) == "manual"
-    assert update_path(plain, "cuda") == "manual"
+    assert update_path("cpu") == "native"
+    assert update_path("cpu", threads=2) == "autograd"
+    assert update_path("cuda") == "autograd"
 
 
 @compiled
@@ -249,7 +198,7 @@ main(["--version"])
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     path, _, told = done.stdout.splitlines()
-    assert path == "manual"
+    assert path == "autograd"
     assert told.startswith("native code not in use: ")
 
 
@@ -257,13 +206,28 @@ main(["--version"])
 def test_learning_at_twice_the_batch_is_what_pytorch_makes_of_it() -> None:
     """Memory grows with the batch, and a smaller one after it uses its beginning."""
     held = network((48, 48), layer_norm=True)
-    theirs = clone(held)
-    FlatParameters(theirs, learns=True)
-    manual, ours = ManualBackprop(theirs), made_native(held)
+    theirs = clone(held).requires_grad_()
+    ours = made_native(held)
     for rows in (8, 64, 16):
         given, gradient = normal(rows, OBSERVATION, seed=rows), normal(rows, ACTIONS, seed=1)
-        torch.testing.assert_close(ours.forward(given)[0], manual.forward(given)[0])
-        ours.backward(gradient)
-        manual.backward(gradient)
+        for each in (held, theirs):
+            each.zero_grad(set_to_none=False)
+        found, expected = ours(given), theirs(given)
+        torch.testing.assert_close(found, expected)
+        found.backward(gradient)
+        expected.backward(gradient)
         for one, other in zip(held.parameters(), theirs.parameters(), strict=True):
             torch.testing.assert_close(one.grad, other.grad, rtol=1e-4, atol=1e-4)
+
+
+@compiled
+def test_passes_that_another_one_followed_are_differentiated() -> None:
+    """As autograd does: gradients of two passes are added, in any order."""
+    held = network((16, 16), layer_norm=True)
+    theirs = clone(held).requires_grad_()
+    ours = made_native(held)
+    first, second = normal(5, OBSERVATION, seed=1), normal(9, OBSERVATION, seed=2)
+    (ours(first).square().mean() + ours(second).square().mean()).backward()
+    (theirs(first).square().mean() + theirs(second).square().mean()).backward()
+    for one, other in zip(held.parameters(), theirs.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, other.grad, rtol=1e-4, atol=1e-5)

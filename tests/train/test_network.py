@@ -1,4 +1,4 @@
-"""The Q network: shapes, LayerNorm, dueling, seeded initialisation."""
+"""The Q network: shapes, LayerNorm, seeded initialisation."""
 
 from __future__ import annotations
 
@@ -46,14 +46,6 @@ def test_layer_norm_bounds_values_far_from_the_data() -> None:
     direction = torch.ones(1, 5)
     near, far = network(direction * 1e2), network(direction * 1e6)
     assert float((near - far).detach().abs().max()) < 0.1
-
-
-def test_dueling_advantages_average_to_zero() -> None:
-    network = seeded(dueling=True)
-    observation = torch.randn(6, 5, generator=torch.Generator().manual_seed(0))
-    assert network.value is not None
-    value = network.value(network.body(observation)).squeeze(1)
-    assert torch.allclose(network(observation).mean(dim=1), value, atol=1e-6)
 
 
 def test_a_clone_is_apart_and_takes_no_gradients() -> None:

@@ -15,8 +15,8 @@ from support.stores import recording_transitions, write_store
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
-from restock.train.dqn.config import NetworkConfig
-from restock.train.dqn.network import make_network
+from restock.train.dqn.algorithm import DQN
+from restock.train.dqn.config import LossConfig, NetworkConfig
 from restock.train.evaluation.onnx_policy import OnnxPolicy, to_onnx
 
 onnx = pytest.importorskip("onnx")
@@ -24,10 +24,10 @@ runtime = pytest.importorskip("onnxruntime")
 TASK = load_profile("warehouse_amr").task
 
 
-@pytest.mark.parametrize("settings", [{}, {"layer_norm": False}, {"dueling": True}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"layer_norm": False}], ids=str)
 def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
     config = msgspec.convert({"hidden": [32, 24], **settings}, NetworkConfig)
-    network = make_network(config, 11, 5, torch.Generator().manual_seed(3))
+    network = DQN(LossConfig()).make_network(config, 11, 5, torch.Generator().manual_seed(3))
     session = runtime.InferenceSession(to_onnx(network).SerializeToString())
     observation = np.random.default_rng(0).normal(size=(64, 11)).astype(np.float32)
     values, action = session.run(["values", "action"], {"observation": observation})
@@ -97,7 +97,7 @@ def test_what_is_no_policy_of_this_task_is_refused(run: Path, tmp_path: Path, ca
     assert main(argv) == 2  # there already
     assert "already exists" in capsys.readouterr().err
     (tmp_path / "text.onnx").write_text("hello")
-    other = make_network(NetworkConfig(hidden=(4,)), 3, 2)
+    other = DQN(LossConfig()).make_network(NetworkConfig(hidden=(4,)), 3, 2)
     (tmp_path / "other.onnx").write_bytes(to_onnx(other).SerializeToString())
     for name, said in (
         ("missing.onnx", "no such file"),

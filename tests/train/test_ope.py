@@ -22,9 +22,9 @@ from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.train.dqn.config import NetworkConfig
+from restock.train.dqn.algorithm import DQN
+from restock.train.dqn.config import LossConfig, NetworkConfig
 from restock.train.dqn.fitted_q import soft_greedy
-from restock.train.dqn.network import make_network
 from restock.train.evaluation.off_policy.dataset import OpeSteps, load_ope_dataset, read_steps
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy
 
@@ -169,7 +169,7 @@ def _known(steps: OpeSteps) -> OpeSteps:
 
 
 def test_soft_greedy_is_a_distribution_with_its_probability_on_the_best() -> None:
-    network = make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
+    network = DQN(LossConfig()).make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
     observation = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     probability = soft_greedy(network, observation, 0.3)
     np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)

@@ -42,8 +42,8 @@ def test_settings_that_were_off_are_left_out() -> None:
     unused = {"loss": OFF["loss"] | {"munchausen_temperature": 0.5, "munchausen_floor": -9.0}}
     for old in (OFF, unused, {"loss": {"munchausen_floor": -2.0}}):
         assert parse_config(old, where="test") == TrainConfig()
-    kept = load_config(None, ["network.ensemble=1", "network.dueling=true", "loss.n_step=5"])
-    assert (kept.network.dueling, kept.loss.n_step) == (True, 5)
+    kept = load_config(None, ["network.ensemble=1", "network.layer_norm=false", "loss.n_step=5"])
+    assert (kept.network.layer_norm, kept.loss.n_step) == (False, 5)
 
 
 @pytest.mark.parametrize(
@@ -70,14 +70,14 @@ def test_an_old_run_is_compared_with_a_new_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = aged(make_run(tmp_path / "old", document(0)))
-    new = make_run(tmp_path / "new", document(1, config__network__dueling=True))
+    new = make_run(tmp_path / "new", document(1, config__network__layer_norm=False))
     assert main(["compare", str(old), "--against", str(new), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "comparable"
-    assert [row["setting"] for row in found["differences"]] == ["config.network.dueling"]
+    assert [row["setting"] for row in found["differences"]] == ["config.network.layer_norm"]
     assert main(["diff", str(old), str(new), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["settings"]
-    assert {row["setting"] for row in said} == {"config.seed", "config.network.dueling"}
+    assert {row["setting"] for row in said} == {"config.seed", "config.network.layer_norm"}
 
 
 def test_a_run_that_used_one_differs_by_it(

@@ -21,14 +21,14 @@ def test_what_moved_is_shown_where_compare_refuses(
 ) -> None:
     first = make_run(tmp_path / "a", document(0), success=0.2)
     second = make_run(
-        tmp_path / "b", document(1, config__network__dueling=True), success=0.7, slip_share=0.1
+        tmp_path / "b", document(1, config__network__layer_norm=False), success=0.7, slip_share=0.1
     )
     assert main(["compare", str(first), "--against", str(second), "--json"]) == 1
     capsys.readouterr()
     assert main(["diff", str(first), str(second), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     settings = {row["setting"]: (row["first"], row["second"]) for row in found["settings"]}
-    assert settings["config.network.dueling"] == (False, True)
+    assert settings["config.network.layer_norm"] == (True, False)
     fed = {(row["source"], row["condition"]): row for row in found["fed"]}
     slip = fed["logs", "wheel_slip"]
     assert (slip["share_a"], slip["share_b"]) == pytest.approx((0.15, 0.05))

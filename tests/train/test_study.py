@@ -39,7 +39,7 @@ references = []
 name = "plain"
 [[arms]]
 name = "dueling"
-settings = { network.dueling = true }
+settings = { network.layer_norm = false }
 """
 
 TWO = "[[arms]]\nname = 'a'\n[[arms]]\nname = 'b'\n"
@@ -57,7 +57,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
     (comparison,) = found["comparisons"]
     assert (comparison["arm"], comparison["baseline"]) == ("dueling", "plain")
     assert comparison["verdict"] in ("inconclusive", "incomparable")
-    assert [d["setting"] for d in comparison["differences"]] == ["config.network.dueling"]
+    assert [d["setting"] for d in comparison["differences"]] == ["config.network.layer_norm"]
     assert "Not compared" in (out / "study.md").read_text()
     made = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/*.parquet")}
     assert len({path.parent.name for path in made}) == 2
@@ -89,7 +89,7 @@ def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> Non
         *("plain-0", "dueling-0"),
         *("plain-7", "dueling-7"),
     ]
-    assert "network.dueling=true" in rows[1]["settings"]
+    assert "network.layer_norm=false" in rows[1]["settings"]
     assert not (tmp_path / "o").exists()
 
 
@@ -159,7 +159,7 @@ def test_a_finished_study_may_be_moved_and_a_changed_one_says_what_is_different(
 
 def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypatch) -> None:
     out = study_of_two_comparisons(tmp_path)
-    dueling = Difference("config.network.dueling", "algorithm", False, True)
+    dueling = Difference("config.network.layer_norm", "algorithm", True, False)
     own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
     def compared(first, second, *, treatment):
@@ -183,9 +183,9 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
         "method",
     )
     page = (out / "study.md").read_text()
-    assert 'they differ in config.network.dueling, which treatment = "algorithm"' in page
+    assert 'they differ in config.network.layer_norm, which treatment = "algorithm"' in page
     assert "## again against dueling" in page
-    assert "Not held: the algorithm (config.network.dueling, library.arguments)." in page
+    assert "Not held: the algorithm (config.network.layer_norm, library.arguments)." in page
 
 
 def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypatch) -> None:

@@ -29,11 +29,11 @@ from restock.report.run.facts import Facts
 from restock.state import restored, saved
 from restock.train.comparison.arms import differences
 from restock.train.describe import describe_run
+from restock.train.dqn.algorithm import td_target
 from restock.train.dqn.behaviour import (
     UNKNOWN,
     FilteredNetwork,
     Labelled,
-    imitation_gradient,
     imitation_loss,
     make_policy,
     plausible_actions,
@@ -41,7 +41,6 @@ from restock.train.dqn.behaviour import (
 from restock.train.dqn.config import GIVEN, TeacherConfig, parse_config
 from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.loss import td_target
 from restock.train.feed.imitation import Imitation, refuse_nothing_to_learn
 from restock.train.feed.teacher import TeacherFailed, open_teacher
 from restock.train.loop import TrainingInterrupted, train
@@ -101,16 +100,6 @@ def test_imitation_is_cross_entropy_over_the_states_with_an_answer() -> None:
     assert float(imitation_loss(logits, torch.full((3,), UNKNOWN))) == 0
 
 
-@pytest.mark.parametrize("known", [0, 1, 7, 16])
-def test_imitations_slope_is_autograds(known: int) -> None:
-    generator = torch.Generator().manual_seed(known)
-    logits = torch.randn(16, 5, generator=generator, dtype=torch.float64, requires_grad=True)
-    action = torch.randint(5, (16,), generator=generator)
-    action[known:] = UNKNOWN
-    (expected,) = torch.autograd.grad(imitation_loss(logits, action), logits)
-    torch.testing.assert_close(imitation_gradient(logits.detach(), action), expected)
-
-
 def learner(path: Any = None, **sections: dict[str, Any]) -> Learner:
     document: dict[str, Any] = {"network": {"hidden": (16,)}, "teacher": {"source": "logs"}}
     document |= sections
@@ -144,9 +133,8 @@ def test_learning_by_hand_is_learning_by_autograd(double: bool, target: str) -> 
         torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("dueling", [False, True])
-def test_every_kind_of_network_is_filtered(dueling: bool) -> None:
-    one = learner(network={"hidden": (16,), "dueling": dueling})
+def test_the_network_is_filtered() -> None:
+    one = learner(network={"hidden": (16,)})
     one.update(rows(0), labelled=Labelled(rows(1)[:, :6], torch.full((32,), FORWARD)))
     assert one.behaviour is not None
     one.behaviour.in_force = 1.0

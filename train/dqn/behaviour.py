@@ -19,10 +19,11 @@ from torch.nn import functional
 
 from restock.replay.mixture.schedules import value_at
 from restock.state import Stateful
+from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.manual_backprop import UpdatePath, make_backprop
-from restock.train.dqn.network import QNetwork, clone, make_network
+from restock.train.dqn.kernel import UpdatePath, differentiable
+from restock.train.dqn.network import QNetwork, clone
 
 UNKNOWN = -1  # the action of a state in which the teacher was not asked, or had no opinion
 _SEED = 1 << 32  # apart from that of Q, which may be as large
@@ -51,17 +52,6 @@ def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
     known = action != UNKNOWN
     each = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
     return each.sum() / known.sum().clamp_min(1)
-
-
-def imitation_gradient(logits: Tensor, action: Tensor) -> Tensor:
-    """Of `imitation_loss`, (M, A): (softmax - one-hot of the action) / known rows; 0 elsewhere."""
-    known = (action != UNKNOWN).unsqueeze(1)
-    chosen = action.clamp_min(0).unsqueeze(1)
-    gradient = logits.softmax(dim=1)
-    gradient.scatter_add_(1, chosen, gradient.new_full(chosen.shape, -1.0))
-    gradient *= known
-    gradient /= known.sum().clamp_min(1)
-    return gradient
 
 
 class FilteredNetwork(nn.Module):
@@ -128,7 +118,7 @@ def make_behaviour(
 
 def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
     """What a run's config says acts, to load weights into."""
-    values = make_network(config.network, observation_size, actions)
+    values = make_network(config, observation_size, actions)
     if not config.teacher.filters:
         return values
     return FilteredNetwork(values, make_behaviour(config.teacher, observation_size, actions))
@@ -139,7 +129,7 @@ class Behaviour(Stateful):
 
     Args:
         averaging: the rate of the average of weights, as of Q's.
-        path: which way gradients are made.
+        path: how its network is differentiated.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("network", "average", "optimizer", "updates", "in_force")
@@ -162,7 +152,7 @@ class Behaviour(Stateful):
         self.optimizer = FlatAdam(self.network, config.learning_rate, compiled=path == "native")
         self._slow = FlatParameters(self.average, learns=False).values
         learns = self.optimizer
-        self._by_hand = make_backprop(path, self.network, learns.values, learns.gradient)
+        self._logits = differentiable(path, self.network, learns.values, learns.gradient)
         self.updates = 0
         self.ratio = torch.zeros((), device=device)  # shared with the networks that it filters
         self.move_to(0)
@@ -207,22 +197,14 @@ class Behaviour(Stateful):
         return [*self.optimizer.moved, self._slow]
 
     def _fill_gradient(self, labelled: Labelled) -> None:
-        if self._by_hand is not None:
-            (logits,) = self._by_hand.forward(labelled.observation)
-            self._by_hand.backward(imitation_gradient(logits, labelled.action))
-        else:
-            self.optimizer.gradient.zero_()
-            loss = imitation_loss(self.network(labelled.observation), labelled.action)
-            loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.gradient.zero_()
+        loss = imitation_loss(self._logits(labelled.observation), labelled.action)
+        loss.backward()  # type: ignore[no-untyped-call]
 
     @torch.no_grad()
     def plausible(self, observation: Tensor) -> Tensor:
         """Which actions (B, A) bool are plausible in observations (B, D)."""
-        if self._by_hand is not None:
-            (logits,) = self._by_hand.forward(observation)
-        else:
-            logits = self.network(observation)
-        return plausible_actions(logits, self.ratio)
+        return plausible_actions(self._logits(observation), self.ratio)
 
 
 __all__ = [
@@ -232,7 +214,6 @@ __all__ = [
     "Labelled",
     "PolicyNetwork",
     "ProposedNetwork",
-    "imitation_gradient",
     "imitation_loss",
     "make_policy",
     "plausible_actions",

@@ -86,7 +86,6 @@ class CapturedUpdates:
         labelled: M of the behaviour network's batches; 0: none.
         has_conservative: whether the CQL term may come in.
         expert: (n,) bool, where the margin term applies; None: nowhere.
-        return_to_go: (n,) float32, Cal-QL's floor; None: none.
     """
 
     def __init__(
@@ -100,11 +99,10 @@ class CapturedUpdates:
         labelled: int = 0,
         has_conservative: bool = False,
         expert: Tensor | None = None,
-        return_to_go: Tensor | None = None,
     ) -> None:
         self.learner, self.table, self.longest = learner, table, longest
         self._has_conservative = has_conservative
-        self._expert, self._return_to_go = expert, return_to_go
+        self._expert = expert
         device, batch = learner.device, (longest, batch_size)
         self._place = torch.arange(batch_size, device=device)
         self._cursor = torch.zeros(1, dtype=torch.int64, device=device)
@@ -182,7 +180,6 @@ class CapturedUpdates:
             weight=self._now(self._weight),
             logged=len(rows),
             conservative=is_logged * conservative if self._has_conservative else 0.0,
-            return_to_go=None if self._return_to_go is None else self._return_to_go[row],
             expert=expert,
         )
         labelled = None
@@ -193,7 +190,7 @@ class CapturedUpdates:
         tail = rows[:, -3:].T
         per_row = torch.cat([loss.td.unsqueeze(0), loss.q.unsqueeze(0), tail])
         self._per_row.index_copy_(0, self._cursor, per_row.unsqueeze(0))
-        self._loss.index_copy_(0, self._cursor, loss.value.detach().view(1))
+        self._loss.index_copy_(0, self._cursor, loss.value.view(1))
         self._cursor.add_(1)
 
     def _captured(self, labels: bool) -> torch.cuda.CUDAGraph:

@@ -41,7 +41,6 @@ Seed = Annotated[int, Meta(ge=0, le=LAST_SEED)]
 class NetworkConfig(Checked, frozen=True):
     hidden: tuple[Count, ...] = (256, 256)  # widths of the layers
     layer_norm: bool = True
-    dueling: bool = False
 
     def check(self) -> None:
         if not self.hidden:
@@ -49,6 +48,7 @@ class NetworkConfig(Checked, frozen=True):
 
 
 class LossConfig(Checked, frozen=True):
+    algorithm: str = "dqn"  # or your own, as module:name; docs/extending.md
     discount: Annotated[float, Meta(ge=0, lt=1)] = 0.99  # per step; must be that of the panel
     n_step: Count = 3  # steps of fresh rows' returns; the panel has its own
     double: bool = True
@@ -56,7 +56,6 @@ class LossConfig(Checked, frozen=True):
     conservative: NonNegative = 0.1  # weight of the CQL term on rows from logs, while offline
     conservative_online: NonNegative = 0.0  # weight that it changes to, linearly, when online
     conservative_steps: Count = 20_000  # environment steps of that change
-    calibrated: bool = False  # Cal-QL: bounds the CQL term by the logs' return-to-go
     margin: NonNegative = 0.0  # weight of DQfD's large margin on logged rows of `margin_policies`
     margin_size: NonNegative = 0.8  # the margin: how much better their action must be
     margin_policies: tuple[str, ...] = ("operator",)  # behaviour policies with the margin

@@ -13,30 +13,13 @@ from torch import Tensor
 
 from restock.errors import ConfigError
 from restock.state import Stateful
+from restock.train.dqn.algorithm import Loss, TrainingBatch, make_algorithm
 from restock.train.dqn.behaviour import Behaviour, FilteredNetwork, Labelled, PolicyNetwork
-from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
+from restock.train.dqn.config import TrainConfig
 from restock.train.dqn.flat_adam import FlatAdam, FlatParameters, averaging_rate
-from restock.train.dqn.loss import (
-    Loss,
-    conservative_gradient,
-    conservative_penalty,
-    dqn_gradient,
-    dqn_loss,
-    margin_gradient,
-    margin_penalty,
-    td_target,
-)
-from restock.train.dqn.manual_backprop import (
-    ManualBackprop,
-    UpdatePath,
-    make_backprop,
-    update_path,
-)
-from restock.train.dqn.native_backprop import NativeBackprop, native_td_loss
-from restock.train.dqn.network import QNetwork, clone, make_network
+from restock.train.dqn.kernel import UpdatePath, differentiable, update_path
+from restock.train.dqn.network import clone
 from restock.train.dqn.target import Polyak, TargetUpdate
-
-_ByHand = ManualBackprop | NativeBackprop
 
 
 @dataclass(frozen=True)
@@ -46,12 +29,7 @@ class Terms:
     weight: Tensor | None  # (B,) importance weights; None: ones
     logged: int  # how many of the first rows the terms below apply to
     conservative: float | Tensor  # weight of the CQL term, or that of each such row (logged,)
-    return_to_go: Tensor | None  # (logged,)
     expert: Tensor | None  # (logged,) bool
-
-    @property
-    def has_conservative(self) -> bool:
-        return isinstance(self.conservative, Tensor) or self.conservative > 0
 
 
 class Learner(Stateful):
@@ -81,8 +59,8 @@ class Learner(Stateful):
     ) -> None:
         """`path` None takes the fastest that the config allows; both agree but for rounding."""
         self.device = open_device(config.device)
-        self.loss: LossConfig = config.loss
-        self.network: QNetwork = make_network(
+        self.algorithm = make_algorithm(config.loss)
+        self.network = self.algorithm.make_network(
             config.network,
             observation_size,
             actions,
@@ -90,7 +68,7 @@ class Learner(Stateful):
         ).to(self.device)
         self.target_network = clone(self.network)
         self.policy_network = clone(self.network)
-        self.path = path or update_path(config.network, config.device, config.threads)
+        self.path = path or update_path(config.device, config.threads)
         self.optimizer = FlatAdam(
             self.network,
             config.optimizer.learning_rate,
@@ -102,8 +80,9 @@ class Learner(Stateful):
         self.target = TargetUpdate(config.target, [self.optimizer.values], [self._slow])
         self.averaging = config.evaluation.averaging
         learns = self.optimizer
-        self._backprop = make_backprop(self.path, self.network, learns.values, learns.gradient)
-        self._target_backprop = make_backprop(self.path, self.target_network, self._slow)
+        # What the loss is computed with: the networks, or kernels that do the same.
+        self._online = differentiable(self.path, self.network, learns.values, learns.gradient)
+        self._target = differentiable(self.path, self.target_network, self._slow)
         self.gradient_steps = 0
         self.behaviour: Behaviour | None = None
         self._acting: PolicyNetwork = self.network
@@ -116,8 +95,7 @@ class Learner(Stateful):
                 seed=config.seed,
                 averaging=self.averaging,
                 device=self.device,
-                # Its network is plain, whatever Q's is.
-                path=path or update_path(NetworkConfig(), config.device, config.threads),
+                path=self.path,
             )
             ratio = self.behaviour.ratio
             self._acting = FilteredNetwork(self.network, self.behaviour.network, ratio)
@@ -131,7 +109,6 @@ class Learner(Stateful):
         weight: Tensor | None = None,
         logged: int = 0,
         conservative: float = 0.0,
-        return_to_go: Tensor | None = None,
         expert: Tensor | None = None,
         labelled: Labelled | None = None,
     ) -> Loss:
@@ -142,11 +119,10 @@ class Learner(Stateful):
             weight: (B,) importance weights, or None for ones.
             logged: how many of the first rows are from logs; the conservative term sees only those.
             conservative: the weight of that term.
-            return_to_go: (logged,) what the logs got from each of them on, for Cal-QL.
             expert: (logged,) bool, whether the margin term applies, or None: to none.
             labelled: what the behaviour network learns from, where there is one.
         """
-        terms = Terms(weight, logged, conservative if logged else 0.0, return_to_go, expert)
+        terms = Terms(weight, logged, conservative if logged else 0.0, expert)
         loss = self._fill_gradient(rows, terms)
         self.gradient_steps += 1
         # `policy_network`, the one that is evaluated and kept, follows as an average of weights.
@@ -196,75 +172,22 @@ class Learner(Stateful):
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 
     def _fill_gradient(self, rows: Tensor, terms: Terms) -> Loss:
-        if self._backprop is not None and self._target_backprop is not None:
-            return self._by_hand(self._backprop, self._target_backprop, rows, terms)
-        return self._by_autograd(rows, terms)
-
-    def _by_autograd(self, rows: Tensor, terms: Terms) -> Loss:
-        """Fill the gradient from a graph: any network."""
-        observation, next_observation, action, reward, discount = unpack(
-            rows, self.network.observation_size
-        )
-        target = self._target(self.target_network, next_observation, reward, discount)
-        logged, share = terms.logged, terms.logged / len(rows)
-        q = self.network(observation)
-        loss = dqn_loss(q, action, target, weight=terms.weight, huber_delta=self.loss.huber_delta)
-        value = loss.value
-        if terms.has_conservative:
-            term = conservative_penalty(
-                q[:logged], action[:logged], terms.return_to_go, terms.conservative
-            )
-            value = value + term * share
-        if terms.expert is not None:
-            term = margin_penalty(q[:logged], action[:logged], terms.expert, self.loss.margin_size)
-            value = value + self.loss.margin * term * share
         self.optimizer.gradient.zero_()
-        value.backward()  # type: ignore[no-untyped-call]
-        return loss
+        loss = self.algorithm.loss(self._online, self._target, self._batch(rows, terms))
+        descended = loss.value if loss.penalty is None else loss.value + loss.penalty
+        descended.backward()  # type: ignore[no-untyped-call]
+        return Loss(loss.value.detach(), loss.td, loss.q)
 
-    @torch.no_grad()
-    def _by_hand(self, online: _ByHand, slow: _ByHand, rows: Tensor, terms: Terms) -> Loss:
-        """Fill the gradient by hand: the plain network, with every term of the loss."""
-        size, settings, logged = self.network.observation_size, self.loss, terms.logged
-        observation, next_observation, action, reward, discount = unpack(rows, size)
-        # Of Double DQN s and s' go through the online network together.
-        inputs = (observation, next_observation) if settings.double else (observation,)
-        q, *following = online.forward(*inputs)
-        next_q = following[0] if following else None
-        (slow_q,) = slow.forward(next_observation)
-        plausible = self._plausible(next_observation)
-        weight, delta = terms.weight, settings.huber_delta
-        if self.path == "native":
-            loss, gradient = native_td_loss(
-                *(q, slow_q, next_q, plausible, rows[:, 2 * size :]),
-                weight=weight,
-                huber_delta=delta,
-            )
-        else:
-            target = td_target(reward, discount, slow_q, next_q, plausible)
-            loss = dqn_loss(q, action, target, weight=weight, huber_delta=delta)
-            gradient = dqn_gradient(loss.td, action, q.shape[1], weight=weight, huber_delta=delta)
-        share = logged / len(rows)
-        if terms.has_conservative:
-            term = conservative_gradient(q[:logged], action[:logged], terms.return_to_go)
-            if isinstance(terms.conservative, Tensor):
-                gradient[:logged].addcmul_(term, terms.conservative.unsqueeze(1), value=share)
-            else:
-                gradient[:logged].add_(term, alpha=terms.conservative * share)
-        if terms.expert is not None:
-            term = margin_gradient(q[:logged], action[:logged], terms.expert, settings.margin_size)
-            gradient[:logged].add_(term, alpha=settings.margin * share)
-        online.backward(gradient)
-        return loss
-
-    @torch.no_grad()
-    def _target(
-        self, slow: QNetwork, next_observation: Tensor, reward: Tensor, discount: Tensor
-    ) -> Tensor:
-        """What Q(s, a) should be, (B,), where `slow` evaluates the next action."""
-        next_q = self.network(next_observation) if self.loss.double else None
-        plausible = self._plausible(next_observation)
-        return td_target(reward, discount, slow(next_observation), next_q, plausible)
+    def _batch(self, rows: Tensor, terms: Terms) -> TrainingBatch:
+        parts = unpack(rows, self.network.observation_size)
+        return TrainingBatch(
+            *parts,
+            weight=terms.weight,
+            plausible=self._plausible(parts[1]),
+            logged=terms.logged,
+            conservative=terms.conservative,
+            expert=terms.expert,
+        )
 
     def _plausible(self, next_observation: Tensor) -> Tensor | None:
         """The actions (B, A) that the target's maximum may look at; None: all."""
@@ -286,13 +209,10 @@ class Learner(Stateful):
 
         `online` lets the online network bootstrap y, as if the target's clock did not lag.
         """
-        observation, next_observation, action, reward, discount = unpack(
-            rows, self.network.observation_size
-        )
+        batch = self._batch(rows, Terms(None, 0, 0.0, None))
         slow = self.network if online else self.target_network
-        target = self._target(slow, next_observation, reward, discount)
-        q: Tensor = self.network(observation)
-        return dqn_loss(q, action, target).td, q, self.target_network(observation)
+        td = self.algorithm.loss(self.network, slow, batch).td
+        return td, self.network(batch.observation), self.target_network(batch.observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
         """The best action (N,) of each observation (N, D), among the plausible ones."""

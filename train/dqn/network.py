@@ -2,20 +2,16 @@
 
 A LayerNorm MLP. LayerNorm bounds how far values can extrapolate away from the data, which is what
 keeps off-policy learning on logs and fresh experience together stable (RLPD, arXiv:2302.02948).
-`dueling` splits the head into a value and advantages (arXiv:1511.06581).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
-
-if TYPE_CHECKING:
-    from restock.train.dqn.config import NetworkConfig
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -30,7 +26,6 @@ class QNetwork(nn.Module):
         *,
         hidden: Sequence[int] = (256, 256),
         layer_norm: bool = True,
-        dueling: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
@@ -45,7 +40,6 @@ class QNetwork(nn.Module):
             width = size
         self.body = nn.Sequential(*layers)
         self.advantage = nn.Linear(width, actions)
-        self.value = nn.Linear(width, 1) if dueling else None
         self._initialise(generator)
 
     def _initialise(self, generator: torch.Generator | None) -> None:
@@ -60,28 +54,8 @@ class QNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """Action values (B, A)."""
         features = self.body(observation)
-        advantage: Tensor = self.advantage(features)
-        if self.value is None:
-            return advantage
-        value: Tensor = self.value(features)
-        return value + advantage - advantage.mean(dim=1, keepdim=True)
-
-
-def make_network(
-    config: NetworkConfig,
-    observation_size: int,
-    actions: int,
-    generator: torch.Generator | None = None,
-) -> QNetwork:
-    """The network that a run's config asks for."""
-    return QNetwork(
-        observation_size,
-        actions,
-        hidden=config.hidden,
-        layer_norm=config.layer_norm,
-        dueling=config.dueling,
-        generator=generator,
-    )
+        values: Tensor = self.advantage(features)
+        return values
 
 
 def clone(network: N) -> N:

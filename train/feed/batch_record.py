@@ -20,7 +20,7 @@ from restock.arrays import F32, Ints
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.share_controller import ShareController
 from restock.state import Stateful
-from restock.train.dqn.loss import Loss
+from restock.train.dqn.algorithm import Loss
 from restock.train.feed import interval_tables
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.fresh_log import FreshPerturbations

@@ -162,7 +162,6 @@ class LogTerms:
     """Per row of the panel, on the learner's device; None where no term asks."""
 
     expert: Tensor | None  # (n,) bool: DQfD's margin applies
-    return_to_go: Tensor | None  # (n,) float32: Cal-QL's floor
 
     @classmethod
     def of(cls, loss: LossConfig, logs: Logs | None, device: torch.device) -> LogTerms:
@@ -171,31 +170,20 @@ class LogTerms:
         Raises:
             ConfigError: it names a behaviour policy or stratum that they do not have, or there are
                 no logs.
-            PanelError: Cal-QL without a return-to-go in the panel.
         """
         if logs is None:
             _refuse_without_logs(loss)
-            return cls(None, None)
-        expert = to_go = None
+            return cls(None)
+        expert = None
         if loss.margin:
             expert = torch.from_numpy(_expert(loss, logs)).to(device)
-        if loss.calibrated:
-            if logs.panel is None:
-                raise ConfigError("loss.calibrated needs logs from a panel")
-            to_go = torch.from_numpy(np.array(logs.panel.return_to_go)).to(device)
-        return cls(expert, to_go)
+        return cls(expert)
 
-    def rows(self, log_rows: Ints) -> tuple[Tensor | None, Tensor | None]:
-        """`expert` and `return_to_go` of some rows of the panel."""
-        if self.expert is None and self.return_to_go is None:
-            return None, None
-        index = torch.from_numpy(log_rows)
-        return (
-            None if self.expert is None else self.expert[index.to(self.expert.device)],
-            None
-            if self.return_to_go is None
-            else self.return_to_go[index.to(self.return_to_go.device)],
-        )
+    def expert_rows(self, log_rows: Ints) -> Tensor | None:
+        """Return `expert` of some rows of the panel."""
+        if self.expert is None:
+            return None
+        return self.expert[torch.from_numpy(log_rows).to(self.expert.device)]
 
 
 def check_terms(loss: LossConfig, panel: Panel | None) -> None:
@@ -206,15 +194,13 @@ def check_terms(loss: LossConfig, panel: Panel | None) -> None:
     if loss.margin:
         policy = Coded.of(panel.meta["behaviour_policy"])
         _refuse_unknown(loss, policy.names, [stratum.name for stratum in panel.strata])
-    if loss.calibrated:
-        _ = panel.return_to_go  # raises PanelError where it has none
 
 
 def _refuse_without_logs(loss: LossConfig) -> None:
-    if loss.margin or loss.calibrated:
+    if loss.margin:
         raise ConfigError(
-            "loss.margin and loss.calibrated apply to logged rows, but this run has no logs",
-            remedy="give --panel, or leave them out",
+            "loss.margin applies to logged rows, but this run has no logs",
+            remedy="give --panel, or leave it out",
         )
 
 

@@ -25,8 +25,9 @@ from restock.imports import installed
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.interrupts import kill_as_interrupt
+from restock.train.dqn.algorithm import make_network
 from restock.train.dqn.config import NetworkConfig, TrainConfig, load_config
-from restock.train.dqn.network import QNetwork, make_network
+from restock.train.dqn.network import QNetwork
 from restock.train.dqn.target import Hard, describe
 from restock.train.evaluation.evaluate import (
     Score,
@@ -76,7 +77,6 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
     refused = [
         name
         for name, bad in (
-            ("network.dueling", config.network.dueling),
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
             ("guard.margin", config.guard.margin is not None),
@@ -208,7 +208,7 @@ def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
     """A library's layers, in order, as Restock's network: the same numbers for the same input."""
     import torch
 
-    network = make_network(config.network, task.observation_size, len(task.actions))
+    network = make_network(config, task.observation_size, len(task.actions))
     layers = [module for module in network.modules() if isinstance(module, torch.nn.Linear)]
     with torch.no_grad():
         for layer, given in zip(layers, linears, strict=True):

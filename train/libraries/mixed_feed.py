@@ -22,7 +22,7 @@ from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
-from restock.train.dqn.loss import Loss
+from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batch_record import FeedRecord, row_ids
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin

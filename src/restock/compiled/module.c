@@ -19,7 +19,6 @@
 #include "surroundings.h"
 
 static PyMethodDef module_methods[] = {
-    {"td_loss", td_loss, METH_VARARGS, td_loss_doc},
     {"adam", adam, METH_VARARGS, adam_doc},
     {"gather", gather, METH_VARARGS, gather_doc},
     {"find_places", find_places, METH_VARARGS, find_places_doc},

@@ -1,0 +1,272 @@
+"""The seam for value-based algorithms, and DQN, written once as PyTorch.
+
+    y_i     = r_i + d_i * Q_target(s'_i, argmax_a Q(s'_i, a))        Double DQN, arXiv:1509.06461
+    delta_i = Q(s_i, a_i) - y_i
+    L       = mean_i w_i * huber(delta_i)
+
+`d_i` is the discount of row i: gamma**n for an n-step row that bootstraps, 0 for one that
+terminated. A truncated episode bootstraps: its d is not 0.
+
+`loss.algorithm` of a run's config names an entry of `ALGORITHMS`, or your own as `module:name`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from restock.errors import ConfigError
+from restock.train.dqn.network import QNetwork
+
+if TYPE_CHECKING:
+    from restock.train.dqn.config import LossConfig, NetworkConfig, TrainConfig
+
+
+@dataclass(frozen=True)
+class TrainingBatch:
+    """What one update learns from. Rows from logs come first."""
+
+    observation: Tensor  # (B, D) float32
+    next_observation: Tensor  # (B, D) float32
+    action: Tensor  # (B,) int64
+    reward: Tensor  # (B,) float32, the sum of the row's n discounted rewards
+    discount: Tensor  # (B,) float32, gamma**n where the row bootstraps, else 0
+    weight: Tensor | None = None  # (B,) importance weights; None: ones
+    plausible: Tensor | None = None  # (B, A) bool, actions at s' to choose from; None: all
+    logged: int = 0  # L, how many of the first rows are from logs
+    conservative: float | Tensor = 0.0  # weight of the CQL term, or that of each logged row (L,)
+    expert: Tensor | None = None  # (L,) bool, rows with the margin term; None: none
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What one batch cost, and the parts that the record of the run keeps."""
+
+    value: Tensor  # () float32, with gradient
+    td: Tensor  # (B,) float32, Q(s, a) - y, without gradient
+    q: Tensor  # (B,) float32, Q(s, a), without gradient
+    penalty: Tensor | None = None  # () float32, minimised with `value`, not recorded
+
+
+class Algorithm(Protocol):
+    """How values are learnt. Made from a run's `LossConfig`.
+
+    The greedy action is the best value of the network, among the plausible ones if a teacher
+    filters: one rule for the twin, evaluation and ONNX.
+    """
+
+    def make_network(
+        self,
+        config: NetworkConfig,
+        observation_size: int,
+        actions: int,
+        generator: torch.Generator | None = None,
+    ) -> QNetwork:
+        """Return a network whose `forward` gives action values (B, A) of observations (B, D)."""
+        ...
+
+    def loss(self, network: Any, target: Any, batch: TrainingBatch) -> Loss:
+        """Return the loss of `network` on a batch; `target` is its slow copy.
+
+        Both are what `make_network` returned. A plain `QNetwork` may be replaced by a compiled
+        function that gives the same values and gradients.
+        """
+        ...
+
+
+class DQN:
+    """Double DQN with Huber's loss, and the CQL and margin terms on logged rows."""
+
+    def __init__(self, settings: LossConfig) -> None:
+        self.settings = settings
+
+    def make_network(
+        self,
+        config: NetworkConfig,
+        observation_size: int,
+        actions: int,
+        generator: torch.Generator | None = None,
+    ) -> QNetwork:
+        """Return a multilayer perceptron with one output an action."""
+        return QNetwork(
+            observation_size,
+            actions,
+            hidden=config.hidden,
+            layer_norm=config.layer_norm,
+            generator=generator,
+        )
+
+    def loss(
+        self,
+        network: Callable[[Tensor], Tensor],
+        target: Callable[[Tensor], Tensor],
+        batch: TrainingBatch,
+    ) -> Loss:
+        """Return the loss on a batch; `value` is the TD part, `penalty` the other terms."""
+        with torch.no_grad():
+            next_online_q = network(batch.next_observation) if self.settings.double else None
+            wanted = td_target(
+                batch.reward,
+                batch.discount,
+                target(batch.next_observation),
+                next_online_q,
+                batch.plausible,
+            )
+        q = network(batch.observation)
+        delta = self.settings.huber_delta
+        loss = dqn_loss(q, batch.action, wanted, weight=batch.weight, huber_delta=delta)
+        return Loss(loss.value, loss.td, loss.q, self._penalty(q, batch))
+
+    def _penalty(self, q: Tensor, batch: TrainingBatch) -> Tensor | None:
+        """Sum the terms on logged rows, in proportion to their share of the batch."""
+        logged, share = batch.logged, batch.logged / len(q)
+        action = batch.action[:logged]
+        terms = []
+        if isinstance(batch.conservative, Tensor) or (batch.conservative > 0 and logged):
+            term = conservative_penalty(q[:logged], action, batch.conservative)
+            terms.append(term * share)
+        if batch.expert is not None:
+            term = margin_penalty(q[:logged], action, batch.expert, self.settings.margin_size)
+            terms.append(self.settings.margin * term * share)
+        return sum(terms[1:], terms[0]) if terms else None
+
+
+ALGORITHMS: dict[str, Callable[[LossConfig], Algorithm]] = {"dqn": DQN}
+
+
+def make_algorithm(config: LossConfig) -> Algorithm:
+    """Return the algorithm that `config.algorithm` names.
+
+    Raises:
+        ConfigError: no such name, module or attribute.
+    """
+    named = ALGORITHMS.get(config.algorithm)
+    if named is None:
+        named = _imported(config.algorithm)
+    made: Algorithm = named(config)
+    return made
+
+
+def _imported(source: str) -> Callable[[LossConfig], Algorithm]:
+    """Import `module:name`, also from the working directory."""
+    module, _, name = source.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        found: Callable[[LossConfig], Algorithm] = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"{source!r} cannot be imported: {error}",
+            where="loss.algorithm",
+            remedy=f"give one of {', '.join(ALGORITHMS)}, or your own as module:name",
+        ) from error
+    finally:
+        sys.path.remove(here)
+    return found
+
+
+def make_network(
+    config: TrainConfig,
+    observation_size: int,
+    actions: int,
+    generator: torch.Generator | None = None,
+) -> QNetwork:
+    """Return the network of a run's algorithm."""
+    return make_algorithm(config.loss).make_network(
+        config.network, observation_size, actions, generator
+    )
+
+
+def td_target(
+    reward: Tensor,
+    discount: Tensor,
+    next_target_q: Tensor,
+    next_online_q: Tensor | None = None,
+    plausible: Tensor | None = None,
+) -> Tensor:
+    """Return what Q(s, a) should be, (B,).
+
+    Args:
+        reward: (B,), the sum of the row's n discounted rewards.
+        discount: (B,), gamma**n where the row bootstraps, else 0.
+        next_target_q: (B, A), the target network at s'.
+        next_online_q: (B, A), the online network at s': it selects the action that the target
+            network evaluates (Double DQN). None lets the target network do both (DQN).
+        plausible: (B, A) bool, at least one of each row: the actions at s' that may be selected
+            (discrete BCQ, arXiv:1910.01708). None: all of them.
+    """
+    chooses = next_target_q if next_online_q is None else next_online_q
+    if plausible is not None:
+        chooses = chooses.masked_fill(~plausible, -torch.inf)
+    best = chooses.argmax(dim=1, keepdim=True)
+    return reward + discount * next_target_q.gather(1, best).squeeze(1)
+
+
+def huber(error: Tensor, delta: float = 1.0) -> Tensor:
+    """Return error**2 / 2 up to |error| = delta, then linear with slope delta; elementwise."""
+    return functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=delta)
+
+
+def dqn_loss(
+    q: Tensor,
+    action: Tensor,
+    target: Tensor,
+    *,
+    weight: Tensor | None = None,
+    huber_delta: float = 1.0,
+) -> Loss:
+    """Return the loss of action values `q` (B, A) at `action` (B,) int64 against `target` (B,).
+
+    `weight` (B,) are importance weights that correct the sampling; None is all ones.
+    """
+    chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
+    td = chosen - target
+    each = huber(td, huber_delta)
+    value = each.mean() if weight is None else (each * weight).mean()
+    return Loss(value, td.detach(), chosen.detach())
+
+
+def conservative_penalty(q: Tensor, action: Tensor, weight: float | Tensor = 1.0) -> Tensor:
+    """Return discrete CQL's regulariser, the mean of weight * (logsumexp_a Q(s, a) - Q(s, a_log)).
+
+    It pushes down the values of actions that the logs never took (arXiv:2006.04779, CQL(H)).
+    `weight` is of all rows or of each, (B,).
+    """
+    chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
+    return ((q.logsumexp(dim=1) - chosen) * weight).mean()
+
+
+def margin_penalty(q: Tensor, action: Tensor, expert: Tensor, margin: float) -> Tensor:
+    """Return DQfD's large-margin term, the mean of max_a [Q(s, a) + l(a)] - Q(s, a_E).
+
+    l(a) is `margin` for every action but the expert's, so that the expert's must be better by that
+    much (arXiv:1704.03732, equation 1). `expert` (B,) bool says which rows are an expert's; the
+    mean is over all B rows, so a batch with few of them has little of it.
+    """
+    others = torch.full_like(q, margin).scatter_(1, action.unsqueeze(1), 0.0)
+    chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
+    return (((q + others).amax(dim=1) - chosen) * expert).mean()
+
+
+__all__ = [
+    "ALGORITHMS",
+    "DQN",
+    "Algorithm",
+    "Loss",
+    "TrainingBatch",
+    "conservative_penalty",
+    "dqn_loss",
+    "huber",
+    "make_algorithm",
+    "make_network",
+    "margin_penalty",
+    "td_target",
+]
