@@ -21,7 +21,7 @@ def check_verdicts(notebook: nbformat.NotebookNode) -> None:
         (text,) = [text for source, text in said.items() if words in source]
         return text
 
-    assert "REFUSED" in of("restock compare plain dueling")
+    assert "REFUSED" in of("restock compare plain unnormed")
     assert of("fair = compare").startswith("comparable\n")
     # Another processor's last bits may have a condition of few rows named beside the target.
     assert re.search(r"^(TARGET|BOTH)$", of("restock diagnose frozen"), re.MULTILINE)

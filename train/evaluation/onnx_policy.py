@@ -127,6 +127,12 @@ class _Graph:
 
     def values(self, network: QNetwork, name: str) -> str:
         """Action values (N, A) of one network."""
+        if type(network) is not QNetwork:  # of an algorithm with a network of its own
+            raise ConfigError(
+                f"a {type(network).__name__} cannot be written as ONNX",
+                where="loss.algorithm",
+                remedy="export it with torch.onnx; only a plain QNetwork is translated here",
+            )
         now = "observation"
         for index, layer in enumerate(network.body):
             place = f"{name}.{index}"
@@ -140,14 +146,7 @@ class _Graph:
                 )
             else:
                 now = self.node("Relu", [now], place)
-        advantage = self.linear(network.advantage, now, f"{name}.advantage")
-        if network.value is None:
-            return advantage
-        value = self.linear(network.value, now, f"{name}.value")
-        axes = self.constant(f"{name}.axes", np.array([1], np.int64))
-        middle = self.node("ReduceMean", [advantage, axes], f"{name}.middle", keepdims=1)
-        centred = self.node("Sub", [advantage, middle], f"{name}.centred")
-        return self.node("Add", [value, centred], f"{name}.values")
+        return self.linear(network.advantage, now, f"{name}.advantage")
 
     def filter(self, network: FilteredNetwork, values: str, output: str) -> str:
         """The values (N, A) where an action is plausible, -inf elsewhere."""

@@ -3,7 +3,7 @@
  *
  * What `restock.train.dqn` does with PyTorch's operations, `restock.replay.sampling` and
  * `restock.ingest.task` with NumPy's and `restock.train.twin` with MuJoCo's rays, in fewer calls and
- * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/native_backprop.py`,
+ * fewer passes over memory. Python's side is `restock/native.py`, `train/dqn/kernel.py`,
  * `train/feed/sampled_rows.py`, `replay/sampling/gather.py` and `priorities.py`,
  * `train/twin/physics/lidar.py`, `ingest/task/route.py` and `surroundings.py`. Compiled with
  * -ffp-contract=off and without fast-math: sums have one order, so that any processor it runs on
