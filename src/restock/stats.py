@@ -51,7 +51,7 @@ def no_interval_text(why: str | None) -> str:
 
 
 def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """The Wilson score interval of a proportion; (0, 1) without trials.
+    """Return the Wilson score interval of a proportion; (0, 1) without trials.
 
     Unlike the normal interval it stays inside [0, 1] and has a width at 0 and n successes.
     """
@@ -215,21 +215,20 @@ def _interaction(arm: F64) -> float:
 def paired_t(
     differences: NDArray[Any], confidence: float = 0.95
 ) -> tuple[ConfidenceInterval, float]:
-    """The mean of paired differences (n,), its Student's t interval, and p of no difference.
+    """Return the mean of paired differences (n,), its Student's t interval, and p of no difference.
 
     With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below
     `LEAST_PAIRS`, and where all are the same, the spread is not known: ends and p are NaN.
     """
-    from scipy.stats import t
+    from scipy.stats import ttest_1samp
 
     values = np.asarray(differences, np.float64)
-    value, count = float(values.mean()), len(values)
-    if count < LEAST_PAIRS or nothing_varies(values):
+    value = float(values.mean())
+    if len(values) < LEAST_PAIRS or nothing_varies(values):
         return ConfidenceInterval(value, float("nan"), float("nan")), float("nan")
-    error = float(values.std(ddof=1)) / math.sqrt(count)
-    half = float(t.ppf(0.5 + confidence / 2, count - 1)) * error
-    p = 2 * float(t.sf(abs(value) / error, count - 1))
-    return ConfidenceInterval(value, value - half, value + half), p
+    test = ttest_1samp(values, 0.0)
+    low, high = test.confidence_interval(confidence)
+    return ConfidenceInterval(value, float(low), float(high)), float(test.pvalue)
 
 
 def nothing_varies(values: NDArray[Any]) -> bool:
@@ -238,14 +237,16 @@ def nothing_varies(values: NDArray[Any]) -> bool:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """p values adjusted for their number, in their order (Holm 1979): below alpha is significant,
-    with a probability of alpha at most that any of them is by chance."""
-    order = sorted(range(len(p_values)), key=lambda place: p_values[place])
-    adjusted, least = [0.0] * len(p_values), 0.0
-    for rank, place in enumerate(order):
-        least = max(least, min((len(p_values) - rank) * p_values[place], 1.0))
-        adjusted[place] = least
-    return adjusted
+    """Adjust p values for their number, in their order (Holm 1979).
+
+    Of those below alpha, the probability that any is by chance is at most alpha.
+    """
+    p = np.asarray(p_values, np.float64)
+    order = np.argsort(p, kind="stable")
+    steps = np.minimum((len(p) - np.arange(len(p))) * p[order], 1.0)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(steps)
+    return [float(value) for value in adjusted]
 
 
 def which_adjusted(primary: bool) -> str:
