@@ -27,7 +27,6 @@ from restock.ingest.urdf.description import (
     extent,
     number,
 )
-from restock.ingest.urdf.unusable import unusable
 from restock.words import counted
 
 SMALLEST_M = 0.005  # of a wheel's radius
@@ -97,10 +96,8 @@ def described_robot(
     places = description.places()
     wheels = _wheels(description, places)
     driven = _driven(wheels)
-    faults = unusable(description, places)
     if not driven:
-        why = _no_wheels(description, places, wheels)
-        return DescribedRobot(problem="; ".join([why, *faults]))
+        return DescribedRobot(problem=_no_wheels(description, places, wheels))
     notes: list[str] = []
     if description.base.split("/")[-1] not in BASE_FRAMES:
         notes.append(_other_base(description.base))
@@ -142,9 +139,6 @@ def described_robot(
     if meshes:
         have = "1 link has" if meshes == 1 else f"{meshes} links have"
         notes.append(f"{have} only meshes, whose size is in other files: left out")
-    notes += faults
-    if any(_without_radius(description.links.get(wheel.joint.child)) for wheel in driven):
-        notes.append("wheels without a usable radius: it is their axle's height over the floor")
     rounded = {key: _rounded(value) for key, value in values.items()}
     return DescribedRobot({k: v for k, v in rounded.items() if v is not None}, notes)
 
@@ -221,11 +215,6 @@ def _radius(link: ET.Element | None) -> float:
             if found is not None and (radius := number(found.get("radius"))) > 0:
                 return radius
     return float("nan")
-
-
-def _without_radius(link: ET.Element | None) -> bool:
-    """Whether nothing gives its radius, not even a mesh, which is noted for itself."""
-    return not _radius(link) > 0 and (link is None or link.find(".//mesh") is None)
 
 
 def _driven(wheels: list[_Wheel]) -> list[_Wheel]:

@@ -24,7 +24,6 @@ LONGEST = 4_000_000  # letters of a description
 MOST_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
 HEAVIEST_KG = 100_000.0  # of a link
-SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
 
 
 @dataclass(frozen=True)

@@ -197,111 +197,6 @@ def test_a_robot_that_moves_in_a_world_is_not_that_world() -> None:
 DRIVEN = robot(wheels((0.2, 0.2), (0.2, -0.2)))
 
 
-@pytest.mark.parametrize(
-    ("written", "instead", "note"),
-    [
-        (
-            "<link name='wheel_0'><collision>",
-            "<link name='wheel_0'><inertial><mass value='-5'/></inertial><collision>",
-            "link 'wheel_0': mass value='-5' is not from 0 to 100,000 kg: counted as 0",
-        ),
-        (
-            "size='0.8 0.5 0.2'",
-            "size='0,8 0,5 0,2'",
-            "link 'base_link': box size='0,8 0,5 0,2' is not 3 numbers of 0 or more (decimals take "
-            "a point): this shape is left out of the outline",
-        ),
-        (
-            "<box size='0.8 0.5 0.2'/>",
-            "<box/>",
-            "link 'base_link': box has no size: this shape is left out of the outline",
-        ),
-        (
-            "<box size='0.8 0.5 0.2'/>",
-            "<sphere radius='-1'/>",
-            "link 'base_link': sphere radius='-1' is not a number of 0 or more: this shape is left "
-            "out of the outline",
-        ),
-        (
-            "<box size='0.8 0.5 0.2'/>",
-            "<capsule radius='1' length='2'/>",
-            "link 'base_link': capsule is not a box, cylinder, sphere or mesh: this shape is left "
-            "out of the outline",
-        ),
-        (
-            "<geometry><box",
-            "<origin xyz='0 0 x'/><geometry><box",
-            "link 'base_link': collision origin xyz='0 0 x' is not 3 numbers: this shape is left "
-            "out of the outline",
-        ),
-        (
-            "</robot>",
-            link("mast", "<sphere radius='0.1'/>")
-            + joint("mast", "nan 0 1", kind="fixed")
-            + "</robot>",
-            "joint 'mast_joint': origin xyz='nan 0 1' is not 3 numbers: shapes of what it carries "
-            "are left out",
-        ),
-        (
-            "</robot>",
-            link("mast") + joint("mast", "0.1 0", kind="fixed") + "</robot>",
-            "joint 'mast_joint': origin xyz='0.1 0' is not 3 numbers: 0 for what is missing",
-        ),
-        (
-            "</robot>",
-            link("mast") + joint("mast", "0 0 0", axis="0 0 0") + "</robot>",
-            "joint 'mast_joint': axis xyz='0 0 0' is not a direction: it is not taken for a wheel",
-        ),
-        (
-            "</robot>",
-            link("mast") + joint("mast", "0 0 0", kind="Fixed") + "</robot>",
-            "joint 'mast_joint': type='Fixed' is not a joint's: what it carries is left out",
-        ),
-        (
-            "</robot>",
-            joint("mast", "0 0 0", kind="fixed") + "</robot>",
-            "joint 'mast_joint': child link='mast' is not described: left out",
-        ),
-        (
-            "</robot>",
-            "<joint name='j' type='fixed'><parent link='base_link'/></joint></robot>",
-            "joint 'j': has no child: left out",
-        ),
-        (
-            "<axis xyz='0 1 0'/></joint><link",
-            "<axis xyz='0 1 0'/><limit velocity='fast'/></joint><link",
-            "joint 'wheel_0_joint': limit velocity='fast' is not a number of 0 or more: it is not "
-            "used",
-        ),
-        (
-            "</robot>",
-            link("stray", mass=3.0) + "</robot>",
-            "no joint leads from the base to 'stray': left out",
-        ),
-    ],
-)  # fmt: skip
-def test_a_value_that_cannot_be_used_is_named_with_what_stands_in(
-    written: str, instead: str, note: str
-) -> None:
-    assert of(DRIVEN).notes == []
-    assert written in DRIVEN
-    found = of(DRIVEN.replace(written, instead, 1))
-    assert found.notes == [note]
-    assert found.values["track_m"] == 0.4
-
-
-def test_wheels_without_a_usable_radius_stand_on_the_floor_or_are_refused_with_its_value() -> None:
-    unknown = DRIVEN.replace("radius='0.1'", "radius='nan'")
-    why = "link 'wheel_0': cylinder radius='nan' is not a number of 0 or more"
-    found = of(unknown)
-    assert found.values["wheel_radius_m"] == 0.05
-    assert found.notes[0].startswith(why)
-    assert found.notes[-1] == (
-        "wheels without a usable radius: it is their axle's height over the floor"
-    )
-    assert why in (of(unknown.replace("-0.05", "-0.1")).problem or "")
-
-
 def test_one_wheel_is_not_wheels() -> None:
     assert "'test' has 1 wheel, but" in (of(robot(wheels((0, 0.2)))).problem or "")
 
@@ -310,13 +205,6 @@ def test_a_radius_that_only_a_visible_shape_has_is_used() -> None:
     seen = "<visual><geometry><cylinder radius='0.1' length='0.04'/></geometry></visual></link>"
     text = DRIVEN.replace("radius='0.1'", "radius='x'").replace("</link><joint", f"{seen}<joint")
     assert of(text).values["wheel_radius_m"] == 0.1
-
-
-def test_many_unusable_values_are_counted() -> None:
-    stray = "".join(link(f"a{i}", "<sphere/>") + joint(f"a{i}", "0 0 0", "x") for i in range(9))
-    notes = of(robot(wheels((0, 0.2), (0, -0.2)), stray)).notes
-    assert len(notes) == 7
-    assert notes[-1] == "12 more values cannot be used"
 
 
 @given(
