@@ -38,7 +38,8 @@ from restock.train.twin.drivers.policies import (
 )
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import PERTURBATIONS, Perturbation
 
 DRIVERS: dict[str, Callable[[], BehaviourPolicy]] = {

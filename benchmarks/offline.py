@@ -37,7 +37,7 @@ from restock.train.run.run import Run
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.physics.episode import KINDS
+from restock.train.twin.missions.registry import KINDS
 
 RECORDING_MINUTES = 48
 FIRST_SEED, EVALUATION_SEED = 7000, 20_000

@@ -41,8 +41,9 @@ from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.episode import KINDS, Episode, EpisodeSpec, draw_episode
-from restock.train.twin.physics.traffic import PEOPLE
+from restock.train.twin.floors.obstacles import PEOPLE
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 
 FIRST_SEED = 500_000
 AGENTS: dict[str, list[str]] = {

@@ -59,7 +59,8 @@ from restock.train.session import Session, open_session
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import find_perturbation
 
 _EVALUATION_ENVS = 16

@@ -39,8 +39,8 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.propose import drives
 from restock.replay.store.store import Store
-from restock.train.twin.env.interface import DEFAULT_CONDITIONS
 from restock.train.twin.floors.occupancy_map import write_pgm
+from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
 
 BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_front"))
 

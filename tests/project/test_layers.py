@@ -58,11 +58,11 @@ MAY_IMPORT = {
         "replay panel plan store ingest/camera ingest/store ingest/profile ingest/task"
     ),
     "train": (
-        "dqn evaluation evaluation/off_policy feed run twin/env twin/floors twin/physics"
-        " replay/fleet replay/mixture replay/panel replay/ring replay/sampling replay/store"
-        " ingest/profile ingest/store ingest/task"
+        "dqn evaluation evaluation/off_policy feed run twin/missions twin/env twin/floors"
+        " twin/physics replay/fleet replay/mixture replay/panel replay/ring replay/sampling"
+        " replay/store ingest/profile ingest/store ingest/task"
     ),
-    "train/dqn": "twin/env twin/physics replay/fleet replay/mixture",
+    "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
         "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel replay/ring"
@@ -70,29 +70,34 @@ MAY_IMPORT = {
     ),
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
-        "dqn evaluation/off_policy feed run twin/drivers twin/env twin/floors twin/physics"
-        " twin/survey replay/panel replay/ring replay/store ingest/live ingest/profile ingest/task"
+        "dqn evaluation/off_policy feed run twin/drivers twin/missions twin/env twin/floors"
+        " twin/physics twin/survey replay/panel replay/ring replay/store ingest/live"
+        " ingest/profile ingest/task"
     ),
     "train/comparison": (
         "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
     ),
     "train/diagnosis": (
-        "evaluation/off_policy feed run twin/calibration twin/drivers twin/env twin/physics"
-        " replay/panel replay/store ingest/profile ingest/store ingest/task"
+        "evaluation/off_policy feed run twin/calibration twin/drivers twin/missions twin/env"
+        " twin/physics replay/panel replay/store ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn evaluation libraries run twin/physics replay/panel ingest",
+    "train/study": "comparison dqn evaluation libraries run replay/panel ingest twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "",
-    "train/twin/physics": "twin/floors ingest/task",
-    "train/twin/env": "twin/floors twin/physics replay/fleet ingest/profile ingest/task",
+    "train/twin/missions": "twin/floors",
+    "train/twin/physics": "twin/floors twin/missions ingest/task",
+    "train/twin/env": (
+        "twin/floors twin/missions twin/physics replay/fleet ingest/profile ingest/task"
+    ),
     "train/twin/drivers": "twin/env twin/floors twin/physics ingest/task",
     "train/twin/recording": (
-        "twin/drivers twin/env twin/floors twin/physics replay/fleet ingest/profile ingest/task"
+        "twin/drivers twin/missions twin/env twin/floors twin/physics replay/fleet"
+        " ingest/profile ingest/task"
     ),
     "train/twin/survey": (
         "twin/floors replay/store ingest/containers ingest/decoding ingest/profile"
@@ -102,7 +107,7 @@ MAY_IMPORT = {
         "twin/floors twin/physics replay/store ingest/profile ingest/steps ingest/task"
     ),
     "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
-    "report/look": "",
+    "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/store train/evaluation train/run"
         " train/twin/calibration train/twin/floors train/twin/survey"
@@ -112,9 +117,9 @@ MAY_IMPORT = {
     "cli": "ingest/steps replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/propose/evidence"
-        " ingest/steps ingest/store ingest/task replay replay/export replay/fleet replay/mixture"
-        " replay/panel replay/plan replay/review replay/store report train/comparison train/dqn"
-        " train/evaluation train/twin/physics"
+        " ingest/steps ingest/store ingest/task replay replay/export replay/fleet"
+        " replay/mixture replay/panel replay/plan replay/review replay/store report"
+        " train/comparison train/dqn train/evaluation train/twin/missions"
     ),
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace train"
@@ -122,23 +127,23 @@ MAY_IMPORT = {
         " train/twin/floors train/twin/physics train/view"
     ),
     "cli/pages": (
-        "cli report ingest/store replay/fleet replay/mixture replay/store train/twin/calibration"
-        " train/twin/physics"
+        "cli report ingest/store replay/fleet replay/mixture replay/store"
+        " train/twin/calibration train/twin/missions"
     ),
     "cli/pipeline": ("cli ingest/store replay replay/fleet replay/store train/evaluation"),
     "cli/robot": "cli ingest/live ingest/profile ingest/task",
     "cli/start": (
-        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
-        " replay/mixture replay/panel replay/store replay/trace train/diagnosis train/dqn"
-        " train/evaluation train/evaluation/off_policy train/run train/twin/calibration"
-        " train/twin/env train/twin/floors"
+        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence"
+        " ingest/task replay/mixture replay/panel replay/store replay/trace train/diagnosis"
+        " train/dqn train/evaluation train/evaluation/off_policy train/run"
+        " train/twin/calibration train/twin/floors train/twin/missions"
     ),
     "cli/upkeep": "cli ingest ingest/store",
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"
         " ingest/store ingest/task replay/fleet replay/store train/evaluation"
         " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
-        " train/twin/recording train/twin/survey"
+        " train/twin/recording train/twin/survey train/twin/missions"
     ),
 }
 

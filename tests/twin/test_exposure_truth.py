@@ -19,7 +19,8 @@ from restock.ingest.task.task import Rewards, Task
 from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.truth import EXPOSURES, Truth
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
 
 STORED = [signal.name for signal in STORED_SIGNALS]
 

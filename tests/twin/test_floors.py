@@ -49,7 +49,8 @@ from restock.train.twin.floors.occupancy_map import (
     write_pgm,
 )
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 SEEDS = st.integers(0, 10_000)
 SAYS_TRUNCATED = pytest.mark.skipif(

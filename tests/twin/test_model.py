@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from restock.ingest.profile.profile import load_profile
 from restock.train.twin.floors.layout import default_warehouse
-from restock.train.twin.physics.contact import NO_PATCH, PATCHES, friction_at
-from restock.train.twin.physics.episode import Episode, EpisodeSpec, no_pallets
+from restock.train.twin.floors.obstacles import NO_PATCH, PATCHES, no_pallets
+from restock.train.twin.physics.contact import friction_at
+from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import build_model
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
 from restock.train.twin.physics.robot import base_controller

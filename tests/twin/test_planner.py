@@ -9,7 +9,8 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.floors.planner import CELL_M, PLAN_POINTS, Planner
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, length_m
+from restock.train.twin.missions.mission import length_m
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 FLOOR = default_warehouse()
 PLANNER = Planner(FLOOR)

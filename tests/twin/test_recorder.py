@@ -28,7 +28,8 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower
-from restock.train.twin.recording.missions import BLOCK, FLEET, NATURAL, parse_shares, schedule
+from restock.train.twin.missions.registry import NATURAL
+from restock.train.twin.recording.missions import BLOCK, FLEET, parse_shares, schedule
 from restock.train.twin.recording.recorder import (
     HARDWARE,
     RecordingPlan,

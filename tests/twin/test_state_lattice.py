@@ -7,6 +7,7 @@ import pytest
 
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import Warehouse, default_warehouse
+from restock.train.twin.floors.obstacles import PALLET_HALF_M
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import (
     Motion,
@@ -17,8 +18,8 @@ from restock.train.twin.floors.state_lattice import (
     near_floor_gap,
     rectangle,
 )
-from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, length_m
-from restock.train.twin.physics.model import PALLET_HALF_M
+from restock.train.twin.missions.mission import length_m
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 FLOOR = default_warehouse()
 AISLE = FLOOR.segments[1].area  # aisle 1 east: x from west to east

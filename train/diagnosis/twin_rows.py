@@ -22,7 +22,7 @@ from restock.train.diagnosis.fed_rows import FedRows
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import Handover, PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.physics.episode import KINDS
+from restock.train.twin.missions.registry import KINDS
 from restock.train.twin.physics.perturbation import Perturbation
 
 ROBOTS = 24

@@ -23,7 +23,8 @@ from restock.replay.mixture.schedules import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
 from restock.train.dqn.removed_settings import refuse_removed, without_removed
 from restock.train.dqn.target import Polyak, TargetRule
-from restock.train.twin.env.interface import DEFAULT_CONDITIONS, LinearEpsilon
+from restock.train.twin.env.interface import LinearEpsilon
+from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
 RENAMED = {"guide": "jump_start"}  # keys of earlier versions

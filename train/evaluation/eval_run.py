@@ -82,8 +82,8 @@ def drive_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
 ) -> list[dict[str, Any]]:
     """Drive all episodes, and add them to the run's `eval/episodes.parquet`: those rows."""
-    from restock.train.twin.env.interface import DEFAULT_CONDITIONS
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
+    from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
 
     profile = profile_of_run(plan.run)
     task = profile.task

@@ -31,7 +31,8 @@ from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import (
     PERTURBATIONS,
     Perturbation,

@@ -28,8 +28,8 @@ from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
+from restock.train.twin.floors.obstacles import PEOPLE
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.model import PEOPLE
 from restock.words import policy_words, quoted
 
 if TYPE_CHECKING:

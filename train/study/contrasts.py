@@ -21,17 +21,21 @@ from restock.arrays import F64
 from restock.stats import LEAST_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
+from restock.train.twin.missions.registry import MISSIONS
 from restock.words import counted
 
-CELLS = {  # what a measure may name: condition and block
-    "nominal": (("nominal", None),),
-    "wheel_slip": (("wheel_slip", None),),
-    "blocked_aisle": (("blocked_aisle", "partial"), ("blocked_aisle", "full")),
-    "partly_blocked": (("blocked_aisle", "partial"),),
-    "wholly_blocked": (("blocked_aisle", "full"),),
-    "near_collision": (("near_collision", None),),
+CELLS: dict[str, tuple[tuple[str, str | None], ...]] = {  # what a measure may name
+    **{
+        name: tuple((name, block) for block in one.blocks or (None,))
+        for name, one in MISSIONS.items()
+    },
+    **{
+        measure: ((name, block),)
+        for name, one in MISSIONS.items()
+        for measure, block in one.block_measures.items()
+    },
 }
-RARE = ("wheel_slip", "blocked_aisle", "near_collision")
+RARE = tuple(name for name, one in MISSIONS.items() if one.is_true is not None)
 KINDS_OF_MEASURE = ("auc", "success")
 
 

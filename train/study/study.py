@@ -26,7 +26,7 @@ from restock.train.evaluation.references import wrong_seed
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
 from restock.train.study.power import PowerConfig
-from restock.train.twin.physics.episode import KINDS
+from restock.train.twin.missions.registry import KINDS
 
 
 class ArmConfig(Checked, frozen=True):

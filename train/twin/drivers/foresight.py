@@ -9,8 +9,8 @@ import numpy as np
 
 from restock.arrays import F64, Ints
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.obstacles import pallet_half_m
 from restock.train.twin.floors.state_lattice import box_gap, near_floor_gap, rectangle
-from restock.train.twin.physics.model import pallet_half_m
 from restock.train.twin.physics.traffic import RETREATING, WALKING
 
 # Nearer than this to anything is too near, and less room than that is a squeeze, for a robot of

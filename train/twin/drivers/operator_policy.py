@@ -27,6 +27,7 @@ from restock.train.twin.drivers.foresight import (
 )
 from restock.train.twin.drivers.policies import SoftPolicy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.floors.obstacles import PALLET_HALF_M, pallet_half_m
 from restock.train.twin.floors.planner import PLAN_POINTS
 from restock.train.twin.floors.state_lattice import (
     Motion,
@@ -34,7 +35,6 @@ from restock.train.twin.floors.state_lattice import (
     Window,
     lattice_around,
 )
-from restock.train.twin.physics.model import PALLET_HALF_M, pallet_half_m
 
 BACK_S = (2.4, 3.2)
 _LOOK_M = tuple(0.3 * step for step in range(14))

@@ -21,14 +21,8 @@ from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.env.draw import draw_map
 from restock.train.twin.floors.layout import Rect, Warehouse
-from restock.train.twin.physics.model import (
-    FORKLIFT_HALF_M,
-    PALLET_HALF_M,
-    PARKED_M,
-    PEOPLE,
-    RACK_HALF_HEIGHT_M,
-    building_boxes,
-)
+from restock.train.twin.floors.obstacles import FORKLIFT_HALF_M, PALLET_HALF_M, PARKED_M, PEOPLE
+from restock.train.twin.physics.model import RACK_HALF_HEIGHT_M, building_boxes
 from restock.train.twin.physics.robot_model import RobotModel
 
 if TYPE_CHECKING:

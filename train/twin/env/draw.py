@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import HEADINGS, Rect, Warehouse
-from restock.train.twin.physics.contact import PATCHES
-from restock.train.twin.physics.model import (
+from restock.train.twin.floors.obstacles import (
     FORKLIFT_HALF_M,
     PALLET_HALF_M,
+    PATCHES,
     PEOPLE,
     PERSON_RADIUS_M,
 )

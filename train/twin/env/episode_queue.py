@@ -17,7 +17,8 @@ from restock.train.twin.env.mission_arms import MissionArm, MissionArms, floor_p
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule
 
 

@@ -12,7 +12,8 @@ from restock.errors import ConfigError, RunError
 from restock.ingest.task.scan import Body
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
 

@@ -22,13 +22,6 @@ if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
     from restock.train.twin.env.mission_arms import MissionArm
     from restock.train.twin.physics.episode import EpisodeSpec
 
-# Shares among the episodes that are drawn, where nothing else is asked for.
-DEFAULT_CONDITIONS: Mapping[str, float] = {
-    "nominal": 0.4,
-    "wheel_slip": 0.2,
-    "blocked_aisle": 0.2,
-    "near_collision": 0.2,
-}
 AFTER_LOGS = 0.2  # the offline phase has learnt to drive: more exploration would only undo that
 
 Probability = Annotated[float, Meta(ge=0, le=1)]

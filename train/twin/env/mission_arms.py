@@ -18,11 +18,11 @@ from restock.errors import ConfigError
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
+from restock.train.twin.missions.registry import MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Schedule
 
 BLOCK, LAYOUT = "block", "layout"
-BLOCKED, BLOCKS = "blocked_aisle", ("partial", "full")
 PARTS = ("low", "high")  # halves of a range of the perturbation
 TRIES = 300  # seeds that are tried for a block
 _PROBES = 24  # seeds that show which blocks a floor has room for
@@ -152,7 +152,7 @@ class MissionArms:
         ]
 
     def _by_block(self, arm: MissionArm) -> list[MissionArm]:
-        if arm.kind != BLOCKED:
+        if not MISSIONS[arm.kind].blocks:
             return [arm]
         found = self._blocks(arm)
         name, _, floor = arm.name.partition(" on ")
@@ -165,14 +165,15 @@ class MissionArms:
     def _blocks(self, arm: MissionArm) -> list[str]:
         """The blocks that an arm's floors have room for."""
         found: set[str] = set()
+        blocks = list(MISSIONS[arm.kind].blocks)
         for seed in range(_PROBES):
             try:
                 found.add(self._block(EpisodeSpec(arm.kind, seed, layout=arm.layout or None)))
             except ConfigError:  # no room at all: the floors are asked about kinds elsewhere
                 break
-            if len(found) == len(BLOCKS):
+            if len(found) == len(blocks):
                 break
-        return [block for block in BLOCKS if block in found] or [""]
+        return [block for block in blocks if block in found] or [""]
 
 
 def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[MissionArm]:

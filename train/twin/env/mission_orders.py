@@ -17,7 +17,8 @@ from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec, draw_episode
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 
 TRIES = 300  # seeds that are tried for a way through a zone
 WAY_POINTS = 24  # along each leg of a plan at which zones are looked up

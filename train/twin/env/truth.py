@@ -29,11 +29,14 @@ from restock.ingest.task.label_scores import truth_text
 from restock.ingest.task.route import view_route
 from restock.ingest.task.task import Task
 from restock.state import Stateful
-from restock.train.twin.physics.model import pallet_half_m
+from restock.train.twin.floors.obstacles import AGENTS, pallet_half_m
+from restock.train.twin.missions.mission import Situation
+from restock.train.twin.missions.registry import MISSIONS
 from restock.train.twin.physics.simulation import Simulation
-from restock.train.twin.physics.traffic import AGENTS
 
-NAMES = ("blocked_aisle", "near_collision", "recovery", "wheel_slip")
+AFTERMATH = "recovery"
+SCORED = {one.name: one.is_true for one in MISSIONS.values() if one.is_true is not None}
+NAMES = (*SCORED, AFTERMATH)
 EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
 
 
@@ -101,7 +104,9 @@ class Truth(Stateful):
     def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
         """All conditions (N,) of the step that ends now, as one text each."""
         near = bumped | (clearance_m < self._near_m)
-        held = np.stack([self.blocked, near, self.aftermath_s > 0, slipped])  # as NAMES
+        now = Situation(self.blocked, near, slipped, clearance_m, self.traffic_gap_m)
+        missions = [is_true(now) for is_true in SCORED.values()]
+        held = np.stack([*missions, self.aftermath_s > 0])  # as NAMES
         which = (held << np.arange(len(NAMES))[:, None]).sum(axis=0)
         left = np.maximum(self.aftermath_s - self._period_s, 0.0)
         left[(clearance_m > 2 * self._near_m) & ~near] = 0.0

@@ -47,19 +47,14 @@ from restock.train.twin.env.floor_report import (
     refuse_unfit,
 )
 from restock.train.twin.env.info import info_after, info_now
-from restock.train.twin.env.interface import (
-    DEFAULT_CONDITIONS,
-    Info,
-    MadeAgain,
-    Step,
-    refuse_other_type,
-)
+from restock.train.twin.env.interface import Info, MadeAgain, Step, refuse_other_type
 from restock.train.twin.env.mission_arms import MissionArm
 from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
 from restock.train.twin.env.truth import Truth
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
+from restock.train.twin.missions.registry import DEFAULT_CONDITIONS, KINDS
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode, with_room
 from restock.train.twin.physics.perturbation import Perturbation, Schedule, find_perturbation
 from restock.train.twin.physics.robot_trial import robot_model
@@ -200,8 +195,8 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.episode_number = np.full(num_envs, -1)
         self.mission_arm = np.full(num_envs, -1)
         self.episode_seed = np.zeros(num_envs, np.int64)
-        self.episode_condition = np.full(num_envs, "nominal", "U16")
-        self.block = np.full(num_envs, "none", "U8")
+        self.episode_condition = np.full(num_envs, "nominal", f"U{max(16, *map(len, KINDS))}")
+        self.block = np.full(num_envs, "none", "U16")
         self.perturbation_name = np.full(num_envs, "nominal", object)  # of any length
         self.perturbation_values = np.full(num_envs, "{}", object)  # JSON, what is not nominal
 

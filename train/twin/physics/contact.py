@@ -11,12 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
+from restock.train.twin.floors.obstacles import NO_PATCH, PATCHES
 
 FLOOR_FRICTION = 0.8
 FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)
-PATCHES = 4  # at most, an episode: parts of the floor with a friction of their own
 SLIPPERY_BELOW = 0.3  # friction under which a wheel counts as on a patch
-NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 SOFT = {"solref": [0.02, 1], "solimp": [0, 0.95, 0.004, 0.5, 2]}  # wheels and casters
 
 # Of geoms: lidar rays end at the first alone, and what stays hidden lies beyond the last.

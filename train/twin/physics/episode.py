@@ -1,12 +1,8 @@
 """An episode: where it starts and goes, and what stands, lies and walks in the way.
 
 `draw_episode` makes all of it from an `EpisodeSpec` alone, so an episode can be repeated, named
-in a table, and looked at again. Kinds of episode:
-
-- nominal: the known map and a dry floor;
-- wheel_slip: slippery patches on the way, where the robot starts, turns or stops;
-- blocked_aisle: pallets across an aisle on the way, partly (a gap of .8 to 1 m) or wholly;
-- near_collision: people and forklifts who cross the way or come toward the robot.
+in a table, and looked at again. Its kind is a module of
+`restock.train.twin.missions`.
 """
 
 from __future__ import annotations
@@ -20,16 +16,13 @@ import numpy as np
 from restock.arrays import F64
 from restock.errors import ConfigError
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.obstacles import AGENTS, NO_PATCH, PATCHES, Walk, no_pallets
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import floor_gap
-from restock.train.twin.physics.contact import NO_PATCH, PATCHES
-from restock.train.twin.physics.model import PALLET_HALF_M, PALLETS, PARKED_M
+from restock.train.twin.missions.mission import length_m, point_along
+from restock.train.twin.missions.registry import KINDS, MISSIONS
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.physics.traffic import AGENTS, Walk, draw_walks
 
-KINDS = ("nominal", "wheel_slip", "blocked_aisle", "near_collision")
-PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete
-GAP_M = (0.80, 1.00)
 TURN_ROOM_M = 0.45  # that the body needs on both sides to turn on the spot
 
 
@@ -73,11 +66,6 @@ class Episode:
     noise: np.random.SeedSequence = field(default_factory=lambda: np.random.SeedSequence(0))
 
 
-def no_pallets() -> F64:
-    """Every pallet parked off the floor."""
-    return np.tile([PARKED_M[0], PARKED_M[1], 0.0], (PALLETS, 1))
-
-
 def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> Episode:
     """The episode that `spec` determines: the same spec always gives the same episode."""
     entropy = [spec.seed, zlib.crc32(spec.condition.encode())]
@@ -89,20 +77,9 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
         else:
             start, goal = spec.way[:3], spec.way[3:]
             plan = planner.plan(start[0], start[1], goal)
-        if spec.condition == "nominal":
-            return Episode(spec, start, goal, plan, noise=noise)
-        if spec.condition == "wheel_slip":
-            patches = _draw_patches(rng, plan)
-            return Episode(spec, start, goal, plan, patches=patches, noise=noise)
-        if spec.condition == "blocked_aisle":
-            block = "partial" if rng.random() < 0.5 else "full"
-            pallets = _draw_block(rng, warehouse, plan, full=block == "full")
-            if pallets is not None:
-                return Episode(spec, start, goal, plan, block, pallets=pallets, noise=noise)
-        else:
-            walks = draw_walks(rng, warehouse, plan)
-            if walks is not None:
-                return Episode(spec, start, goal, plan, walks=walks, noise=noise)
+        staged = MISSIONS[spec.condition].stage(rng, warehouse, plan)
+        if staged is not None:
+            return Episode(spec, start, goal, plan, **vars(staged), noise=noise)
     low, high = warehouse.way_m
     raise ConfigError(
         f"no route of {low:g} to {high:g} m suits a {spec.condition} episode",
@@ -169,98 +146,3 @@ def _draw_way(
         where=f"layout {warehouse.name}",
         remedy="use a larger floor",
     )
-
-
-def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
-    """Oily floor before and in the sharpest turn, and mostly where the robot starts or stops.
-
-    Some patches lie under the wheels of one side only, which turns a robot that pulls or brakes.
-    """
-    patches = np.tile(NO_PATCH, (PATCHES, 1))
-    turn, total = _sharpest_turn(plan), length_m(plan)
-    places = [turn, turn - rng.uniform(0.6, 1.2)]
-    if rng.random() < 0.7:
-        places.append(total - rng.uniform(0.5, 1.5))
-    if rng.random() < 0.7:
-        places.append(rng.uniform(0.3, 1.2))
-    for row, place in enumerate(places):
-        at = point_along(plan, place)
-        ahead = point_along(plan, place + 0.3) - point_along(plan, place - 0.3)
-        long, wide = rng.uniform(1.2, 1.7), 1.5
-        if row > 0 and rng.random() < 0.35:  # under one side only: an edge along the plan
-            normal = np.array([-ahead[1], ahead[0]]) / max(float(np.hypot(*ahead)), 1e-9)
-            wide = 0.6
-            at = at + normal * rng.choice([-1.0, 1.0]) * wide
-        half = (long, wide) if abs(ahead[0]) > abs(ahead[1]) else (wide, long)
-        patches[row] = (*at, *half, rng.uniform(*PATCH_FRICTION))
-    return patches
-
-
-def _sharpest_turn(plan: F64) -> float:
-    """How far along the plan it bends most over .6 m."""
-    step = np.diff(plan, axis=0)
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    spacing = length_m(plan) / (len(plan) - 1)
-    reach = min(max(int(0.6 / spacing), 1), len(heading) // 3)
-    bend = np.abs(heading[2 * reach :] - heading[: -2 * reach])
-    return float((np.argmax(bend) + reach) * spacing)
-
-
-def _draw_block(
-    rng: np.random.Generator, warehouse: Warehouse, plan: F64, *, full: bool
-) -> F64 | None:
-    """Pallets across an aisle that the plan runs through; None where placed is no room for it."""
-    if not warehouse.segments:
-        return None
-    spacing = length_m(plan) / (len(plan) - 1)
-    arc = np.arange(len(plan)) * spacing
-    segment = warehouse.segment_of(plan[:, 0], plan[:, 1])
-    half_x, half_y = PALLET_HALF_M[:2]
-    room = (arc >= 1.9) & (arc <= arc[-1] - 1.5) & (segment >= 0)
-    edges = warehouse.segment_edges[np.maximum(segment, 0)]
-    turned = warehouse.segment_along_y[np.maximum(segment, 0)]
-    edges = np.where(turned[:, None], edges[:, [1, 0, 3, 2]], edges)
-    along = np.where(turned, plan[:, 1], plan[:, 0])
-    room &= (along > edges[:, 0] + half_x) & (along < edges[:, 2] - half_x)
-    places = np.flatnonzero(room)
-    if not len(places):
-        return None
-    place = int(rng.choice(places))
-    area = warehouse.segments[segment[place]].lengthwise
-    pallets = no_pallets()
-    x = along[place]
-    width = area.y_max - area.y_min
-    if full:
-        # Between the racks in a narrow aisle, and without a gap to pass in a wide one.
-        near = min(half_y, max(width / 2 - half_y, 0.0))
-        apart = float(np.clip(width / 2 - 2 * half_y, 0.0, 0.2))
-        for row in range(2):
-            side = 1 if row else -1
-            y = area.center[1] + side * (near + rng.uniform(0.0, apart))
-            pallets[row] = (x + rng.uniform(-0.1, 0.1), y, rng.normal(0.0, 0.03))
-    else:
-        gap = rng.uniform(*GAP_M)
-        if width < gap + 0.15:
-            return None
-        side = rng.choice([-1.0, 1.0])
-        y = area.center[1] + side * (width / 2 - gap - half_y)
-        pallets[0] = (x, y, rng.normal(0.0, 0.02))
-    if turned[place]:
-        placed = pallets[:, 0] > 0
-        pallets[placed] = pallets[placed][:, [1, 0, 2]]
-        pallets[placed, 2] = np.pi / 2 - pallets[placed, 2]
-    return pallets
-
-
-def length_m(plan: F64) -> float:
-    """The length of a polyline (P, 2)."""
-    return float(np.hypot(*np.diff(plan, axis=0).T).sum())
-
-
-def point_along(plan: F64, at_m: float) -> F64:
-    """The point `at_m` along an evenly spaced polyline (P, 2), clipped to its ends."""
-    total = length_m(plan)
-    place = np.clip(at_m / max(total, 1e-9), 0.0, 1.0) * (len(plan) - 1)
-    first = min(int(place), len(plan) - 2)
-    point: F64 = plan[first] + (place - first) * (plan[first + 1] - plan[first])
-    return point

@@ -13,6 +13,16 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.obstacles import (
+    FORKLIFT_HALF_M,
+    FORKLIFTS,
+    PALLET_HALF_M,
+    PALLETS,
+    PARKED_M,
+    PEOPLE,
+    PERSON_HALF_HEIGHT_M,
+    PERSON_RADIUS_M,
+)
 from restock.train.twin.physics.contact import (
     FLOOR,
     FLOOR_GROUP,
@@ -23,20 +33,12 @@ from restock.train.twin.physics.contact import (
 from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.robot_parts import actuator_places, add_robot, grip, wheels_of
 
-PALLETS = 2
-PALLET_HALF_M = (0.60, 0.40, 0.30)  # long side along the aisle
-PEOPLE = 2
-PERSON_RADIUS_M = 0.25
-PERSON_HALF_HEIGHT_M = 0.85
-FORKLIFTS = 1
-FORKLIFT_HALF_M = (0.60, 0.40, 0.60)
 # Of the mocap bodies (M, 3), in their order; a person is a cylinder.
 MOVING_HALF_M = np.repeat(
     [PALLET_HALF_M, (PERSON_RADIUS_M, PERSON_RADIUS_M, PERSON_HALF_HEIGHT_M), FORKLIFT_HALF_M],
     [PALLETS, PEOPLE, FORKLIFTS],
     axis=0,
 )
-PARKED_M = (-50.0, -50.0, 1.0)  # where bodies wait that no episode uses
 PARKED_RACK_M = (-60.0, -60.0, 1.0)
 RACK_HALF_HEIGHT_M = 0.75
 WALL_HALF_HEIGHT_M = 0.5
@@ -211,12 +213,6 @@ def passed_over(lidar_z_m: float) -> list[str]:
         "people": PERSON_HALF_HEIGHT_M,
     }
     return [f"{name} ({2 * half:g} m)" for name, half in heights.items() if lidar_z_m > 2 * half]
-
-
-def pallet_half_m(yaw_rad: F64) -> F64:
-    """Half sizes (..., 2) along x and y of pallets by heading (...): across, they are exchanged."""
-    across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
-    return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
 
 
 def yaw_of(quat: F64) -> F64:

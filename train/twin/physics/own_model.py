@@ -20,6 +20,11 @@ from restock.ingest.task.robot import Drive, Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.physics.robot_model import RobotModel
 
+# Divergence is counted and reported: MuJoCo shall not write MUJOCO_LOG.TXT where the user stands.
+_log = mujoco.MjLogConfig.get()
+_log.logto_file = False
+_log.set()
+
 PREFIX = "robot/"
 # The actuators of each drive, in the order of its wheels; what steers last.
 ROLES: dict[str, tuple[str, ...]] = {

@@ -14,14 +14,9 @@ import numpy as np
 from restock.arrays import F64, Ints
 from restock.state import Stateful
 from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.obstacles import PALLETS, PARKED_M
 from restock.train.twin.physics.episode import Episode
-from restock.train.twin.physics.model import (
-    MOVING_HALF_M,
-    PALLETS,
-    PARKED_M,
-    Handles,
-    building_boxes,
-)
+from restock.train.twin.physics.model import MOVING_HALF_M, Handles, building_boxes
 from restock.train.twin.physics.traffic import Traffic
 
 

@@ -9,26 +9,24 @@ robot, not the reverse.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.state import Stateful
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.physics.model import (
+from restock.train.twin.floors.obstacles import (
+    AGENTS,
     FORKLIFT_HALF_M,
     FORKLIFTS,
     PARKED_M,
     PEOPLE,
     PERSON_RADIUS_M,
+    WAY_POINTS,
+    Walk,
 )
 
-AGENTS = PEOPLE + FORKLIFTS  # the people first
-WAY_POINTS = 24
 FORKLIFT_RADIUS_M = 0.5  # of the circle that stands for it when it looks out
 YIELD_M = 0.5
-PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin
 STANDING_M = 0.15  # how near an inattentive one comes to a robot that stands or backs off
 RETREAT_M = 2.0  # how far off the robot a retreat ends
 DRIVEN_AT_MPS = 0.15  # closing speed from which on a robot counts as driving at someone
@@ -36,107 +34,6 @@ WAIT_S = 2.0
 HIDDEN, WAITING, WALKING, RETREATING = 0, 1, 2, 3
 _TRUCK_HALF_M = FORKLIFT_HALF_M[:2]
 _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-
-
-@dataclass(frozen=True)
-class Walk:
-    """One agent's way, (WAY_POINTS, 2) evenly spaced, and how it behaves on it."""
-
-    way_m: F64
-    speed_mps: float
-    trigger: tuple[float, float, float]  # x, y, and how near the robot must come to it
-    attentive: bool
-
-
-def draw_walks(
-    rng: np.random.Generator, warehouse: Warehouse, plan: F64
-) -> tuple[Walk | None, ...] | None:
-    """One or two people and perhaps a forklift on the robot's way; None where none fits."""
-    walks: list[Walk | None] = [None] * AGENTS
-    crossings = _crossings_on(plan, warehouse)
-    for slot in range(1 + int(rng.random() < 0.35)):
-        oncoming = rng.random() < 0.4 or not crossings
-        walks[slot] = (
-            _oncoming(rng, plan)
-            if oncoming
-            else _crossing(rng, warehouse, plan, crossings[rng.integers(len(crossings))], 0.3)
-        )
-    if crossings and rng.random() < 0.65:  # there is room for half of them
-        place = crossings[rng.integers(len(crossings))]
-        walks[PEOPLE] = _crossing(rng, warehouse, plan, place, 0.6)
-    return tuple(walks) if any(walk is not None for walk in walks) else None
-
-
-def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
-    """Points of the plan inside a crossing, at least 1.5 m from its ends."""
-    spacing = float(np.hypot(*(plan[1] - plan[0])))
-    margin = int(1.5 / max(spacing, 1e-6)) + 1
-    return [
-        index
-        for index in range(margin, len(plan) - margin)
-        if any(c.contains(plan[index, 0], plan[index, 1], 0.3) for c in warehouse.crossings)
-    ]
-
-
-def _crossing(
-    rng: np.random.Generator, warehouse: Warehouse, plan: F64, index: int, half_width_m: float
-) -> Walk | None:
-    """Straight across the plan at one of its points, as far as the racks allow."""
-    place = plan[index]
-    along = plan[min(index + 2, len(plan) - 1)] - plan[max(index - 2, 0)]
-    across = np.array([0.0, 1.0]) if abs(along[0]) > abs(along[1]) else np.array([1.0, 0.0])
-    across = across * rng.choice([-1.0, 1.0])
-    reach = [_free_m(warehouse, place, side * across, half_width_m) for side in (-1, 1)]
-    if min(reach) < 1.0 and max(reach) < 2.0:
-        return None
-    start, end = place - across * min(reach[0], 4.0), place + across * min(reach[1], 4.0)
-    ends = np.stack([start, end])
-    off_plan = np.hypot(*(ends[:, None] - plan[None]).transpose(2, 0, 1)).min(axis=1)
-    if off_plan.min() < half_width_m + PASSING_M:
-        return None  # who waits or has arrived there would leave no room to pass
-    speed = rng.uniform(0.5, 1.1)
-    arrival_s = float(np.hypot(*(place - start))) / speed + rng.uniform(-0.6, 0.6)
-    return Walk(
-        np.linspace(start, end, WAY_POINTS),
-        speed,
-        (float(place[0]), float(place[1]), float(np.clip(0.8 * arrival_s, 1.2, 4.0))),
-        bool(rng.random() < 0.4),
-    )
-
-
-def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
-    """Along the robot's plan, the other way, some way to one side of it."""
-    spacing = float(np.hypot(*(plan[1] - plan[0])))
-    length = spacing * (len(plan) - 1)
-    meet_m = rng.uniform(0.4, 0.7) * length
-    at = np.linspace(min(meet_m + 3.5, length), max(meet_m - 5.0, 0.0), WAY_POINTS)
-    place = np.clip(at / spacing, 0, len(plan) - 1.001)
-    first = place.astype(int)
-    way = plan[first] + (place - first)[:, None] * (plan[first + 1] - plan[first])
-    along = np.gradient(way, axis=0)
-    along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
-    offset = rng.uniform(0.25, 0.5) * rng.choice([-1.0, 1.0])
-    way = way + offset * np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    meet = plan[int(meet_m / spacing)]
-    return Walk(
-        way,
-        rng.uniform(0.5, 1.0),
-        (float(meet[0]), float(meet[1]), float(rng.uniform(2.0, 3.5))),
-        bool(rng.random() < 0.4),
-    )
-
-
-def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: float) -> float:
-    """How far one can go from a place in a direction before a rack or wall is too near."""
-    for step in range(1, 60):
-        x, y = place + direction * (0.1 * step)
-        on_floor = (
-            half_width_m <= x <= warehouse.width_m - half_width_m
-            and half_width_m <= y <= warehouse.depth_m - half_width_m
-        )
-        if not on_floor or any(rack.contains(x, y, -half_width_m) for rack in warehouse.racks):
-            return 0.1 * (step - 1)
-    return 6.0
 
 
 class Traffic(Stateful):

@@ -15,13 +15,12 @@ from restock.replay.fleet.missions_file import MissionsFile, as_toml
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.mission_orders import MissionOrders
-from restock.train.twin.physics.episode import KINDS, EpisodeSpec
+from restock.train.twin.missions.registry import KINDS, MISSIONS
+from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
 HANDOVER = "handover"  # the fleet: planners, and an operator who takes over from them
 SCRIPTED = (HANDOVER, "planner", "operator", "random")
-# What a site that runs well sees.
-NATURAL = {"nominal": 0.80, "wheel_slip": 0.07, "blocked_aisle": 0.07, "near_collision": 0.06}
 # How the fleet is driven: the planner (and its next release, on a few robots), whom an operator
 # helps out, and missions that an operator drives throughout.
 FLEET = {"planner 1": 0.70, "planner 2": 0.18, f"operator {Operator.version}": 0.12}
@@ -136,7 +135,9 @@ class OrderedMissions:
 
 def meets(kind: str, true_conditions: Sequence[str]) -> bool:
     """Whether a mission of a kind met it at one of its steps; a nominal one has nothing to meet."""
-    return kind == "nominal" or any(kind in text.split(",") for text in true_conditions)
+    return MISSIONS[kind].is_true is None or any(
+        kind in text.split(",") for text in true_conditions
+    )
 
 
 def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbation:
@@ -204,7 +205,6 @@ def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float
 
 __all__ = [
     "FLEET",
-    "NATURAL",
     "VERSIONS",
     "Mission",
     "OrderedMissions",

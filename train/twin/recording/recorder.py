@@ -29,6 +29,7 @@ from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.floors.planner import Planner
+from restock.train.twin.missions.registry import NATURAL
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.recording.bag_writer import Format, recording_sink
@@ -37,7 +38,6 @@ from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPoli
 from restock.train.twin.recording.fleet import DrivenMission, Fleet
 from restock.train.twin.recording.missions import (
     HANDOVER,
-    NATURAL,
     SCRIPTED,
     VERSIONS,
     Mission,

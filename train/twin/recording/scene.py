@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.train.twin.physics.contact import NO_PATCH
-from restock.train.twin.physics.model import (
+from restock.train.twin.floors.obstacles import (
     FORKLIFT_HALF_M,
+    NO_PATCH,
     PALLET_HALF_M,
     PARKED_M,
     PEOPLE,

@@ -81,7 +81,7 @@ class CoverageCommand:
         from restock.replay.mixture.mixture import load_mixture
         from restock.replay.store.audit import load_thresholds
         from restock.report import write_coverage_page
-        from restock.train.twin.physics.episode import KINDS
+        from restock.train.twin.missions.registry import KINDS
 
         advance(0, "what is missing")
         yields, gaps = find_gaps(

@@ -26,7 +26,6 @@ STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is mad
 WARM_UP_PART = 0.5  # of the draws that few rows allow
 UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
 INTERVALS = 20  # at least so many points of every curve
-BLOCKED = "blocked_aisle"
 DRIVERS = "behaviour_policies"  # of a row of the coverage
 INSIDE = 0.5  # of the ticks: with returns inside the outline at more, it is not the robot's
 NOT_AGAIN = ("paths", "out", "dry_run", "json")  # of a call: not what the way depends on
@@ -259,7 +258,7 @@ def evidence_lines(to: Settings) -> list[str]:
 def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
     """Train on the floors, on these kinds of episode; none: all."""
     from restock.toml import toml_value
-    from restock.train.twin.env.interface import DEFAULT_CONDITIONS
+    from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
 
     settings = [f"env.layouts={to.layouts}"]
     shares = {name: share for name, share in DEFAULT_CONDITIONS.items() if name in kinds}
@@ -270,15 +269,25 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
 
 def missions_unseen(to: Settings, document: Document) -> str | None:
     """What there is room for on the floor and no sensor sees, so that it is left out."""
-    task = _task(to.profile)
-    if task is None or task.lidar or BLOCKED not in document.get("episodes", []):
+    if not (unseen := _unseen(to, document)):
         return None
-    return "no missions with blocked aisles: without a lidar, a robot finds one by driving into it"
+    kinds = ", ".join(unseen).replace("_", " ")
+    return f"no missions of {kinds}: without a lidar, a robot finds it by driving into it"
+
+
+def _unseen(to: Settings, document: Document) -> list[str]:
+    """Return the kinds of episode that need a lidar, if the robot has none."""
+    from restock.train.twin.missions.registry import MISSIONS
+
+    task = _task(to.profile)
+    if task is None or task.lidar:
+        return []
+    return [kind for kind in document.get("episodes", []) if MISSIONS[kind].needs_lidar]
 
 
 def possible_kinds(to: Settings, document: Document) -> list[str]:
     """The kinds of episode that the floor has room for and that the robot can do."""
-    unseen = {BLOCKED} if missions_unseen(to, document) else set()
+    unseen = _unseen(to, document)
     return [kind for kind in document.get("episodes", []) if kind not in unseen]
 
 

@@ -89,9 +89,10 @@ class RecordCommand:
         from restock.train.twin.env.floor_report import refuse_unfit, sealed
         from restock.train.twin.floors.floors import open_floors
         from restock.train.twin.floors.planner import planners
+        from restock.train.twin.missions.registry import NATURAL
         from restock.train.twin.physics.perturbation import find_perturbation
         from restock.train.twin.recording.bag_writer import refuse_existing
-        from restock.train.twin.recording.missions import NATURAL, parse_shares
+        from restock.train.twin.recording.missions import parse_shares
         from restock.train.twin.recording.recorder import (
             FIRST_NS,
             HARDWARE,

@@ -20,6 +20,7 @@ import numpy as np
 import vl_convert
 
 from restock.report.look.blocks import Drawing, words
+from restock.train.twin.missions.registry import MISSIONS
 
 Row = Mapping[str, Any]
 
@@ -28,12 +29,12 @@ FULL = (300, 630, 1000)  # of one with the line for itself
 
 # Okabe-Ito: colour-blind readers can distinguish them too.
 CONDITION_COLOURS = {
-    "nominal": "#6b7280",
-    "wheel_slip": "#0072b2",
-    "blocked_aisle": "#e69f00",
-    "blocked_aisle (partial)": "#e69f00",
-    "blocked_aisle (full)": "#8a5a00",
-    "near_collision": "#d55e00",
+    **{name: one.colour for name, one in MISSIONS.items()},
+    **{
+        f"{name} ({block})": colour
+        for name, one in MISSIONS.items()
+        for block, colour in one.blocks.items()
+    },
     "recovery": "#cc79a7",
 }
 WORDS_COLOURS = {words(name): colour for name, colour in CONDITION_COLOURS.items()}

@@ -1,0 +1,70 @@
+"""What a kind of mission says of itself. Each kind is a module here with a `MISSION`.
+
+The registry finds the modules; nothing else lists them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from restock.arrays import F64, Bools
+from restock.train.twin.floors.layout import Warehouse
+from restock.train.twin.floors.obstacles import AGENTS, NO_PATCH, PATCHES, Walk, no_pallets
+
+
+@dataclass(frozen=True)
+class Staged:
+    """What stands, lies and walks in the way of an episode."""
+
+    block: str = "none"
+    pallets: F64 = field(default_factory=no_pallets)  # (PALLETS, 3): x, y, yaw
+    patches: F64 = field(default_factory=lambda: np.tile(NO_PATCH, (PATCHES, 1)))  # (PATCHES, 5)
+    walks: tuple[Walk | None, ...] = (None,) * AGENTS
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What physically was so over a step of N environments, each (N,)."""
+
+    plan_blocked: Bools  # at t: pallets lay on the plan just ahead
+    near: Bools  # at t + 1: nearer than the task's `tight_clearance_m`, or the bumper was pressed
+    slipped: Bools  # a wheel moved over a slippery patch by more than the task's limit
+    clearance_m: F64  # at t + 1, from the body's edge
+    traffic_gap_m: F64  # (N, AGENTS) at t, to each person and forklift; inf: not there
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A kind of mission: `stage` draws an episode of it, `is_true` scores its steps.
+
+    `stage` takes a generator, the floor and the plan (P, 2), and returns None if that plan has no
+    room for it. Its draws decide what a seed means: keep their order.
+    """
+
+    name: str
+    stage: Callable[[np.random.Generator, Warehouse, F64], Staged | None]
+    share: float  # of training's missions, unless a config says otherwise
+    natural: float  # of the missions of a site that runs well
+    colour: str  # in charts, from Okabe and Ito
+    place: int  # among the kinds; the same place: by name
+    is_true: Callable[[Situation], Bools] | None = None  # None: there is nothing to meet
+    blocks: Mapping[str, str] = field(default_factory=dict)  # ways it can be staged: colours
+    block_measures: Mapping[str, str] = field(default_factory=dict)  # of a study: name -> block
+    needs_lidar: bool = False  # without one a robot meets it only by driving into it
+
+
+def length_m(plan: F64) -> float:
+    """The length of a polyline (P, 2)."""
+    return float(np.hypot(*np.diff(plan, axis=0).T).sum())
+
+
+def point_along(plan: F64, at_m: float) -> F64:
+    """The point `at_m` along an evenly spaced polyline (P, 2), clipped to its ends."""
+    total = length_m(plan)
+    place = np.clip(at_m / max(total, 1e-9), 0.0, 1.0) * (len(plan) - 1)
+    first = min(int(place), len(plan) - 2)
+    point: F64 = plan[first] + (place - first) * (plan[first + 1] - plan[first])
+    return point
