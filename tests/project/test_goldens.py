@@ -16,7 +16,6 @@ GOLDEN = json.loads(KEPT.read_text())
 def computed(tmp_path_factory: pytest.TempPathFactory) -> Hashes:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RESTOCK_NATIVE", "0")
-        patch.setattr("restock.train.prepare.update_path", lambda *_: "autograd", raising=False)
         return compute_hashes(Path(tmp_path_factory.mktemp("goldens")))
 
 
