@@ -35,8 +35,13 @@ LANGUAGES = (
 )  # py: signatures in docs/reference.md
 ALL = {page: blocks(page) for page in PAGES}
 NOTEBOOKS = [ROOT / "docs/tutorial.md"]  # test_tutorial.py runs it
-PAGES_RUN = [p for p in PAGES if p not in NOTEBOOKS and any(block.is_run for block in ALL[p])]
-PAGES_SLOW = [page for page in PAGES if any("slow" in block.marks for block in ALL[page])]
+PARTS = {  # (page, number of its folder) -> the blocks that run there, one after the other
+    (page, number): list(part)
+    for page in PAGES
+    for number, part in groupby(ALL[page], lambda block: block.folder)
+}
+PARTS_RUN = [p for p in PARTS if p[0] not in NOTEBOOKS and any(b.is_run for b in PARTS[p])]
+PARTS_SLOW = [part for part in PARTS if any("slow" in block.marks for block in PARTS[part])]
 TOML = [b for told in ALL.values() for b in told if b.language == "toml" and "file" not in b.marks]
 
 
@@ -71,37 +76,40 @@ def prepared(server: Reader, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run_page(page: Path, server: Reader, prepared: Path, folder: Path, *, slow: bool) -> None:
-    for number, told in groupby(blocks(page), lambda block: block.folder):
-        run_blocks(list(told), server, prepared, folder / str(number), slow=slow)
+def part_name(part: tuple[Path, int]) -> str:
+    return f"{name(part[0])}-{part[1]}"
 
 
-def run_blocks(
-    told: list[Block], server: Reader, prepared: Path, folder: Path, *, slow: bool
+def run_part(
+    part: tuple[Path, int], server: Reader, prepared: Path, folder: Path, *, slow: bool
 ) -> None:
     shutil.copytree(prepared, folder, symlinks=True)
-    for block in told:
+    for block in PARTS[part]:
         if target := block.marks.get("file"):
             (folder / target).parent.mkdir(parents=True, exist_ok=True)
             (folder / target).write_text(block.text, encoding="utf-8")
-    wanted = [block for block in told if block.is_run and (slow or "slow" not in block.marks)]
+    wanted = [
+        block for block in PARTS[part] if block.is_run and (slow or "slow" not in block.marks)
+    ]
     wrong = server.run(wanted, folder)
     assert not wrong, wrong
 
 
 @pytest.mark.docs
-@pytest.mark.parametrize("page", PAGES_RUN, ids=name)
-def test_a_page_runs_as_printed(page: Path, server: Reader, prepared: Path, tmp_path: Path) -> None:
-    run_page(page, server, prepared, tmp_path / "reader", slow=False)
+@pytest.mark.parametrize("part", PARTS_RUN, ids=part_name)
+def test_a_page_runs_as_printed(
+    part: tuple[Path, int], server: Reader, prepared: Path, tmp_path: Path
+) -> None:
+    run_part(part, server, prepared, tmp_path / "reader", slow=False)
 
 
 @pytest.mark.docs
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES_SLOW, ids=name)
+@pytest.mark.parametrize("part", PARTS_SLOW, ids=part_name)
 def test_a_page_runs_with_its_slow_blocks(
-    page: Path, server: Reader, prepared: Path, tmp_path: Path
+    part: tuple[Path, int], server: Reader, prepared: Path, tmp_path: Path
 ) -> None:
-    run_page(page, server, prepared, tmp_path / "reader", slow=True)
+    run_part(part, server, prepared, tmp_path / "reader", slow=True)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

@@ -86,7 +86,9 @@ class Kernel:
         """Return action values (B, A)."""
         if self._gradient is None or not torch.is_grad_enabled():
             return self._forward(observation)
-        values: Tensor = _Differentiated.apply(self._anchor, observation, self)
+        values: Tensor = _Differentiated.apply(  # type: ignore[no-untyped-call]
+            self._anchor, observation, self
+        )
         return values
 
     def _forward(self, observation: Tensor) -> Tensor:
