@@ -15,13 +15,11 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.renamed import MIXTURE_KEYS, MIXTURES
 from restock.replay.mixture.schedules import Fraction, Portion, Schedule, knots, value_at
-from restock.toml import Checked, parse_toml, read_toml, typed
-from restock.toml_schema import json_schema
+from restock.toml import Checked, json_schema, parse_toml, read_toml, typed
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
-# Shipped mixtures by the names of earlier versions.
-_RENAMED = {"missions": "coverage"}
 SCHEMA_FILE = "mixture.schema.json"
 
 AtLeastOne = Annotated[int, Meta(ge=1)]
@@ -351,9 +349,8 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
     else:
         raise ConfigError(
             f"there is no mixture {name!r}",
-            remedy=f"it is now called {_RENAMED[name]!r}"
-            if name in _RENAMED
-            else f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
+            remedy=MIXTURES.get(name)
+            or f"give a TOML file, or one of {', '.join(shipped_mixtures())}",
         )
     return parse_mixture(text, where=name)
 
@@ -369,7 +366,7 @@ def _mixture(document: dict[str, Any], where: str) -> Mixture:
         Mixture,
         where=where,
         remedy="docs/mixture.md lists every key",
-        renamed={"held_out": "evaluation_split"},
+        renamed=MIXTURE_KEYS,
     )
 
 

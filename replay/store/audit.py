@@ -30,6 +30,7 @@ import duckdb
 from restock.errors import ConfigError, StoreError, expect
 from restock.files import first_line
 from restock.interrupts import interrupts_raised
+from restock.renamed import AUDITS
 from restock.replay.store.definitions import install_named, is_empty, rows_held
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import found, interruptible
@@ -40,14 +41,6 @@ Status = Literal["pass", "fail", "warn", "info", "skipped"]
 Thresholds = Mapping[str, Mapping[str, float | str]]
 
 SAMPLE_ROWS = 10
-# Audits and thresholds by the names of earlier versions.
-RENAMED = {
-    "flattering_evaluation": "evaluation_bias",
-    "flattering_panel": "panel_bias",
-    "flattering_policy": "policy_bias",
-    "observation_drift": "signal_drift",
-    "max_flattery": "max_bias",
-}
 OFFENDED: Mapping[Severity, Status] = {"error": "fail", "warning": "warn", "info": "info"}
 WORST_FIRST: tuple[Status, ...] = ("fail", "warn", "info", "pass", "skipped")
 
@@ -275,7 +268,7 @@ def check_thresholds(
         expect(f"thresholds[{name!r}]", table, Mapping, "give its thresholds by their names")
         if name not in used:
             likely = get_close_matches(name, used, n=1, cutoff=0.9 if others else 0.6)
-            if others and not likely and name not in RENAMED:
+            if others and not likely and name not in AUDITS:
                 continue
             remedy = _instead(name, likely, f"the audits are {', '.join(used)}")
             raise ConfigError(f"no audit named {name!r}", where="thresholds", remedy=remedy)
@@ -292,8 +285,8 @@ def check_thresholds(
 
 
 def _instead(name: str, likely: Sequence[str], known: str) -> str:
-    if name in RENAMED:
-        return f"it is now called {RENAMED[name]!r}: rename it"
+    if name in AUDITS:
+        return AUDITS[name]
     return f"did you mean {likely[0]!r}?" if likely else known
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import json
 import math
 import re
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-from msgspec import inspect
+from msgspec import inspect as kinds
 
 from restock.errors import ConfigError
 
@@ -109,19 +110,15 @@ def typed(
     """Plain values as a typed struct.
 
     Args:
-        renamed: keys of earlier versions, dotted, each with the name that it has now.
+        renamed: keys of earlier versions, dotted, each with what became of it (restock.renamed).
         prefix: what stands before each key in errors, dotted.
 
     Raises:
         ConfigError: an unknown, missing or renamed key, or a value that does not fit; names it.
     """
-    for old, new in (renamed or {}).items():
+    for old, instead in (renamed or {}).items():
         if _has(document, old.split(".")):
-            raise ConfigError(
-                f"unknown key `{_join(prefix, old)}`",
-                where=where,
-                remedy=f"it is now called `{_join(prefix, new)}`: rename it",
-            )
+            raise ConfigError(f"unknown key `{_join(prefix, old)}`", where=where, remedy=instead)
     try:
         return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
@@ -195,30 +192,30 @@ def _key(name: str) -> str:
 
 
 @functools.cache
-def _ranges(kind: type) -> dict[str, inspect.Type]:
+def _ranges(kind: type) -> dict[str, kinds.Type]:
     """The fields of a struct that are numbers to check, or hold some."""
-    info = inspect.type_info(kind)
-    assert isinstance(info, inspect.StructType)
+    info = kinds.type_info(kind)
+    assert isinstance(info, kinds.StructType)
     return {f.name: f.type for f in info.fields if _ranged(f.type)}
 
 
-def _ranged(kind: inspect.Type) -> bool:
-    if isinstance(kind, inspect.UnionType):
+def _ranged(kind: kinds.Type) -> bool:
+    if isinstance(kind, kinds.UnionType):
         return any(map(_ranged, kind.types))
-    if isinstance(kind, inspect.TupleType):
+    if isinstance(kind, kinds.TupleType):
         return any(map(_ranged, kind.item_types))
     item = _item(kind)
     return _is_number(kind) or (item is not None and _ranged(item))
 
 
-def _is_number(kind: inspect.Type) -> bool:
-    return bool(_bounds(kind)) or isinstance(kind, inspect.FloatType)
+def _is_number(kind: kinds.Type) -> bool:
+    return bool(_bounds(kind)) or isinstance(kind, kinds.FloatType)
 
 
-def _item(kind: inspect.Type) -> inspect.Type | None:
-    if isinstance(kind, inspect.DictType):
+def _item(kind: kinds.Type) -> kinds.Type | None:
+    if isinstance(kind, kinds.DictType):
         return kind.value_type
-    if isinstance(kind, inspect.VarTupleType | inspect.ListType):
+    if isinstance(kind, kinds.VarTupleType | kinds.ListType):
         return kind.item_type
     return None
 
@@ -237,18 +234,18 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _check(name: str, kind: inspect.Type, value: Any) -> None:
+def _check(name: str, kind: kinds.Type, value: Any) -> None:
     if value is None:
         return
-    if isinstance(kind, inspect.UnionType):
+    if isinstance(kind, kinds.UnionType):
         fitting = [k for k in kind.types if _is_number(k) and isinstance(value, int | float)]
         several = not isinstance(value, int | float | str)
-        lists = (k for k in kind.types if _item(k) or isinstance(k, inspect.TupleType))
+        lists = (k for k in kind.types if _item(k) or isinstance(k, kinds.TupleType))
         fitting += [k for k in lists if several]
         for option in fitting:
             _check(name, option, value)
         return
-    if isinstance(kind, inspect.TupleType):
+    if isinstance(kind, kinds.TupleType):
         if len(value) != len(kind.item_types):
             raise ValueError(f"{name} must have {len(kind.item_types)} values, got {len(value)}")
         for index, (one_kind, one) in enumerate(zip(kind.item_types, value, strict=True)):
@@ -269,7 +266,7 @@ def _check(name: str, kind: inspect.Type, value: Any) -> None:
         raise ValueError(f"{name} must be finite, got {value}")
 
 
-def _bounds(kind: inspect.Type) -> dict[str, float]:
+def _bounds(kind: kinds.Type) -> dict[str, float]:
     bounds = {name: getattr(kind, name, None) for name in ("ge", "gt", "le", "lt")}
     return {name: bound for name, bound in bounds.items() if bound is not None}
 
@@ -303,12 +300,12 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
             return f"{word} key `{_join(prefix, path, field[1])}`"
     key = _join(prefix, path)
     if re.fullmatch(r"Expected `\w+` [<>]=? .*", what):
-        place = _walk(inspect.type_info(kind), document, path)
+        place = _walk(kinds.type_info(kind), document, path)
         if place is not None:
             bounds, value, key = *place[:2], _join(prefix, place[2])
             return f"{key} must be {_range_in_words(bounds)}, got {value}"
     if re.match(r"Expected `|Invalid ", what) or not path:
-        choices = sorted(set(_choices(inspect.type_info(kind), path)))
+        choices = sorted(set(_choices(kinds.type_info(kind), path)))
         if choices and choices[0].startswith('"'):  # names stand before other kinds
             what += f"; choose from {', '.join(choices)}"
         return f"`{key}`: {what}" if key else what
@@ -325,20 +322,20 @@ def _key_meant(message: str, kind: Any, prefix: str) -> str | None:
         return None
     from difflib import get_close_matches
 
-    near = get_close_matches(unknown[1], set(_keys(inspect.type_info(kind), path)), n=1)
+    near = get_close_matches(unknown[1], set(_keys(kinds.type_info(kind), path)), n=1)
     return _join(prefix, path, near[0]) if near else None
 
 
-def _keys(kind: inspect.Type, path: str) -> Iterator[str]:
+def _keys(kind: kinds.Type, path: str) -> Iterator[str]:
     """The keys of the table that a message's path leads to; of several that it may be, of all."""
-    if isinstance(kind, inspect.UnionType):
+    if isinstance(kind, kinds.UnionType):
         for option in kind.types:
             yield from _keys(option, path)
-    elif isinstance(kind, inspect.StructType) and not path:
+    elif isinstance(kind, kinds.StructType) and not path:
         yield from (field.encode_name for field in kind.fields)
         yield from (kind.tag_field,) if kind.tag_field else ()
     elif step := re.fullmatch(_STEP, path, re.S):
-        if isinstance(kind, inspect.StructType):
+        if isinstance(kind, kinds.StructType):
             for field in kind.fields:
                 if field.encode_name == step[1][1:]:
                     yield from _keys(field.type, step[2])
@@ -346,9 +343,9 @@ def _keys(kind: inspect.Type, path: str) -> Iterator[str]:
             yield from _keys(item, step[2])
 
 
-def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], Any, str] | None:
+def _walk(kind: kinds.Type, value: Any, path: str) -> tuple[dict[str, float], Any, str] | None:
     """Bounds, value and key of what a message's path leads to; `[...]` is any item of a map."""
-    if isinstance(kind, inspect.UnionType):
+    if isinstance(kind, kinds.UnionType):
         for option in kind.types:
             if place := _walk(option, value, path):
                 return place
@@ -357,7 +354,7 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
         bounds = _bounds(kind)
         return (bounds, value, "") if bounds and not _inside(value, bounds) else None
     step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
-    if isinstance(kind, inspect.StructType | inspect.TypedDictType | inspect.DataclassType):
+    if isinstance(kind, kinds.StructType | kinds.TypedDictType | kinds.DataclassType):
         fields = {field.encode_name: field.type for field in kind.fields}
         name = step[1:]
         if name not in fields or not isinstance(value, Mapping) or name not in value:
@@ -365,7 +362,7 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
         place = _walk(fields[name], value[name], rest)
         return place and (place[0], place[1], _join(name, place[2]))
     item = _item(kind)
-    if isinstance(kind, inspect.TupleType):
+    if isinstance(kind, kinds.TupleType):
         item = kind.item_types[int(step[1:-1])]
     if item is None or not isinstance(value, Mapping | list | tuple):
         return None
@@ -380,22 +377,22 @@ def _walk(kind: inspect.Type, value: Any, path: str) -> tuple[dict[str, float], 
     return place and (place[0], place[1], _join(step, place[2]))
 
 
-def _choices(kind: inspect.Type, path: str) -> Iterator[str]:
+def _choices(kind: kinds.Type, path: str) -> Iterator[str]:
     """What may stand where a message's path leads to: names in quotes, or a number or table."""
-    if isinstance(kind, inspect.UnionType):
+    if isinstance(kind, kinds.UnionType):
         for option in kind.types:
             yield from _choices(option, path)
         return
     if not path:
-        if isinstance(kind, inspect.LiteralType):
+        if isinstance(kind, kinds.LiteralType):
             yield from (f'"{value}"' for value in kind.values)
-        elif isinstance(kind, inspect.IntType | inspect.FloatType):
+        elif isinstance(kind, kinds.IntType | kinds.FloatType):
             yield "a number"
-        elif isinstance(kind, inspect.StructType | inspect.DictType):
+        elif isinstance(kind, kinds.StructType | kinds.DictType):
             yield "a table"
         return
     step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
-    if isinstance(kind, inspect.StructType):
+    if isinstance(kind, kinds.StructType):
         if step[1:] == kind.tag_field:
             yield f'"{kind.tag}"'
         for field in kind.fields:
@@ -441,4 +438,74 @@ def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any)
     return [name for name in named if getattr(settings, name) != getattr(usual, name)]
 
 
-__all__ = ["Checked", "by_path", "changed", "parse_toml", "read_toml", "toml_value", "typed"]
+_FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
+
+
+def json_schema(kind: type, title: str) -> str:
+    """Return the JSON Schema of a struct's TOML, for editors: `#:schema FILE` names it.
+
+    Types, ranges and defaults are those of the struct, descriptions the comments beside its fields.
+    What concerns several keys at once is not in it: only reading the file says.
+    """
+    schema = msgspec.json.schema(kind)
+    structs = {struct.__name__: struct for struct in _structs(kinds.type_info(kind), set())}
+    for name, definition in schema.get("$defs", {}).items():
+        definition["properties"] = {
+            key: _without_null(value) for key, value in definition.get("properties", {}).items()
+        }
+        if "description" in definition:  # a docstring, which keeps its indent before Python 3.13
+            definition["description"] = inspect.cleandoc(definition["description"])
+        if (struct := structs.get(name)) is None:
+            continue
+        names = {field.name: field.encode_name for field in msgspec.structs.fields(struct)}
+        for part in struct.__mro__:
+            if part is msgspec.Struct or not issubclass(part, msgspec.Struct):
+                break
+            for field, comment in _FIELD.findall(inspect.getsource(part)):
+                key = names.get(field)
+                if key in definition["properties"]:
+                    definition["properties"][key].setdefault("description", comment)
+    draft = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps({"$schema": draft, "title": title, **schema}, indent=1) + "\n"
+
+
+def _structs(kind: kinds.Type, seen: set[type]) -> Iterator[type]:
+    """Every struct that a type holds."""
+    if isinstance(kind, kinds.StructType):
+        if kind.cls in seen:
+            return
+        seen.add(kind.cls)
+        yield kind.cls
+        for field in kind.fields:
+            yield from _structs(field.type, seen)
+    elif isinstance(kind, kinds.UnionType):
+        for option in kind.types:
+            yield from _structs(option, seen)
+    elif isinstance(kind, kinds.TupleType):
+        for item in kind.item_types:
+            yield from _structs(item, seen)
+    elif isinstance(kind, kinds.DictType):
+        yield from _structs(kind.value_type, seen)
+    elif isinstance(kind, kinds.CollectionType):
+        yield from _structs(kind.item_type, seen)
+
+
+def _without_null(value: dict[str, Any]) -> dict[str, Any]:
+    """TOML has no null: what may be left out is a field without one."""
+    choices = [choice for choice in value.get("anyOf", ()) if choice != {"type": "null"}]
+    if len(choices) == len(value.get("anyOf", ())):
+        return value
+    rest = {key: item for key, item in value.items() if key != "anyOf" and item is not None}
+    return {**choices[0], **rest} if len(choices) == 1 else {"anyOf": choices, **rest}
+
+
+__all__ = [
+    "json_schema",
+    "Checked",
+    "by_path",
+    "changed",
+    "parse_toml",
+    "read_toml",
+    "toml_value",
+    "typed",
+]

@@ -20,7 +20,6 @@ from restock.arrays import F64
 from restock.errors import ArgumentError, RunError
 from restock.toml import by_path
 from restock.train.comparison.comparability import Feed
-from restock.train.dqn.removed_settings import without_removed
 from restock.train.run.run import Run
 
 Treatment = Literal["algorithm", "target", "mixture", "practice", "data", "method"]
@@ -258,8 +257,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
     Shares of strata are left out: `panel.id` stands for them, and two of one name are not the same.
     """
-    config = without_removed(run.document.get("config", {}))
-    document = {**run.document, "config": config}
+    document = run.document
     settings = by_path({key: document[key] for key in document if key not in _NO_SETTING})
     shares = ("panel.strata.", "panel.forecast")
     return {name: value for name, value in settings if not name.startswith(shares)}

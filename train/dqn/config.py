@@ -18,16 +18,15 @@ import msgspec
 from msgspec import Meta
 
 from restock.errors import ConfigError
+from restock.renamed import TRAINING_KEYS
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.replay.mixture.schedules import Portion
 from restock.toml import Checked, changed, read_toml, toml_value, typed
-from restock.train.dqn.removed_settings import refuse_removed, without_removed
 from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.twin.env.interface import LinearEpsilon
 from restock.train.twin.missions.registry import DEFAULT_CONDITIONS
 from restock.train.twin.physics.perturbation import find_perturbation
 
-RENAMED = {"guide": "jump_start"}  # keys of earlier versions
 GIVEN = "given"  # the source of a teacher that Python code passed in
 
 Count = Annotated[int, Meta(ge=1)]
@@ -330,13 +329,11 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
     """A typed config from plain values.
 
     Raises:
-        ConfigError: an unknown, renamed or removed key, or a value out of range; names the key.
+        ConfigError: an unknown or renamed key, or a value out of range; names the key.
     """
-    document = without_removed(document)
-    refuse_removed(document, where=where)
     _refuse_other_rule(document.get("target"), where)
     remedy = "docs/train.md lists every key with its meaning"
-    return typed(document, TrainConfig, where=where, remedy=remedy, renamed=RENAMED)
+    return typed(document, TrainConfig, where=where, remedy=remedy, renamed=TRAINING_KEYS)
 
 
 def _refuse_other_rule(target: Any, where: str) -> None:

@@ -36,8 +36,8 @@ from restock.words import quoted
 if TYPE_CHECKING:
     from restock.replay.panel.panel import Panel
 
-FORMAT = "restock-run/2"
-_EARLIER = ("restock-run/1",)
+FORMAT = "restock-run/3"
+_EARLIER = ("restock-run/1", "restock-run/2")
 _LONG_TABLE = 4096  # rows
 _UNKNOWN = -1  # rows on disk: others than those in memory, so the next flush writes them
 _AGAIN = "restore the file from a copy, or train the run again"

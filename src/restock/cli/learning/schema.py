@@ -71,7 +71,7 @@ class SchemaCommand:
 
 def schema_of(name: str) -> str:
     """The schema of a config, as JSON text."""
-    from restock.toml_schema import json_schema
+    from restock.toml import json_schema
 
     kind, changed = _kinds()[name]
     schema = json.loads(json_schema(kind, f"Restock {name}"))

@@ -1,0 +1,30 @@
+"""Say what the names of earlier versions became: the only place that knows them. Goes at 1.0."""
+
+from __future__ import annotations
+
+
+def _now(name: str) -> str:
+    return f"it is now called {name}: rename it"
+
+
+_GONE = "it was removed, as it gained nothing (docs/evidence.md): leave it out"
+
+TRAINING_KEYS = {
+    "guide": _now("`jump_start`"),
+    "network.dueling": _GONE,
+    "network.ensemble": _GONE,
+    "network.quantiles": _GONE,
+    "loss.calibrated": _GONE,
+    "loss.munchausen": _GONE,
+    "loss.munchausen_floor": _GONE,
+    "loss.munchausen_temperature": _GONE,
+}
+MIXTURE_KEYS = {"held_out": _now("`evaluation_split`")}
+MIXTURES = {"missions": _now("'coverage'")}
+AUDITS = {  # and their thresholds
+    "flattering_evaluation": _now("'evaluation_bias'"),
+    "flattering_panel": _now("'panel_bias'"),
+    "flattering_policy": _now("'policy_bias'"),
+    "observation_drift": _now("'signal_drift'"),
+    "max_flattery": _now("'max_bias'"),
+}
