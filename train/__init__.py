@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     from restock.train.diagnosis.before_training import (
         diagnose_before_training as diagnose_before_training,
     )
+    from restock.train.dqn.algorithm import Algorithm as Algorithm
+    from restock.train.dqn.algorithm import Loss as Loss
+    from restock.train.dqn.algorithm import TrainingBatch as TrainingBatch
     from restock.train.dqn.config import TrainConfig as TrainConfig
+    from restock.train.dqn.network import QNetwork as QNetwork
     from restock.train.evaluation.eval_run import evaluate as evaluate
     from restock.train.evaluation.ope import OpeConfig as OpeConfig
     from restock.train.evaluation.ope import evaluate_run_off_policy as evaluate_run_off_policy
@@ -43,7 +47,9 @@ else:
             "restock.train.comparison.run_difference": ["diff_runs"],
             "restock.train.comparison.diagnose": ["diagnose"],
             "restock.train.diagnosis.before_training": ["diagnose_before_training"],
+            "restock.train.dqn.algorithm": ["Algorithm", "Loss", "TrainingBatch"],
             "restock.train.dqn.config": ["TrainConfig"],
+            "restock.train.dqn.network": ["QNetwork"],
             "restock.train.evaluation.eval_run": ["evaluate"],
             "restock.train.evaluation.ope": ["OpeConfig", "evaluate_run_off_policy"],
             "restock.train.evaluation.regression": ["compare_with_baseline", "regressed"],

@@ -9,8 +9,7 @@ the twin, evaluation and ONNX use. The target of a row is the quantiles of its b
 import torch
 from torch import Tensor
 
-from restock.train.dqn.algorithm import Loss, TrainingBatch
-from restock.train.dqn.network import QNetwork
+from restock.train import Loss, QNetwork, TrainingBatch
 
 QUANTILES = 32
 
