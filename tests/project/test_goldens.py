@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from support.goldens import KEPT, Hashes, compute_hashes, made_on
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 GOLDEN = json.loads(KEPT.read_text())
 
 
