@@ -70,7 +70,7 @@ def list_run_tables() -> Iterator[str]:
 def list_views() -> Iterator[str]:
     """Yield every view of a store, with every column."""
     from restock.ingest.task.schema import frame_schema, recording_schema, transition_schema
-    from restock.replay.store.column_docs import install_columns, view_docs
+    from restock.replay.store.column_docs import HELD, install_columns, view_docs
     from restock.replay.store.definitions import FRAMES, definitions
 
     with duckdb.connect() as connection:
@@ -81,9 +81,17 @@ def list_views() -> Iterator[str]:
         install_columns(connection)
         rows = connection.sql("FROM columns").fetchall()
     for view, doc in view_docs().items():
+        of_view = [row[1:] for row in rows if row[0] == view]
+        if view == HELD:
+            doc += ". It has the columns of `transitions`, and one more"
+            of_view = [row for row in of_view if row[0] == "condition"]
         yield f"### {view}\n\n{doc[0].upper()}{doc[1:]}.\n"
-        columns = [row[1:] for row in rows if row[0] == view]
+        columns = [(name, _short_type(kind), *rest) for name, kind, *rest in of_view]
         yield from _table(("column", "type", "unit", "meaning"), columns)
+
+
+def _short_type(kind: str) -> str:
+    return "STRUCT(…)[]" if kind.startswith("STRUCT") else kind
 
 
 def list_audits() -> Iterator[str]:

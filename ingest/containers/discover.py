@@ -308,5 +308,5 @@ def container_of(path: Path) -> Container | None:
     raise RecordingError(
         "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",
         where=where,
-        remedy="recordings are .mcap files, rosbag2 folders or their .db3 files, and .bag files",
+        remedy=_NAMES,
     )
