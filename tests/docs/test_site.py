@@ -26,5 +26,6 @@ def test_the_site_is_whole_and_loads_nothing(tmp_path: Path) -> None:
     assert "./javascripts/iframe-worker.js" in loaded  # without it there is no search from file://
     assert [one for one in loaded if not (site / one).is_file()] == []
     assert (site / "search.js").is_file()
-    assert "build_panel" in (site / "api.html").read_text(encoding="utf-8")
-    assert "restock ingest" in (site / "cli.html").read_text(encoding="utf-8")
+    reference = (site / "reference.html").read_text(encoding="utf-8")
+    assert "build_panel" in reference
+    assert "restock ingest" in reference
