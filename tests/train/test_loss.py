@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from torch import tensor
+from torch import Tensor, int64, stack, tensor, zeros
 
 from restock.train.dqn.algorithm import (
     conservative_penalty,
     dqn_loss,
-    huber,
     margin_penalty,
     td_target,
 )
@@ -30,6 +29,13 @@ def test_double_dqn_selects_with_the_online_and_evaluates_with_the_target_networ
     reward, discount = tensor([1.0]), tensor([0.5])
     assert td_target(reward, discount, slow, online).tolist() == [2.0]  # 1 + 0.5 * 2
     assert td_target(reward, discount, slow).tolist() == [3.0]  # 1 + 0.5 * 4
+
+
+def huber(error: Tensor, delta: float = 1.0) -> Tensor:
+    """Return the loss of each error alone: of one action value against a target of 0."""
+    action, target = zeros(1, dtype=int64), zeros(1)
+    losses = [dqn_loss(one.reshape(1, 1), action, target, huber_delta=delta) for one in error]
+    return stack([loss.value for loss in losses])
 
 
 def test_huber_is_quadratic_then_linear() -> None:

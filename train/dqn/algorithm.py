@@ -210,11 +210,6 @@ def td_target(
     return reward + discount * next_target_q.gather(1, best).squeeze(1)
 
 
-def huber(error: Tensor, delta: float = 1.0) -> Tensor:
-    """Return error**2 / 2 up to |error| = delta, then linear with slope delta; elementwise."""
-    return functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=delta)
-
-
 def dqn_loss(
     q: Tensor,
     action: Tensor,
@@ -227,11 +222,15 @@ def dqn_loss(
 
     `weight` (B,) are importance weights that correct the sampling; None is all ones.
     """
-    chosen = q.gather(1, action.unsqueeze(1)).squeeze(1)
-    td = chosen - target
-    each = huber(td, huber_delta)
-    value = each.mean() if weight is None else (each * weight).mean()
-    return Loss(value, td.detach(), chosen.detach())
+    chosen = q.gather(1, action.unsqueeze(1))  # (B, 1), as autograd has fewer operations to undo
+    wanted = target.unsqueeze(1)
+    if weight is None:
+        value = functional.huber_loss(chosen, wanted, delta=huber_delta)
+    else:
+        each = functional.huber_loss(chosen, wanted, reduction="none", delta=huber_delta)
+        value = (each.squeeze(1) * weight).mean()
+    found = chosen.detach().squeeze(1)
+    return Loss(value, found - target, found)
 
 
 def conservative_penalty(q: Tensor, action: Tensor, weight: float | Tensor = 1.0) -> Tensor:
@@ -264,7 +263,6 @@ __all__ = [
     "TrainingBatch",
     "conservative_penalty",
     "dqn_loss",
-    "huber",
     "make_algorithm",
     "make_network",
     "margin_penalty",
