@@ -27,8 +27,8 @@ from support.paths import ROOT
 
 KEPT = ROOT / "tests/golden/sample_logs.json"
 STEPS = 3_000
-# Clocks of the machine, ages in wall time, random ids and paths.
-NOT_COMPARED = {"wall_s", "env_steps_per_s", "updates_per_s", "ingest_id"}
+# Clocks of the machine, ages in wall time, random ids, paths and the commit.
+NOT_COMPARED = {"wall_s", "env_steps_per_s", "updates_per_s", "ingest_id", "restock_version"}
 NOT_COMPARED |= {"source_file", "p50", "p90", "p99", "age_days"}
 Hashes = dict[str, dict[str, str | int]]
 
