@@ -46,8 +46,8 @@ WEAR = (0.0, 0.01, 0.02, 0.03, 0.06)
 DRIVES_A_WEEK = (1, 2, 4, 8)
 # What p must be below so that one change is found beside 72 tests (3 robots, 12 signals, 2 weeks).
 CORRECTED = 0.05 / 72
-MOST_FALSE = 0.01
-LEAST_FOUND = 0.8
+MAX_FALSE = 0.01
+MIN_FOUND = 0.8
 
 
 @dataclass(frozen=True)
@@ -183,8 +183,8 @@ def main() -> int:
     missed += [
         f"{row['wear']:.0%} of wear, {row['drives_a_week']} drives a week: found {row['found']:.0%}"
         for row in table
-        if (row["wear"] == 0 and row["found"] > MOST_FALSE)
-        or (row["wear"] >= 0.03 and row["drives_a_week"] >= 4 and row["found"] < LEAST_FOUND)
+        if (row["wear"] == 0 and row["found"] > MAX_FALSE)
+        or (row["wear"] >= 0.03 and row["drives_a_week"] >= 4 and row["found"] < MIN_FOUND)
     ]
     cells = {(row["drives_a_week"], row["wear"]): row for row in table}
     lines = [

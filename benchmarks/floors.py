@@ -26,7 +26,7 @@ from restock.ingest.task.scan import Body
 from restock.train.twin.survey.survey import Surveyed, survey
 from restock.twin import EpisodeSpec, PlannerFollower, WarehouseVectorEnv
 
-LEAST_ARRIVING = 0.5
+MIN_ARRIVING = 0.5
 
 
 def drive(made: Surveyed, missions: int) -> Counter[str]:
@@ -82,7 +82,7 @@ def main() -> int:
     rows = [measure(path, options.missions) for path in options.recordings]
     driven = [row for row in rows if "at the goal" in row]
     arriving = sum(row["at the goal"] for row in driven) / max(len(driven) * options.missions, 1)
-    missed = [] if arriving >= LEAST_ARRIVING else [f"{arriving:.0%} of the missions arrive"]
+    missed = [] if arriving >= MIN_ARRIVING else [f"{arriving:.0%} of the missions arrive"]
     header = list(driven[0] if driven else rows[0])
     table = markdown(header, ([row.get(key, "") for key in header] for row in rows))
     return finish(options, {"floors": rows, "arriving": arriving}, missed, [table])

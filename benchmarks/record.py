@@ -24,8 +24,8 @@ from harness import finish, option_parser
 
 from restock.train.twin.recording.recorder import RecordingPlan, record
 
-MOST_S_PER_MINUTE = 2.0
-MOST_GROWTH_MIB = 64
+MAX_S_PER_MINUTE = 2.0
+MAX_GROWTH_MIB = 64
 
 
 def measure(file_format: str, minutes: float) -> dict[str, Any]:
@@ -79,11 +79,11 @@ def main() -> int:
         for row in rows
     ]
     missed = [
-        f"{row['format']}: {row['s_per_minute']:.2f} s a robot-minute, at most {MOST_S_PER_MINUTE}"
+        f"{row['format']}: {row['s_per_minute']:.2f} s a robot-minute, at most {MAX_S_PER_MINUTE}"
         for row in rows
-        if row["s_per_minute"] > MOST_S_PER_MINUTE
+        if row["s_per_minute"] > MAX_S_PER_MINUTE
     ]
-    if growth_mib > MOST_GROWTH_MIB:
+    if growth_mib > MAX_GROWTH_MIB:
         missed.append(f"memory grew by {growth_mib:.0f} MiB with the length")
     return finish(options, {"recordings": rows, "memory_growth_mib": growth_mib}, missed, lines)
 

@@ -40,7 +40,7 @@ from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 
-LEAST_RECORDINGS, LEAST_TIME = 0.9, 0.85
+MIN_RECORDINGS, MIN_TIME = 0.9, 0.85
 STEP_S = 0.05  # of the loops over log time
 KNOWN_S = 1.0
 MOVED_M, TURNED_RAD = 0.02, 0.04  # within KNOWN_S: less is standing
@@ -107,9 +107,9 @@ def main() -> int:
         *(f"{name}: {value}" for name, value in figures.items()),
     ]
     missed = []
-    if figures["give_rows"] < LEAST_RECORDINGS * figures["recordings"]:
+    if figures["give_rows"] < MIN_RECORDINGS * figures["recordings"]:
         missed.append(f"{figures['give_rows']} of {figures['recordings']} recordings give rows")
-    if figures["usable_s"] < LEAST_TIME * figures["known_s"]:
+    if figures["usable_s"] < MIN_TIME * figures["known_s"]:
         missed.append(f"{figures['usable_s']:.0f} of {figures['known_s']:.0f} s are usable")
     whole = {**figures, "strangers": [asdict(s) for s in strangers]}
     return finish(options, whole, missed, lines)

@@ -30,7 +30,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from restock.errors import RestockError
 from restock.ingest import open_recording
 
-LARGEST_BYTES = 8 << 20
+MAX_BYTES = 8 << 20
 PAGE = 4096
 
 
@@ -111,7 +111,7 @@ def main(argv: list[str] | None = None) -> int:
         for folder in options.folders
         for ending in ("mcap", "db3", "bag")
         for file in folder.rglob(f"*.{ending}")
-        if file.is_file() and 0 < file.stat().st_size <= LARGEST_BYTES
+        if file.is_file() and 0 < file.stat().st_size <= MAX_BYTES
     )
     if not files:
         parser.error(f"no recording below {', '.join(map(str, options.folders))}")

@@ -50,10 +50,10 @@ with (
     from restock.ingest.decoding.row_by_row import RowDecoder
     from restock.ingest.describe import describe_recording
 
-LONGEST_INPUT = 1 << 14
+MAX_INPUT = 1 << 14
 SECONDS_EACH = 30
 MEMORY_MB = 3000  # of one process: imports take some 500, an input may take the rest
-MOST_LEAVES = 200  # of a topic that are read: a definition may have thousands
+MAX_LEAVES = 200  # of a topic that are read: a definition may have thousands
 
 Target = Callable[[bytes], None]
 
@@ -92,7 +92,7 @@ def _read(path: Path, *, salvage: bool) -> None:
     try:
         describe_recording(path, salvage=salvage)
         with open_recording(path, salvage=salvage) as opened:
-            wanted = {topic: opened.leaves(topic)[:MOST_LEAVES] for topic in opened.topics}
+            wanted = {topic: opened.leaves(topic)[:MAX_LEAVES] for topic in opened.topics}
             by_topic = opened.read(wanted)
             for topic, account in opened.accounts.items():
                 explained = account.decoded + sum(account.reasons.values())
@@ -128,7 +128,7 @@ def _compare_with_rosbags(
     batch = MessageBatch.of(payloads, range(len(payloads)), range(len(payloads)))
     try:
         kind = type_of(channel, "humble", lambda: payloads)
-        leaves = kind.leaves()[:MOST_LEAVES]
+        leaves = kind.leaves()[:MAX_LEAVES]
         decoder = decoder_of(channel, kind, leaves)
         rosbags = RowDecoder(kind, leaves, ros1=encoding == "ros1")  # type: ignore[arg-type]
     except CannotDecode:
@@ -159,7 +159,7 @@ def _decode(channel: Channel, payloads: list[bytes]) -> None:
     batch = MessageBatch.of(payloads, range(len(payloads)), range(len(payloads)))
     try:
         kind = type_of(channel, "humble", lambda: payloads)
-        decoder = decoder_of(channel, kind, kind.leaves()[:MOST_LEAVES])
+        decoder = decoder_of(channel, kind, kind.leaves()[:MAX_LEAVES])
     except CannotDecode:
         return
     decoded = decoder.decode(batch)
@@ -237,7 +237,7 @@ def fuzz(corpus: Path, out: Path, seconds: int) -> None:
 
     if atheris:
         options = [f"-max_total_time={seconds}", f"-timeout={SECONDS_EACH}", "-rss_limit_mb=0"]
-        options += [f"-max_len={LONGEST_INPUT}", f"-artifact_prefix={out}/", "-print_final_stats=1"]
+        options += [f"-max_len={MAX_INPUT}", f"-artifact_prefix={out}/", "-print_final_stats=1"]
         atheris.Setup([sys.argv[0], *options, str(corpus)], one, internal_libfuzzer=True)
         atheris.Fuzz()
     rng = random.Random(time.time_ns())

@@ -20,7 +20,7 @@ _QOS = {
     "durability": ("system_default", "transient_local", "volatile"),
     "history": ("system_default", "keep_last", "keep_all"),
 }
-MOST_PROFILES = 20  # of a topic: publishers that offer others
+MAX_PROFILES = 20  # of a topic: publishers that offer others
 JUMP_S = 1.0  # a change of (log time - stamp) that means a clock was set, as in profiles
 
 
@@ -94,7 +94,7 @@ def offered(text: str) -> list[dict[str, Any]]:
     and depth, as far as the file's text says them. It is not read as YAML: that is slow, and it may
     be damaged."""
     found: list[dict[str, Any]] = []
-    for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MOST_PROFILES + 1]:
+    for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MAX_PROFILES + 1]:
         said = dict(re.findall(r"^\s*(\w+):\s*(\w+)\s*$", block, re.MULTILINE))
         one: dict[str, Any] = {}
         for key, names in _QOS.items():

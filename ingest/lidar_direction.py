@@ -12,7 +12,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.urdf.description import BASE_FRAMES
 
-MOST_TRANSFORMS = 20_000  # messages of a topic; what places a lidar is published all the time
+MAX_TRANSFORMS = 20_000  # messages of a topic; what places a lidar is published all the time
 _ENDS = ("tf", "tf_static", "robot_description")
 
 
@@ -73,5 +73,5 @@ def _children(recording: Recording, topic: str) -> Iterator[str]:
         children = set(map(str, np.asarray(values, object).ravel()))
         yield from {plain(child) for child in children}
         count += len(times)
-        if count > MOST_TRANSFORMS:
+        if count > MAX_TRANSFORMS:
             return

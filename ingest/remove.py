@@ -21,7 +21,7 @@ from restock.words import counted, quoted
 OPERATION = "restock remove"
 ID_DIGITS = 16
 PREFIX_DIGITS = 6  # of an id, at least
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 _HEX = re.compile(rf"[0-9a-f]{{1,{ID_DIGITS}}}")
 
 
@@ -152,8 +152,8 @@ def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str
     by_path = {row["source_file"]: row for row in live}
     files = {PurePath(path).name: path for path in by_path}
     near = [
-        *get_close_matches(name, by_path, n=_MOST_NAMED),
-        *(files[one] for one in get_close_matches(PurePath(name).name, files, n=_MOST_NAMED)),
+        *get_close_matches(name, by_path, n=_MAX_NAMED),
+        *(files[one] for one in get_close_matches(PurePath(name).name, files, n=_MAX_NAMED)),
     ]
     what = f"no recording {name!r} is in the store"
     if near := list(dict.fromkeys(near)):
@@ -164,6 +164,6 @@ def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str
 
 
 def _listed(rows: Sequence[dict[str, Any]]) -> str:
-    named = [f"{row['recording_id']} ({row['source_file']})" for row in rows[:_MOST_NAMED]]
+    named = [f"{row['recording_id']} ({row['source_file']})" for row in rows[:_MAX_NAMED]]
     more = len(rows) - len(named)
     return ", ".join(named) + (f", and {more:,} more" if more else "")

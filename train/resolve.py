@@ -56,7 +56,7 @@ def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedD
 
 
 _ROWS_OF_UPDATES = 5_000  # as many cloned rows want as many updates as the critic makes
-_MOST_UPDATES = 10.0  # times the critic's
+_MAX_UPDATES = 10.0  # times the critic's
 
 
 def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) -> TrainConfig:
@@ -74,7 +74,7 @@ def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) 
     teacher = msgspec.structs.replace(teacher, successes=_clones_successes(teacher, profile))
     if teacher.offline_updates is None:
         rows = 0 if panel is None or not teacher.filters else int(cloned(panel, teacher).sum())
-        times = min(max(rows / _ROWS_OF_UPDATES, 1.0), _MOST_UPDATES)
+        times = min(max(rows / _ROWS_OF_UPDATES, 1.0), _MAX_UPDATES)
         count = round(config.schedule.offline_updates * times)
         teacher = msgspec.structs.replace(teacher, offline_updates=count)
     if teacher.mirror is not False:

@@ -20,7 +20,7 @@ from restock.replay.ring.ring import META
 from restock.replay.store.capacity import capacity_of_rows
 from restock.train.dqn.config import TrainConfig
 
-MOST_BYTES = 2 << 30  # of a ring that "auto" chooses
+MAX_BYTES = 2 << 30  # of a ring that "auto" chooses
 _SLOT_BYTES = 18  # of a row's stratum, its place there, and its age
 
 
@@ -42,11 +42,11 @@ def resolve_ring_capacity(
     capacity = capacity_of_rows(panel.meta)
     rows, reason = capacity.recommended, capacity.reason
     least = max(config.replay.batch_size, config.env.num_envs * config.loss.n_step)
-    most = MOST_BYTES // row_bytes(panel.observation_size)
+    most = MAX_BYTES // row_bytes(panel.observation_size)
     if rows < least:
         rows, reason = least, f"{reason}; a batch and the environments' steps need {least:,}"
     if rows > most:
-        rows, reason = most, f"{reason}; {MOST_BYTES >> 30} GiB hold {most:,}"
+        rows, reason = most, f"{reason}; {MAX_BYTES >> 30} GiB hold {most:,}"
     replay = msgspec.structs.replace(config.replay, ring_capacity=rows)
     chosen = {"asked": "auto", "ring_rows": rows, "reason": reason, **asdict(capacity)}
     return msgspec.structs.replace(config, replay=replay), chosen

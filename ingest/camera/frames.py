@@ -15,7 +15,7 @@ from restock.ingest.profile.camera import Camera
 
 NS = 1_000_000_000
 OFF_CLOCK = "its stamp does not fit the clock"
-MOST_REASONS = 20  # a file may give another one with each message
+MAX_REASONS = 20  # a file may give another one with each message
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class CameraFrames:
         words = np.asarray(self.columns.fields[PROBLEM], object)
         off = (words == "") & (self.stamp_ns < 0)
         counted = Counter([word for word in words if word])
-        most = Counter(dict(counted.most_common(MOST_REASONS)))
+        most = Counter(dict(counted.most_common(MAX_REASONS)))
         rest = {"other problems": counted.total() - most.total(), OFF_CLOCK: int(off.sum())}
         return most + Counter(rest)
 

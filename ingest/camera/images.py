@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
 TYPES = (COMPRESSED, RAW)
-MOST_PIXELS = 100_000_000  # of a frame: more is no camera's
+MAX_PIXELS = 100_000_000  # of a frame: more is no camera's
 JPEG, PNG = "jpeg", "png"
 # Of raw images: type, channels, and the order in which they are red, green, blue (and alpha).
 ENCODINGS: dict[str, tuple[str, int, tuple[int, ...]]] = {
@@ -132,8 +132,8 @@ def _decoded(data: bytes, layout: ImageLayout) -> NDArray[np.generic]:
 def _bound(layout: ImageLayout) -> None:
     if layout.width < 1 or layout.height < 1:
         raise ImageProblem("no pixels")
-    if layout.width * layout.height > MOST_PIXELS:
-        raise ImageProblem(f"claims more than {MOST_PIXELS:,} pixels")
+    if layout.width * layout.height > MAX_PIXELS:
+        raise ImageProblem(f"claims more than {MAX_PIXELS:,} pixels")
 
 
 def _jpeg(data: bytes) -> ImageLayout:

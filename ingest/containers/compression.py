@@ -13,7 +13,7 @@ from restock.ingest.containers.discover import ZSTD_MAGIC
 from restock.ingest.containers.formats.plausible import FILE, most_bytes
 from restock.ingest.decoding.messages import MessageBatch
 
-LARGEST_MESSAGE = 1 << 30
+MAX_MESSAGE = 1 << 30
 PIECE = 32 << 20  # of messages decompressed at a time
 BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
 
@@ -85,7 +85,7 @@ def _piece(batch: MessageBatch, payloads: list[bytes], good: list[int]) -> Messa
 def _plain(payload: bytes) -> bytes:
     if not payload.startswith(ZSTD_MAGIC):
         return payload
-    limit = min(most_bytes(len(payload)), LARGEST_MESSAGE)
+    limit = min(most_bytes(len(payload)), MAX_MESSAGE)
     size = zstandard.frame_content_size(payload)
     if 0 <= size <= limit:
         return bytes(zstandard.ZstdDecompressor().decompress(payload, max_output_size=limit))

@@ -28,7 +28,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
-LARGEST_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
+MAX_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
 _PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
 _NAMES = (
     f"recordings end in {', '.join(name for one in known.CONTAINERS for name in one.endings)}"
@@ -234,7 +234,7 @@ def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
     if not file.is_file():
         return BagMetadata(), f"no {METADATA}: read from the storage files alone"
     try:
-        if file.stat().st_size > LARGEST_METADATA:
+        if file.stat().st_size > MAX_METADATA:
             return BagMetadata(), f"{METADATA} has {file.stat().st_size:,} bytes: not read"
         text = file.read_text(encoding="utf-8")
         document = YAML(typ="safe", pure=True).load(text)

@@ -25,13 +25,13 @@ from restock.ingest.containers.formats.mcap_records import (
 from restock.ingest.containers.storage import Extra, Metadata, Watch, keep_entries, unwatched
 
 # What the survey keeps is bounded, whatever a file is made of.
-MOST_CHUNKS = 1_000_000
-MOST_NAMED = 10_000  # attachments and metadata records; the others are counted
-MOST_DAMAGED = 100
+MAX_CHUNKS = 1_000_000
+MAX_NAMED = 10_000  # attachments and metadata records; the others are counted
+MAX_DAMAGED = 100
 FOOTER_BYTES = 20  # of its content; the last 4 are the CRC of the summary and of what is before it
 TELL_EVERY = 65_536  # records, of how far the walk is
 ROSBAG2 = "rosbag2"  # the metadata record of rosbag2's storage
-MOST_OTHERS = 1_000_000  # records beside those of messages
+MAX_OTHERS = 1_000_000  # records beside those of messages
 _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
 
@@ -96,8 +96,8 @@ def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
             if number % TELL_EVERY == 0:
                 watch("looking through the file, bytes", at, end)
             others += opcode not in _MANY
-            if others > MOST_OTHERS:
-                raise Malformed(f"more than {MOST_OTHERS:,} records of no messages", at)
+            if others > MAX_OTHERS:
+                raise Malformed(f"more than {MAX_OTHERS:,} records of no messages", at)
             if opcode == Op.FOOTER:
                 finished = file[stop : stop + len(MAGIC)] == MAGIC
                 contents.damaged += check_summary(contents, file, at, stop)
@@ -105,7 +105,7 @@ def survey(file: FileBytes, watch: Watch = unwatched) -> Contents:
             try:
                 take_record(contents, file, opcode, at, stop)
             except Malformed as bad:
-                if len(contents.damaged) < MOST_DAMAGED:
+                if len(contents.damaged) < MAX_DAMAGED:
                     contents.damaged.append(f"record at byte {at - PREFIX:,}: {bad.what}")
     except Malformed as cut:
         contents.cut = cut
@@ -128,8 +128,8 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
         channel = int.from_bytes(file[at : at + 2], "little")
         contents.loose.setdefault(channel, []).append(at - PREFIX)
     elif opcode == Op.CHUNK:
-        if len(contents.chunks) >= MOST_CHUNKS:
-            raise Malformed(f"more than {MOST_CHUNKS:,} chunks: not read", at)
+        if len(contents.chunks) >= MAX_CHUNKS:
+            raise Malformed(f"more than {MAX_CHUNKS:,} chunks: not read", at)
         contents.chunks.append(_chunk(file, at, stop))
     elif opcode == Op.MESSAGE_INDEX and contents.chunks:
         index = parse(Op.MESSAGE_INDEX, file, at, stop)
@@ -176,7 +176,7 @@ def statistics_at(file: FileBytes, at: int, stop: int) -> Statistics:
 
 
 def _name(contents: Contents, extra: Extra) -> None:
-    if len(contents.extras) < MOST_NAMED:
+    if len(contents.extras) < MAX_NAMED:
         contents.extras.append(extra)
     else:
         contents.unnamed += 1

@@ -33,7 +33,7 @@ from restock.ingest.containers.storage import (
 )
 from restock.ingest.decoding.messages import Channel, MessageBatch
 
-LEAST_GROUPS = 4  # to decompress ahead
+MIN_GROUPS = 4  # to decompress ahead
 GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's calls
 
 
@@ -224,7 +224,7 @@ class McapFile:
         return (
             ChunkReader.ahead
             and cores() > 1
-            and len(sizes) >= LEAST_GROUPS
+            and len(sizes) >= MIN_GROUPS
             and max(sizes) <= 2 * GROUP_BYTES
         )
 

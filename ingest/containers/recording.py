@@ -47,7 +47,7 @@ from restock.ingest.decoding.messages import Channel, MessageBatch
 from restock.ingest.decoding.row_by_row import Decoder
 
 STATIC_TRANSFORMS = "/tf_static"
-MOST_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
+MAX_DEFINED_BYTES = 8 << 20  # parsing takes about a second a MB
 
 
 @dataclass(frozen=True)
@@ -187,9 +187,9 @@ class Recording:
         self._defined[channel.type, channel.definition_format, hash(channel.definition)] = len(
             channel.definition
         )
-        if sum(self._defined.values()) > MOST_DEFINED_BYTES:
+        if sum(self._defined.values()) > MAX_DEFINED_BYTES:
             raise CannotDecode(
-                f"the definitions up to its own have more than {MOST_DEFINED_BYTES:,} bytes"
+                f"the definitions up to its own have more than {MAX_DEFINED_BYTES:,} bytes"
             )
 
     @property

@@ -41,12 +41,12 @@ MAGIC = b"SQLite format 3\x00"
 ROWS_PER_FETCH = 1000
 BYTES_PER_BATCH = 8 << 20
 LARGE_ROW = 1 << 20  # bytes: larger ones are not fetched some at a time
-LARGEST_MESSAGE = 256 << 20
-LARGEST_METADATA = 2 << 20  # characters
-LONGEST_QOS = 8192  # characters of a topic's offered profiles
-MOST_FOUND = 10  # by the check: one is enough to refuse the file
+MAX_MESSAGE = 256 << 20
+MAX_METADATA = 2 << 20  # characters
+MAX_QOS = 8192  # characters of a topic's offered profiles
+MAX_FOUND = 10  # by the check: one is enough to refuse the file
 STEPS_PER_BYTE = 64  # of sqlite's machine; reading rows of a few bytes takes one or two
-FEWEST_STEPS = 10_000_000
+MIN_STEPS = 10_000_000
 STEPS_AT_ONCE = 100_000
 # What the check says of values, not of pages: those are read as they are.
 _OF_VALUES = re.compile(r"\S+ value in |\S+ constraint |CHECK ")
@@ -142,7 +142,7 @@ class SqliteFile:
         reading all rows costs."""
         self._connection.execute("PRAGMA ignore_check_constraints = ON")  # those are programs
         try:
-            found = self._connection.execute(f"PRAGMA quick_check({MOST_FOUND})").fetchall()
+            found = self._connection.execute(f"PRAGMA quick_check({MAX_FOUND})").fetchall()
         except sqlite3.DatabaseError as error:
             raise DamagedSqliteError(f"SQLite finds it damaged: {error}", self.path) from error
         lines = [line for (text,) in found for line in str(text).splitlines()]
@@ -181,7 +181,7 @@ class SqliteFile:
         names = {row[1] for row in self._connection.execute("PRAGMA table_info(topics)")}
         # Before rosbag2 0.0.5 there was no such column: all was CDR.
         encoding = "serialization_format" if "serialization_format" in names else "'cdr'"
-        qos = f"substr(offered_qos_profiles, 1, {LONGEST_QOS})"
+        qos = f"substr(offered_qos_profiles, 1, {MAX_QOS})"
         qos = qos if "offered_qos_profiles" in names else "''"
         rows = self._connection.execute(
             f"SELECT id, name, type, {encoding}, {qos} FROM topics WHERE typeof(id) = 'integer'"
@@ -220,7 +220,7 @@ class SqliteFile:
             refuse_programs(self._connection, ("metadata",))
             row = self._connection.execute(
                 "SELECT substr(metadata, 1, ?) FROM metadata ORDER BY id DESC LIMIT 1",
-                (LARGEST_METADATA,),
+                (MAX_METADATA,),
             ).fetchone()
             custom, left_out = custom_data(str(row[0] or "") if row else "", self.path.name)
         except sqlite3.OperationalError:  # older bags have no such table
@@ -275,7 +275,7 @@ class SqliteFile:
     def _large(self, row: _Row) -> list[_Row]:
         """A row with its data, which may have some hundred MB; none where it has more than that."""
         topic, stamp, _, size, number = row
-        if size is not None and size <= LARGEST_MESSAGE:
+        if size is not None and size <= MAX_MESSAGE:
             query = "SELECT data FROM messages WHERE id = ?"
             try:
                 (data,) = self._connection.execute(query, (number,)).fetchone()
@@ -284,7 +284,7 @@ class SqliteFile:
                 return []
             return [(topic, stamp, data, size, number)]
         what = f"row {number:,} is not read: its message of {size:,} bytes is too large"
-        if len(self.damage) < MOST_FOUND and all(item.what != what for item in self.damage):
+        if len(self.damage) < MAX_FOUND and all(item.what != what for item in self.damage):
             self.damage.append(Damage(what, {topic: 1}))
         return []
 
@@ -370,7 +370,7 @@ def guard(connection: sqlite3.Connection, size: int) -> None:
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 1 << 20), (1 << 31) - 1))
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
-    left = [max(size * STEPS_PER_BYTE, FEWEST_STEPS)]
+    left = [max(size * STEPS_PER_BYTE, MIN_STEPS)]
 
     def count() -> bool:
         left[0] -= STEPS_AT_ONCE

@@ -15,7 +15,7 @@ from restock.errors import RecordingError
 from restock.ingest.containers.formats.sqlite_pages import (
     INT_SIZES,
     INTERIOR,
-    SMALLEST_CELL,
+    MIN_CELL,
     Cell,
     NotAPage,
     Pages,
@@ -30,7 +30,7 @@ from restock.ingest.containers.storage import Damage, Extra, Integrity, Metadata
 from restock.ingest.decoding.messages import Channel, MessageBatch, PendingBatch
 
 BYTES_PER_BATCH = 8 << 20
-LARGEST_MESSAGE = 256 << 20
+MAX_MESSAGE = 256 << 20
 PIECE_ROWS = 4096
 
 
@@ -140,7 +140,7 @@ class SalvagedSqliteFile:
             self._lost(f"{lost:,} messages of topics without a name", lost)
         last = max(self._last, int(rows[-1, 0]) if len(rows) else 0)
         missing = last - int((rows[:, 0] > 0).sum())
-        room = self._pages.count * self._pages.page_size // SMALLEST_CELL
+        room = self._pages.count * self._pages.page_size // MIN_CELL
         if missing > 0 and last <= room:
             self._lost(f"at least {missing:,} messages are missing, by their row numbers", missing)
         return rows[named]
@@ -157,7 +157,7 @@ class SalvagedSqliteFile:
         for _, topic, stamp, number, place in self._rows[np.isin(self._rows[:, 1], wanted)]:
             if number != page:
                 page, cells = int(number), self._pages.cells(self._pages.page(int(number)))
-            whole = cells[place].size <= LARGEST_MESSAGE
+            whole = cells[place].size <= MAX_MESSAGE
             payload = self._pages.payload(cells[place], self._moves, taken) if whole else None
             if payload is None:
                 lost[int(topic)] = lost.get(int(topic), 0) + 1

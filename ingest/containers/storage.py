@@ -18,11 +18,11 @@ Integrity = Literal["verified", "unverified", "damaged"]
 Watch = Callable[[str, int, int], None]  # what is being done, how much of it is done, of how much
 
 # Of a file's metadata so much is kept; the rest is counted.
-MOST_ENTRIES = 1_000
-LONGEST_TEXT = 4_096  # characters of a name or value
-LONGEST_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
+MAX_ENTRIES = 1_000
+MAX_TEXT = 4_096  # characters of a name or value
+MAX_CUSTOM_DATA = 64 << 10  # characters: the parser is slow
 HEAD_BYTES = 64  # by which a container claims a file
-NOT_KEPT = f"not text, longer than {LONGEST_TEXT:,} characters, or beyond entry {MOST_ENTRIES:,}"
+NOT_KEPT = f"not text, longer than {MAX_TEXT:,} characters, or beyond entry {MAX_ENTRIES:,}"
 # What the YAML library raises of an invalid document, or of one that it does not expect.
 INVALID_YAML = (
     *(YAMLError, KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError),
@@ -85,8 +85,8 @@ def keep_entries(
     said: Mapping[str, str], kept: Collection[Metadata] = ()
 ) -> tuple[dict[str, str], int]:
     """Those of a record's entries that are kept beside `kept`, and how many are not."""
-    room = MOST_ENTRIES - sum(len(item.entries) for item in kept)
-    short = {n: v for n, v in said.items() if len(n) <= LONGEST_TEXT and len(v) <= LONGEST_TEXT}
+    room = MAX_ENTRIES - sum(len(item.entries) for item in kept)
+    short = {n: v for n, v in said.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
     entries = dict(list(short.items())[: max(room, 0)])
     return {visible(n): visible(v) for n, v in entries.items()}, len(said) - len(entries)
 
@@ -114,7 +114,7 @@ def _custom_data(text: str) -> tuple[dict[str, str], int]:
     if found["value"].strip() in ("", "~", "null", "{}") and not found["block"].strip():
         return {}, 0
     lines = found[0]
-    if len(lines) > LONGEST_CUSTOM_DATA:
+    if len(lines) > MAX_CUSTOM_DATA:
         raise ValueError(f"custom_data has {len(lines):,} characters: not read")
     try:
         said = YAML(typ="base", pure=True).load(lines.strip())["custom_data"]

@@ -26,7 +26,7 @@ _HEADER = re.compile(r"^[ \t]*Header\b", re.MULTILINE)
 # The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
 _ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
 _NESTED = re.compile(r"(?:<[^<>]*){4}")
-LONGEST_PLACE = 60  # characters of a text that are named where it cannot be parsed
+MAX_PLACE = 60  # characters of a text that are named where it cannot be parsed
 
 
 def types_in(content: bytes, name: str, form: str) -> Typesdict:
@@ -70,5 +70,5 @@ def _where(error: Exception) -> str:
     lines = re.sub(r"\n\{['\"].*\Z", "", str(error) or type(error).__name__).splitlines()
     if len(lines) < 3:
         return f": {' '.join(lines)}"
-    rest = " ".join(" ".join(lines[3:]).split())[:LONGEST_PLACE]
+    rest = " ".join(" ".join(lines[3:]).split())[:MAX_PLACE]
     return f" at {rest!r}" if rest else " at its end"

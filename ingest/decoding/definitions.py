@@ -20,8 +20,8 @@ from restock.ingest.decoding.messages import Channel
 
 DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}
-LONGEST_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
-LONGEST_ARRAY = 1 << 20
+MAX_DEFINITION = 512 << 10  # real ones have up to some 50 kB, and the parser is slow
+MAX_ARRAY = 1 << 20
 KEPT = 1024  # types as recordings define them
 
 EMPTY = "structure_needs_at_least_one_member"  # ROS's placeholder in a message without fields
@@ -50,7 +50,7 @@ def _field(name: str, description: Any) -> FieldType:
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         (node, rest), length = rest
         fixed = description[0] == Nodetype.ARRAY
-        if fixed and not 0 < length <= LONGEST_ARRAY:
+        if fixed and not 0 < length <= MAX_ARRAY:
             raise CannotDecode(f"{name} is an array of {length:,}, which is not supported")
         many = Many(length if fixed else None)
     if node == Nodetype.NAME:
@@ -110,7 +110,7 @@ def message_type(channel: Channel, distro: str) -> RosType:
     # Loading a distribution takes a quarter of a second: not where a recording defines all.
     types = {} if embedded and channel.definition else distro_types(distro)
     if embedded and (channel.definition or name not in types):
-        if len(channel.definition) > LONGEST_DEFINITION:
+        if len(channel.definition) > MAX_DEFINITION:
             raise CannotDecode(f"its definition of {len(channel.definition):,} bytes is too long")
         return _embedded(name, channel.definition_format, channel.definition, distro)
     if name not in types:

@@ -16,8 +16,8 @@ import numpy as np
 from restock.errors import RecordingError, visible
 
 DEEPEST = 24  # nested messages; real ones reach 6
-MOST_FIELDS = 20_000
-LONGEST_WHY = 300  # it may quote a definition
+MAX_FIELDS = 20_000
+MAX_WHY = 300  # it may quote a definition
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "bool": np.dtype(np.bool_),
@@ -41,7 +41,7 @@ class CannotDecode(Exception):
     """A type that cannot be decoded, and why: the topic is skipped, the recording is not."""
 
     def __init__(self, why: str) -> None:
-        super().__init__(visible(why if len(why) <= LONGEST_WHY else f"{why[:LONGEST_WHY]}…"))
+        super().__init__(visible(why if len(why) <= MAX_WHY else f"{why[:MAX_WHY]}…"))
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ class MessageType(ABC):
             raise CannotDecode(f"{self.name} nests deeper than {DEEPEST} messages")
         for field in self.fields_of(name):
             count[0] += 1
-            if count[0] > MOST_FIELDS:
-                raise CannotDecode(f"{self.name} has more than {MOST_FIELDS:,} fields")
+            if count[0] > MAX_FIELDS:
+                raise CannotDecode(f"{self.name} has more than {MAX_FIELDS:,} fields")
             path = prefix + field.name
             through = (*steps, field)
             if field.base:

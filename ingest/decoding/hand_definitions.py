@@ -17,7 +17,7 @@ from restock.ingest.decoding.definition_text import types_in
 from restock.ingest.decoding.field_paths import CannotDecode
 
 LARGEST = 512 << 10  # bytes of one file
-MOST_FILES = 5000
+MAX_FILES = 5000
 # Part of no distribution's core, and what every robot that steers is driven by (ackermann_msgs).
 ACKERMANN = {
     "ackermann_msgs/msg/AckermannDrive": (
@@ -51,8 +51,8 @@ def folder_types(folder: str) -> Typesdict:
     if not root.is_dir():
         raise _refused(folder, "no such folder of definitions")
     files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
-    if len(files) > MOST_FILES:
-        raise _refused(folder, f"it holds {len(files):,} definitions, more than {MOST_FILES:,}")
+    if len(files) > MAX_FILES:
+        raise _refused(folder, f"it holds {len(files):,} definitions, more than {MAX_FILES:,}")
     types: Typesdict = {}
     for file in files:
         parts = [part for part in file.relative_to(root).parts[:-1] if part != "msg"]

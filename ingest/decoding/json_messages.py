@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from restock.ingest.decoding.field_paths import (
     DEEPEST,
     DTYPES,
-    MOST_FIELDS,
+    MAX_FIELDS,
     CannotDecode,
     FieldType,
     Leaf,
@@ -33,7 +33,7 @@ from restock.ingest.decoding.field_paths import (
 from restock.ingest.decoding.row_by_row import Unparsable, objects
 
 LARGEST = 64 << 20  # bytes of a message; as objects it takes some thirty times that
-LONGEST_SCHEMA = 4 << 20
+MAX_SCHEMA = 4 << 20
 EXACT = 1 << 53  # up to here float64 holds every integer
 
 # Members by which an object is a time or a duration: seconds, nanoseconds.
@@ -124,7 +124,7 @@ class _Schema:
     """A JSON Schema's document, as far as it describes which values are where."""
 
     def __init__(self, text: bytes) -> None:
-        if len(text) > LONGEST_SCHEMA:
+        if len(text) > MAX_SCHEMA:
             raise CannotDecode(f"its definition of {len(text):,} bytes is too long")
         try:
             self._document = msgspec.json.decode(text)
@@ -137,8 +137,8 @@ class _Schema:
 
     def _node(self, schema: Any, depth: int, within: frozenset[str]) -> Node:
         self._count += 1
-        if self._count > MOST_FIELDS:
-            raise CannotDecode(f"its definition has more than {MOST_FIELDS:,} fields")
+        if self._count > MAX_FIELDS:
+            raise CannotDecode(f"its definition has more than {MAX_FIELDS:,} fields")
         if isinstance(schema, dict) and isinstance(target := schema.get("$ref"), str):
             if target in within:  # its paths have no end: they are left out
                 return Node(declared=True)
@@ -184,8 +184,8 @@ def _observe(node: Node, value: Any, depth: int) -> None:
     if isinstance(value, dict):
         kind = "object"
         for name, inner in value.items():
-            if len(node.members) >= MOST_FIELDS:
-                raise CannotDecode(f"its messages have more than {MOST_FIELDS:,} fields")
+            if len(node.members) >= MAX_FIELDS:
+                raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
             _observe(node.members.setdefault(name, Node()), inner, depth + 1)
     elif isinstance(value, list):
         kind = "array"
@@ -213,8 +213,8 @@ class _Fields:
         fields = []
         for member, inner in node.members.items():
             self._count += 1
-            if self._count > MOST_FIELDS:
-                raise CannotDecode(f"its messages have more than {MOST_FIELDS:,} fields")
+            if self._count > MAX_FIELDS:
+                raise CannotDecode(f"its messages have more than {MAX_FIELDS:,} fields")
             # A path could not tell such a name from its own dots and brackets.
             if member and member.isprintable() and "." not in member and "[]" not in member:
                 made = self._field(f"{name}.{member}", member, inner, None)

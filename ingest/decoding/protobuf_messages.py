@@ -31,7 +31,7 @@ from restock.ingest.decoding.field_paths import (
 from restock.ingest.decoding.row_by_row import Unparsable, objects
 
 LARGEST = 256 << 20  # bytes of a message
-LONGEST_DEFINITION = 4 << 20
+MAX_DEFINITION = 4 << 20
 KEPT = 256  # types: each keeps its pool
 TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
@@ -85,7 +85,7 @@ def protobuf_type(name: str, definition: bytes) -> ProtobufType:
     Raises:
         CannotDecode: no such set, or the type is not in it, or it uses something unsupported.
     """
-    if len(definition) > LONGEST_DEFINITION:
+    if len(definition) > MAX_DEFINITION:
         raise CannotDecode(f"its definition of {len(definition):,} bytes is too long")
     pool = DescriptorPool()
     try:

@@ -14,7 +14,7 @@ from restock.toml import Checked
 
 COMMAND_SOURCES = "command_sources"
 COMMAND_THROUGH = "command_through"
-MOST_NAME = 64  # characters of a behaviour policy
+MAX_NAME = 64  # characters of a behaviour policy
 _OnRobot = Annotated[float, Meta(ge=-20, le=20)]  # m from the middle of its outline
 SCANS = ("scan", "scan_2", "scan_3", "scan_4")  # of a robot's lidars
 _SCAN_FIELDS = {
@@ -281,9 +281,9 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
     """
     commanding = source.fields.keys() - {"pressed"}
     name = key.removeprefix(f"{COMMAND_SOURCES}.")
-    if not name or len(name) > MOST_NAME or not name.isprintable():
+    if not name or len(name) > MAX_NAME or not name.isprintable():
         raise ConfigError(
-            f"`{key}`: the name of a behaviour policy has 1 to {MOST_NAME} printable characters",
+            f"`{key}`: the name of a behaviour policy has 1 to {MAX_NAME} printable characters",
             where=where,
             remedy='name the driver: "teleop", "navigation"',
         )

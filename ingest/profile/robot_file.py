@@ -16,7 +16,7 @@ from typing import Any
 from restock.errors import ConfigError
 from restock.files import first_line
 
-LARGEST_BYTES = 200_000
+MAX_BYTES = 200_000
 MOST = {"body": 100, "geom": 300, "joint": 60, "site": 100, "actuator": 60}
 TIMESTEP_S = (1e-4, 0.05)
 # What makes many things of one, opens other files, runs other code, or reserves memory.
@@ -58,9 +58,9 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
             f"is outside the profile's folder: {given}", "put it into the profile's folder"
         )
     try:
-        if path.stat().st_size > LARGEST_BYTES:
+        if path.stat().st_size > MAX_BYTES:
             raise refused(
-                f"is larger than {LARGEST_BYTES:,} bytes: {given}",
+                f"is larger than {MAX_BYTES:,} bytes: {given}",
                 "leave out meshes: boxes, cylinders and spheres are enough to drive",
             )
         text = path.read_text(encoding="utf-8").lstrip("\ufeff \t\r\n")
@@ -73,8 +73,8 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
 
 def mjcf_problem(text: str) -> str | None:
     """Why this text cannot be a robot's model; None: by its form it can."""
-    if len(text) > LARGEST_BYTES:
-        return f"is longer than {LARGEST_BYTES:,} characters"
+    if len(text) > MAX_BYTES:
+        return f"is longer than {MAX_BYTES:,} characters"
     if not _is_text(text):
         return "is not XML: give a .xml file in the profile's folder"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:

@@ -17,7 +17,7 @@ from typing import TypeAlias
 import msgspec
 
 from restock.errors import RecordingError
-from restock.ingest.task.tags import MOST_TAGS, NAMED, in_words, tag_problem
+from restock.ingest.task.tags import MAX_TAGS, NAMED, in_words, tag_problem
 from restock.toml import Checked
 
 Said: TypeAlias = "tuple[str, str, Mapping[str, str]]"  # source, record, entries: of a recording
@@ -90,7 +90,7 @@ class TagRules(Checked, frozen=True):
         named = [name for name in (*NAMED, *self.from_metadata) if name in found]
         sources: dict[str, dict[str, str]] = {}
         left_out: list[str] = []
-        room = MOST_TAGS
+        room = MAX_TAGS
         for name in dict.fromkeys([*named, *found]):
             value, source, _ = found[name][0]
             other = next((entry for entry in found[name] if entry[0] != value), None)
@@ -109,7 +109,7 @@ class TagRules(Checked, frozen=True):
         return sources, [
             f"{len(left_out):,} names in its metadata cannot be tags ({some}"
             f"{', …' if len(left_out) > 5 else ''}): too long, not printable, of several values, or"
-            f" beyond the {MOST_TAGS}th"
+            f" beyond the {MAX_TAGS}th"
         ]
 
     def _names(self, record: str, key: str) -> list[str]:

@@ -36,9 +36,9 @@ from restock.ingest.propose.propose import (
 )
 from restock.ingest.propose.trial import Advice, Trial
 
-MOST_DRIVES = 12  # of one kind, that a proposal reads
-MOST_NAMED = 5  # of those that it does not read, in a profile's first lines
-MOST_BASES = 4  # that are tried on all drives
+MAX_DRIVES = 12  # of one kind, that a proposal reads
+MAX_NAMED = 5  # of those that it does not read, in a profile's first lines
+MAX_BASES = 4  # that are tried on all drives
 # Poses on a map are worth so many times the time that odometry serves: where some drives have no
 # map, most of the time would be lost for want of it.
 LOCALISED_WORTH = 1.25
@@ -77,7 +77,7 @@ class Drives:
 
 
 def drives_by_kind(
-    paths: Sequence[Path], traits: Sequence[RobotTraits], *, most: int = MOST_DRIVES
+    paths: Sequence[Path], traits: Sequence[RobotTraits], *, most: int = MAX_DRIVES
 ) -> Drives:
     """The kinds of these recordings, and of the one with most drives that have a command at most so
     many to read: the largest, those with a command first.
@@ -278,7 +278,7 @@ def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     bases: dict[tuple[str, str, bool], Evidence] = {}
     for one in usable:
         bases.setdefault((one.clock.alignment, one.clock.steps, one.poses_from_frames), one)
-    return list(bases.values())[:MOST_BASES]
+    return list(bases.values())[:MAX_BASES]
 
 
 def _on_map(one: Evidence) -> bool:
@@ -310,8 +310,8 @@ def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives
 
 def names_of(paths: Sequence[Path]) -> str:
     """The first of these recordings by name, and how many more there are."""
-    more = f" and {len(paths) - MOST_NAMED:,} more" if len(paths) > MOST_NAMED else ""
-    return ", ".join(map(_name, paths[:MOST_NAMED])) + more
+    more = f" and {len(paths) - MAX_NAMED:,} more" if len(paths) > MAX_NAMED else ""
+    return ", ".join(map(_name, paths[:MAX_NAMED])) + more
 
 
 def _name(path: Path) -> str:

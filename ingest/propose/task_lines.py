@@ -23,9 +23,9 @@ from restock.ingest.task.task import Rewards, Task
 
 GENTLE_MPS, GENTLE_RADPS = 0.45, 1.0  # what a careful driver dares on ice
 ROUTE_M = 20.0  # that the time limit leaves room for, at the robot's highest speed
-LONGEST_TIME_LIMIT_STEPS = 1000
+MAX_TIME_LIMIT_STEPS = 1000
 MOSTLY_FREE = 0.1  # of its messages, at most, in which a bumper is pressed
-LEAST_TIGHT_M = 0.05  # a lidar's noise hides what is less
+MIN_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 
 def task_lines(seen: Evidence, trial: Trial) -> list[str]:
@@ -66,7 +66,7 @@ def _time_limit_lines(seen: Evidence, speed_mps: float) -> list[str]:
     (default,) = (f.default for f in msgspec.structs.fields(Task) if f.name == "time_limit_steps")
     if steps <= default:
         return []
-    steps = min(steps, LONGEST_TIME_LIMIT_STEPS)
+    steps = min(steps, MAX_TIME_LIMIT_STEPS)
     reach_m = steps * seen.clock.period_s * speed_mps
     return [f"time_limit_steps = {steps}  # {reach_m:.0f} m at {speed_mps:.3g} m/s"]
 
@@ -162,7 +162,7 @@ def lidar_guess(footprint: Footprint) -> str:
 
 def _reward_lines(width_m: float) -> list[str]:
     """How near is near for a robot that is narrower than the one that the default suits."""
-    near_m = round(max(TIGHT_PER_WIDTH * width_m, LEAST_TIGHT_M), 3)
+    near_m = round(max(TIGHT_PER_WIDTH * width_m, MIN_TIGHT_M), 3)
     if near_m >= Rewards().tight_clearance_m:
         return []
     return [

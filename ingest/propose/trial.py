@@ -29,7 +29,7 @@ MUCH = 0.1  # of the ticks: what costs so many is worth a word
 GAIN = 1.1  # times the transitions: what gives so many is worth a try
 OFTEN_NEAR = 0.4  # of the ticks: more than that says that the outline is wrong
 OFTEN_INSIDE = 0.02
-MOVING, LEAST_MOVING = 0.2, 30  # of the fastest action; ticks
+MOVING, MIN_MOVING = 0.2, 30  # of the fastest action; ticks
 SLIP_OVER = "{0.2 m}"  # of driving, as in wheel_slip and slippery_floor
 NOISE_IN_LIMIT = 1.25  # slip is more than twice the noise
 EVEN_S = 3.0  # as long as a stretch that the twin is compared with a log by
@@ -114,7 +114,7 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
     summed_m, breaks = np.cumsum(off_m), np.cumsum(~steps.follows)
     ends = np.arange(window, len(steps))  # of windows of so many ticks, each after one more
     ends = ends[(breaks[ends] == breaks[ends - window]) & moved[ends]]
-    if len(ends) < LEAST_MOVING:
+    if len(ends) < MIN_MOVING:
         return None
     apart_m = np.abs(summed_m[ends] - summed_m[ends - window])
     return float(np.percentile(apart_m, 90)) / (2 * NOISE_IN_LIMIT)

@@ -50,7 +50,7 @@ TOLERANCE_S = 0.1  # half a control period
 IMPOSSIBLE_S = 0.25  # by which a stamp is after the reception, of a clock of its own
 OFTEN = 20  # messages: a topic with so many was there before and after a clock was set
 LATENCY_S = 1.0  # of a topic that is stamped by the recorder's clock, at most
-MOST_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
+MAX_TICKS = 20_000_000  # of a fixed rate in one segment: 46 days of 5 Hz, more than memory holds
 Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice takes no memory
 
 
@@ -284,14 +284,14 @@ def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tu
     `steps = "rate"`: every period, from the first command to `end_ns`.
 
     Raises:
-        RecordingError: a fixed rate gives more than MOST_TICKS, as a wrong time makes it do.
+        RecordingError: a fixed rate gives more than MAX_TICKS, as a wrong time makes it do.
     """
     stamps = command.stamp_ns
     if not len(stamps):
         return np.zeros(0, np.int64), 0
     period_ns = round(period_s * NS)
     if clock.steps == "rate":
-        if (span_ns := end_ns - int(stamps[0])) > MOST_TICKS * period_ns:
+        if (span_ns := end_ns - int(stamps[0])) > MAX_TICKS * period_ns:
             raise RecordingError(
                 f"from its first command ({int(stamps[0]) / NS:.0f} s since 1970) to its last "
                 f"message ({end_ns / NS:.0f} s) are {span_ns / 86_400 / NS:,.0f} days, so a tick "

@@ -21,7 +21,7 @@ from restock.ingest.task.signals import Signals, wrap_angle
 from restock.words import counted
 
 WINDOW_S = 3.0  # in which two sources of a speed are compared
-LEAST_WINDOWS = 5  # in which the robot moves; fewer say nothing
+MIN_WINDOWS = 5  # in which the robot moves; fewer say nothing
 APART = 1.25  # how many times the other one a speed is in three of four windows
 STILL = 0.05  # of the other one: less is standing
 MOVES = 0.2  # of the fastest command
@@ -29,17 +29,17 @@ TURNS_RAD = 0.3  # in a window
 STEPS_PER_WINDOW = 2 / 3  # of its time that must be known
 BEYOND, BEYOND_MPS = 1.5, 0.1  # times the fastest command or wheels, and a margin
 OFTEN = 0.02  # of the steps
-LEAST_STEPS = 5
+MIN_STEPS = 5
 JUMP_M = 0.2  # further than that, less is the localiser's noise
 LEADS, SURE = 0.03, 0.8  # of a correlation: how much better it is, and how good
-MOST_LEAD_S = 1.0
+MAX_LEAD_S = 1.0
 # Of turns by scans: a correlation, how much may be left of the variance that is unexplained as
 # stamped, and how late: a lidar takes a tenth of a second or two to turn.
 SCAN_SURE, SCAN_LEFT, SCAN_LATE_S = 0.5, 0.8, 0.3
-LEAST_SECTORS = 12
+MIN_SECTORS = 12
 _AT_ONCE = 16_384
 HARMONICS = slice(1, 5)  # of clearance around the robot
-LEAST_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
+MIN_FOLLOWED = 150  # steps: in fewer, two unrelated motions may look alike
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _jumping_poses(drive: Drive, topic: str, fastest_mps: float, noise_mps: floa
     speed = np.abs(signals["localised_speed_mps"])
     beyond = joined & (speed > limit) & ((speed - most) * drive.seconds > JUMP_M)
     count = int(beyond.sum())
-    if count < max(LEAST_STEPS, OFTEN * joined.sum()):
+    if count < max(MIN_STEPS, OFTEN * joined.sum()):
         return []
     return [
         Finding(
@@ -235,7 +235,7 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
     """
     source, poses = windows
     kind, topic, what, pose_topic = of
-    if len(source) < LEAST_WINDOWS:
+    if len(source) < MIN_WINDOWS:
         return []
     ratio = source / np.where(poses == 0, 1e-9, poses)
     low, middle, high = np.percentile(ratio, [25, 50, 75])
@@ -285,7 +285,7 @@ def _scans(
 ) -> list[Finding]:
     """Find lidars that turn at another time than the poses."""
     sectors = np.asarray(drive.signals["sector_clearance_m"], np.float64)
-    if not scans or sectors.shape[1] < LEAST_SECTORS:
+    if not scans or sectors.shape[1] < MIN_SECTORS:
         return []
     known = np.isfinite(sectors).all(axis=1)
     seen = drive.joined & known & np.roll(known, 1)
@@ -324,7 +324,7 @@ def _turned(sectors: F64) -> F64:
 
 def _by_lag(asked: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
     """Return `_correlation` at each lag from -n to n steps, and n."""
-    most = max(1, round(MOST_LEAD_S / period_s))
+    most = max(1, round(MAX_LEAD_S / period_s))
     return [_correlation(asked, did, joined, lag) for lag in range(-most, most + 1)], most
 
 
@@ -335,7 +335,7 @@ def _correlation(asked: F64, did: F64, joined: Bools, lag: int) -> float:
     elif lag < 0:
         asked, did, joined = asked[-lag:], did[:lag], joined[-lag:] & joined[:lag]
     asked, did = asked[joined], did[joined]
-    if len(asked) < LEAST_FOLLOWED or asked.std() < 1e-3 or did.std() < 1e-3:
+    if len(asked) < MIN_FOLLOWED or asked.std() < 1e-3 or did.std() < 1e-3:
         return -1.0
     return float(np.corrcoef(asked, did)[0, 1])
 

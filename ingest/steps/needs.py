@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from restock.ingest.decoding.field_paths import Leaf
 
 NEARLY = 0.8  # of a name's letters: /plan is not /scan
-MOST_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording
+MAX_TOLD = 20  # topics in a message: a fleet's nightly log has one a recording
 OTHER_FIELDS = (
     "correct the profile; if the messages changed with an update of the robot, ingest the"
     " recordings from before and from after it with a profile each: a copy with the other field and"
@@ -75,7 +75,7 @@ def _told(profile: Profile, available: Mapping[str, Any]) -> str:
     """The topics of a recording; of very many, those that the profile could use."""
     types = {source.type for source in profile.sources.values()}
     usable = [topic for topic in sorted(available) if available[topic].type in types]
-    topics = sorted(available) if len(available) <= MOST_TOLD else usable[:MOST_TOLD]
+    topics = sorted(available) if len(available) <= MAX_TOLD else usable[:MAX_TOLD]
     others = len(available) - len(topics)
     more = [f"{others:,} others, which `restock info` lists"] if others else []
     return ", ".join([*topics, *more]) or "none"

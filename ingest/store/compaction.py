@@ -25,7 +25,7 @@ from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.schema import recording_schema
 
 FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writes again, at most
-LEAST_FILES = 2
+MIN_FILES = 2
 FOLD_FILES = 50  # manifests of a file each, which cost each opening 5 ms; joining one costs 20 ms
 FULL_MANIFESTS = 2_000  # a file of so many is left alone: else each fold would write all of them
 OPERATION = "restock compact"
@@ -149,7 +149,7 @@ class _Fold:
 
     @property
     def worth_it(self) -> bool:
-        return bool(self.lacking) or len(self.chosen) >= LEAST_FILES
+        return bool(self.lacking) or len(self.chosen) >= MIN_FILES
 
     def count(self, done: Compacted) -> None:
         """Say what becomes of the files."""
@@ -223,7 +223,7 @@ def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
 
 
 def _worth_it(group: Sequence[StoredFile]) -> bool:
-    return len(group) >= LEAST_FILES or any(not file.listed for file in group)
+    return len(group) >= MIN_FILES or any(not file.listed for file in group)
 
 
 def _merge_rows(store: StoreWriter, group: Sequence[StoredFile], done: Compacted) -> None:

@@ -23,7 +23,7 @@ from restock.errors import StoreError
 
 SKETCH = b"restock.sketch"  # key in the metadata of a manifest
 SKETCH_HASHES = 256
-LEAST_HASHES = 3  # that two recordings must share
+MIN_HASHES = 3  # that two recordings must share
 LARGELY = 0.5  # of the smaller recording's rows
 NEARLY_ALL = 0.95  # at its cut, a part has rows of its own
 # Replaced meanwhile, or damaged: no fault of the recording that is being ingested.
@@ -120,7 +120,7 @@ def looks_alike(mine: Hashes, other: Sketch) -> bool:
     compared = mine[mine <= other.hashes[-1]] if full else mine
     both = len(np.intersect1d(compared, other.hashes))
     least = min(len(compared), len(other.hashes))
-    return both >= LEAST_HASHES and both >= LARGELY / 2 * least
+    return both >= MIN_HASHES and both >= LARGELY / 2 * least
 
 
 def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive | None:
@@ -138,7 +138,7 @@ def compare(rows: pa.Table, other: pa.Table, period_s: float) -> RepeatedDrive |
     shift = np.sort(later)[len(later) // 2]
     same = int((np.abs(later - shift) <= period_s * 1e9 / 2).sum())
     least = min(len(mine), len(theirs))
-    if same < LEAST_HASHES or same < LARGELY * least:
+    if same < MIN_HASHES or same < LARGELY * least:
         return None
     return RepeatedDrive(
         str(other["recording_id"][0]),

@@ -33,7 +33,7 @@ from restock.ingest.task.conditions import Condition, Kind
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import STAND_IN_LIMITS
 
-LARGEST_BYTES = 100_000  # of a condition's file
+MAX_BYTES = 100_000  # of a condition's file
 _PART = re.compile(r"-- (?:let ([A-Za-z]\w*)|(label|probability)):\s*")
 _SETTINGS = ("kind", "timing", "priority", "uncertain")
 
@@ -139,8 +139,8 @@ def _read(entry: dict[str, Any], key: str, folder: Path | None, where: str) -> d
             f"is outside the profile's folder: {name}", "put it into the profile's folder"
         )
     try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise refused(f"is larger than {LARGEST_BYTES:,} bytes: {name}")
+        if path.stat().st_size > MAX_BYTES:
+            raise refused(f"is larger than {MAX_BYTES:,} bytes: {name}")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise refused(f"cannot be read: {name}: {first_line(error)}") from error

@@ -22,7 +22,7 @@ from restock.ingest.task.task import Task
 NEAR_M = 2.0  # of clearance, for who comes nearer
 REMEMBERED_S = 1.0  # what was seen that long ago was there already
 FASTEST_MPS = 2.0  # that anybody walks: a return that comes faster was hidden before
-LEAST_S = 0.25  # of such a walk: a lidar may be slower than the steps
+MIN_S = 0.25  # of such a walk: a lidar may be slower than the steps
 PLAN_PARTS = 3  # between two look-ahead points, and to the first
 GAP_WITHIN = 1.4  # of `near_m`: the plan just ahead
 _MOTION = (
@@ -57,7 +57,7 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
     if not count:
         return np.full(len(clearance), np.nan)
     elapsed_s = (now["stamp_ns"] - earlier[0]["stamp_ns"]) * 1e-9
-    walked_m = FASTEST_MPS * np.maximum(elapsed_s, LEAST_S)
+    walked_m = FASTEST_MPS * np.maximum(elapsed_s, MIN_S)
     before = np.array([one["sector_clearance_m"] for one in earlier])
     motions = _motions([now, *earlier])
     if not native.is_used():

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 from restock.errors import ConfigError
 
 NAMED = ("robot", "site", "firmware", "map", "shift")  # columns of the views
-MOST_TAGS = 64  # of a recording
-LONGEST_NAME, LONGEST_VALUE = 64, 256  # characters
+MAX_TAGS = 64  # of a recording
+MAX_NAME, MAX_VALUE = 64, 256  # characters
 
 
 def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False) -> dict[str, str]:
@@ -44,22 +44,22 @@ def parse_tags(texts: Iterable[str], *, flag: str = "--tag", empty: bool = False
                 remedy="a recording has one value of a tag: ingest the recordings of each value "
                 "separately",
             )
-    if len(tags) > MOST_TAGS:
+    if len(tags) > MAX_TAGS:
         raise ConfigError(
-            f"{len(tags)} tags are too many: at most {MOST_TAGS} are allowed", where=flag
+            f"{len(tags)} tags are too many: at most {MAX_TAGS} are allowed", where=flag
         )
     return tags
 
 
 def tag_problem(name: str, value: str) -> str | None:
     """Why this cannot be a tag, or None."""
-    if not 0 < len(name) <= LONGEST_NAME or "=" in name or not name.isprintable():
+    if not 0 < len(name) <= MAX_NAME or "=" in name or not name.isprintable():
         return (
-            f"{name[: LONGEST_NAME + 1]!r} is not a name of a tag: use 1 to {LONGEST_NAME} "
+            f"{name[: MAX_NAME + 1]!r} is not a name of a tag: use 1 to {MAX_NAME} "
             "characters, without = and control characters"
         )
-    if len(value) > LONGEST_VALUE:
-        return f"the value of {name} has {len(value):,} characters, more than {LONGEST_VALUE}"
+    if len(value) > MAX_VALUE:
+        return f"the value of {name} has {len(value):,} characters, more than {MAX_VALUE}"
     if not value.isprintable():
         return f"the value of {name} has control characters"
     return None

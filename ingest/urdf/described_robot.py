@@ -29,8 +29,8 @@ from restock.ingest.urdf.description import (
 )
 from restock.words import counted
 
-SMALLEST_M = 0.005  # of a wheel's radius
-MOST_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
+MIN_M = 0.005  # of a wheel's radius
+MAX_ABOVE = 2  # joints that move above a wheel, as a suspension: more are an arm's
 ENDLESS_RAD = 6 * np.pi  # a joint that may turn so far is a wheel's
 AT_FLOOR_M = 0.012  # what is no higher above the floor stands on it
 USUAL_RADPS = (0.5, 60.0)  # a wheel's limit beyond this is a placeholder
@@ -168,10 +168,10 @@ def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
                 swivels |= _endless(upward)
                 steers |= upward.kind == "revolute"
             upward = above.get(upward.parent)
-        if moving > MOST_ABOVE:
+        if moving > MAX_ABOVE:
             continue
         radius = _radius(description.links.get(joint.child))
-        if not radius > SMALLEST_M and ground is not None:  # a mesh
+        if not radius > MIN_M and ground is not None:  # a mesh
             radius = float(place.at_m[2]) - ground
         found.append(_Wheel(joint, place, radius, swivels, steers))
     return found
@@ -222,11 +222,11 @@ def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
     able = [
         wheel
         for wheel in wheels
-        if wheel.radius_m > SMALLEST_M
+        if wheel.radius_m > MIN_M
         and not wheel.swivels
         and "caster" not in wheel.joint.child.lower()
         and "castor" not in wheel.joint.child.lower()
-        and abs(wheel.y_m) > SMALLEST_M
+        and abs(wheel.y_m) > MIN_M
     ]
     largest = max((wheel.radius_m for wheel in able), default=0.0)
     able = [wheel for wheel in able if wheel.radius_m > 0.5 * largest]

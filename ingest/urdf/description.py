@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
 F64 = NDArray[np.float64]
 LONGEST = 4_000_000  # letters of a description
-MOST_LINKS = 5_000
+MAX_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
 HEAVIEST_KG = 100_000.0  # of a link
 
@@ -80,7 +80,7 @@ def read_description(text: str) -> Description | str:
     if robot.tag != "robot":
         return f"is not a URDF: it begins with <{robot.tag}>, not with <robot>"
     links = {str(link.get("name")): link for link in robot.findall("link")}
-    if len(links) > MOST_LINKS:
+    if len(links) > MAX_LINKS:
         return f"{len(links):,} links are too many for a robot"
     joints = [
         Joint(str(j.get("name")), str(j.get("type")), str(p.get("link")), str(c.get("link")), j)

@@ -19,7 +19,7 @@ from restock.errors import StoreError, expect
 from restock.ingest.task.signals import STORED_SIGNALS
 from restock.interrupts import interrupts_raised
 from restock.replay.fleet.two_sample import (
-    LEAST_EPISODES,
+    MIN_EPISODES,
     Shift,
     false_discovery_adjusted,
     share_differences,
@@ -287,11 +287,11 @@ def _signals(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, Any], Row
     counts = dict(
         connection.sql("SELECT change, count(*) FROM episode_pairs GROUP BY ALL").fetchall()
     )
-    new = counts.get("in", 0) >= LEAST_EPISODES
+    new = counts.get("in", 0) >= MIN_EPISODES
     if new and sum(counts.values()) > counts["in"]:
         of_a, of_b = "change <> 'in'", "change = 'in'"
         words = "the new episodes of b, compared with those of a"
-    elif counts.get("out", 0) >= LEAST_EPISODES and sum(counts.values()) > counts["out"]:
+    elif counts.get("out", 0) >= MIN_EPISODES and sum(counts.values()) > counts["out"]:
         of_a, of_b = "change = 'out'", "change <> 'out'"
         words = "the episodes of b, compared with those that were removed"
     else:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from restock.arrays import F64
 from restock.stats import NOT_KNOWN, ConfidenceInterval
 
-LEAST_EPISODES = 5  # of each sample: fewer say nothing of its spread
+MIN_EPISODES = 5  # of each sample: fewer say nothing of its spread
 _RESAMPLES_AT_ONCE = 50
 
 
@@ -35,14 +35,14 @@ def shift(first: NDArray[Any], second: NDArray[Any]) -> Shift:
     """How a figure (n,), one value an episode, differs in a second sample (m,); NaN is unknown.
 
     The interval of the standardised difference is the normal one of Hedges and Olkin (1985).
-    From fewer than LEAST_EPISODES episodes of either there is none, and no p-value.
+    From fewer than MIN_EPISODES episodes of either there is none, and no p-value.
     """
     samples = [np.asarray(values, np.float64) for values in (first, second)]
     a, b = (values[np.isfinite(values)] for values in samples)
     episodes = len(a), len(b)
     mean = tuple(float(values.mean()) if len(values) else float("nan") for values in (a, b))
     nan = float("nan")
-    if min(episodes) < LEAST_EPISODES:
+    if min(episodes) < MIN_EPISODES:
         return Shift(episodes, (mean[0], mean[1]), NOT_KNOWN, nan, nan)
     from scipy.stats import ks_2samp
 

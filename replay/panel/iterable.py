@@ -33,7 +33,7 @@ from restock.replay.panel.logged_sampler import (
 )
 from restock.replay.panel.panel import Panel
 
-_MOST_WORKERS = 64
+_MAX_WORKERS = 64
 
 
 class PanelDataset(IterableDataset[dict[str, Tensor]]):
@@ -74,7 +74,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self._limit = self.panel.header.mixture.most_draws
         # In memory that workers share: passes begun by each, and the next one, since persistent
         # workers keep a copy of this from before the first.
-        self._begun = _shared(_MOST_WORKERS)
+        self._begun = _shared(_MAX_WORKERS)
         self._next = _shared(1)
         self._persists = False  # this is a worker's copy, and had its first pass
         self._sent_by = (0, 1)  # the rank that sent this copy to a worker, and how many there are
@@ -137,14 +137,14 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
                 where=str(self.path),
                 remedy="give `batches`",
             )
-        if epoch < int(self._begun[number % _MOST_WORKERS]):
+        if epoch < int(self._begun[number % _MAX_WORKERS]):
             raise MixtureError(
                 f"pass {epoch} was given already, and its rows may be drawn"
                 f" {self._limit:g} times in all",
                 where=str(self.path),
                 remedy=f"go on with set_epoch({epoch + 1})",
             )
-        self._begun[number % _MOST_WORKERS] = epoch + 1
+        self._begun[number % _MAX_WORKERS] = epoch + 1
         for _ in range(epoch * ranks * (self.batches or 0)):
             self._draw(sampler)
 

@@ -24,7 +24,7 @@ AGAIN = "make it again with `restock mix`"
 SAMPLED_BLOCKS, BLOCK_BYTES = 16, 4096
 DIGEST_BYTES = 16
 LEAF_BYTES = 1 << 20
-MOST_THREADS = 8
+MAX_THREADS = 8
 
 
 class FileRecord(msgspec.Struct, frozen=True):
@@ -97,7 +97,7 @@ def checksum(path: Path, leaf_bytes: int) -> str:
     leaves = Leaves(path.stat().st_size, leaf_bytes)
     descriptor = os.open(path, os.O_RDONLY)
 
-    threads = min(os.cpu_count() or 1, MOST_THREADS)
+    threads = min(os.cpu_count() or 1, MAX_THREADS)
 
     def add_from(first: int) -> None:
         for number in range(first, leaves.count, threads):

@@ -20,7 +20,7 @@ from restock.arrays import Bools, Ints
 
 KEYS = ("episode_index", "step_index", "transition_id")  # the id where all others are the same
 # Stretches that are more, and shorter on average, take longer than sorting rows.
-MOST_STRETCHES, STRETCH_ROWS = 1_000, 256
+MAX_STRETCHES, STRETCH_ROWS = 1_000, 256
 COLUMNS_AT_A_TIME = 2  # put in order: each holds memory
 _LOOKED_AT = 1 << 20  # codes at a time
 
@@ -132,7 +132,7 @@ def _in_order(batches: list[_Stretches], rank: Ints) -> list[tuple[int, int, int
     none = np.empty(0, np.int64)
     begin = np.concatenate([none, *(one.begin for one in batches)])
     size = np.concatenate([none, *(one.size for one in batches)])
-    if len(size) > MOST_STRETCHES and size.sum() < len(size) * STRETCH_ROWS:
+    if len(size) > MAX_STRETCHES and size.sum() < len(size) * STRETCH_ROWS:
         return None
     batch = np.repeat(np.arange(len(batches)), [len(one.begin) for one in batches])
     recording = rank[np.concatenate([none, *(one.recording for one in batches)])]

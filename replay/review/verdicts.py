@@ -28,7 +28,7 @@ _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 _STEP = re.compile(r"[0-9]{1,9}")
 _EXTENT = re.compile(r"([0-9]{1,9})\s*(?:\.\.|-)\s*([0-9]{1,9})")
 _MOVED_S = 0.1  # by which a step's time may differ from the file's
-_MOST_SAID = 10  # problems of a file that are named
+_MAX_SAID = 10  # problems of a file that are named
 _ROWS = """
 SELECT
     recording_id, ingest_id, source_file, format, episode_id, episode_index, step_index, logged_ns,
@@ -154,7 +154,7 @@ class _Reading:
         """Raises LabelError where problems were found."""
         if not self.problems:
             return
-        shown = self.problems[:_MOST_SAID]
+        shown = self.problems[:_MAX_SAID]
         if more := len(self.problems) - len(shown):
             shown.append(f"and {more} more")
         raise LabelError(

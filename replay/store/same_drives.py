@@ -23,8 +23,8 @@ from restock.arrays import Ints
 from restock.replay.store.shared_rows import MetTwice
 
 N = TypeVar("N", bound=np.generic)
-LEAST_ROWS = 2
-LEAST_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
+MIN_ROWS = 2
+MIN_SHARE = 0.1  # of the smaller recording's distinctive rows: pairs that share less are not told
 WITHIN_NS = 100_000_000  # of the shift
 FEW = 5  # recordings of one content, up to which all pairs are compared
 _BATCH_ROWS = 100_000
@@ -59,7 +59,7 @@ def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def same_drives(rows: MovingRows) -> pa.Table:
-    """Pairs of recordings with LEAST_ROWS distinctive rows, and LEAST_SHARE of them, in common.
+    """Pairs of recordings with MIN_ROWS distinctive rows, and MIN_SHARE of them, in common.
 
     Columns: `recording_id`, `same_as` (the later name), `rows` of both within WITHIN_NS of the
     shift, `share` of the distinctive rows of the smaller one, and `later_s`, the shift. A content
@@ -72,7 +72,7 @@ def same_drives(rows: MovingRows) -> pa.Table:
     later = stamp[second] - stamp[first]
     # By chance two recordings share little: only pairs that share enough are gone on with.
     keys, each = np.unique(pair, return_counts=True)
-    least = np.maximum(LEAST_SHARE * _smaller(keys, count, distinctive), LEAST_ROWS)
+    least = np.maximum(MIN_SHARE * _smaller(keys, count, distinctive), MIN_ROWS)
     kept = np.isin(pair, keys[each >= least])
     pair, later = pair[kept], later[kept]
     order = np.lexsort((later, pair))
@@ -82,7 +82,7 @@ def same_drives(rows: MovingRows) -> pa.Table:
     near = np.abs(later - np.repeat(shift, each)) <= WITHIN_NS
     same = np.add.reduceat(near, begin, dtype=np.int64) if len(begin) else each
     share = same / np.maximum(_smaller(keys, count, distinctive), 1)
-    told = (same >= LEAST_ROWS) & (share >= LEAST_SHARE)
+    told = (same >= MIN_ROWS) & (share >= MIN_SHARE)
     names = pa.array(rows.names, pa.string())
     return pa.table(
         {

@@ -20,7 +20,7 @@ SHARED = ("shared_rows", "repeated_rows", "same_steps")  # the view, and what is
 CONTENT, ROWS = "distinctive_rows.content", "distinctive_rows"  # of the manifests
 MARKED = 1 << 14  # numbers at a time
 _ODD = np.uint64(0x9E3779B97F4A7C15)
-_LEAST_BITS, _MOST_BITS = 10, 34
+_MIN_BITS, _MAX_BITS = 10, 34
 
 
 def install_shared_rows(
@@ -70,7 +70,7 @@ class MetTwice:
     """
 
     def __init__(self, count: int) -> None:
-        bits = min(max(int(4 * count).bit_length(), _LEAST_BITS), _MOST_BITS)
+        bits = min(max(int(4 * count).bit_length(), _MIN_BITS), _MAX_BITS)
         self._shift = np.uint64(64 - bits)
         self._marks = np.zeros(1 << bits, np.uint8)  # bit 0: met, bit 1: met again
         self._last = np.zeros(MARKED << 4, np.int32)  # by a place's low bits, who was last there

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
-LEAST_PAIRS = 3  # of which `paired_t` says more than the mean
+MIN_PAIRS = 3  # of which `paired_t` says more than the mean
 _WEIGHTS_AT_ONCE = 4_000_000  # in memory
 
 
@@ -218,13 +218,13 @@ def paired_t(
     """Return the mean of paired differences (n,), its Student's t interval, and p of no difference.
 
     With n of 5 it covers what it says (a percentile bootstrap .84 to .91 of .95). Below
-    `LEAST_PAIRS`, and where all are the same, the spread is not known: ends and p are NaN.
+    `MIN_PAIRS`, and where all are the same, the spread is not known: ends and p are NaN.
     """
     from scipy.stats import ttest_1samp
 
     values = np.asarray(differences, np.float64)
     value = float(values.mean())
-    if len(values) < LEAST_PAIRS or nothing_varies(values):
+    if len(values) < MIN_PAIRS or nothing_varies(values):
         return ConfidenceInterval(value, float("nan"), float("nan")), float("nan")
     test = ttest_1samp(values, 0.0)
     low, high = test.confidence_interval(confidence)
@@ -270,7 +270,7 @@ def paired_t_power(effect: float, sd: float, pairs: int, *, confidence: float = 
     """
     from scipy.stats import chi2, norm, t
 
-    if pairs < LEAST_PAIRS:
+    if pairs < MIN_PAIRS:
         return 0.0
     freedom, shift = pairs - 1, effect / (sd / math.sqrt(pairs))
     limit = float(t.ppf(0.5 + confidence / 2, freedom))

@@ -47,7 +47,7 @@ def test_a_folder_of_no_use_is_refused(text, what, tmp_path):
 
 
 def test_more_definitions_than_are_read_are_refused_and_not_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("restock.ingest.decoding.hand_definitions.MOST_FILES", 1)
+    monkeypatch.setattr("restock.ingest.decoding.hand_definitions.MAX_FILES", 1)
     with pytest.raises(RecordingError, match="it holds 2 definitions, more than 1"):
         folder_types(str(package(tmp_path)))
 

@@ -470,7 +470,7 @@ def test_definitions_are_parsed_up_to_a_sum(
 ) -> None:
     """Thirty definitions of 40 kB that differ, against a tenth of the limit: the parser takes a
     second for a MB."""
-    monkeypatch.setattr(recording, "MOST_DEFINED_BYTES", recording.MOST_DEFINED_BYTES // 10)
+    monkeypatch.setattr(recording, "MAX_DEFINED_BYTES", recording.MAX_DEFINED_BYTES // 10)
     path = tmp_path / "run.mcap"
     with path.open("wb") as file:
         writer = Writer(file)

@@ -15,7 +15,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.propose.driven.steering import TurnReading, turn_reading
 from restock.ingest.steps.motion import PoseSeries
 
-WHEELBASE_M, MOST_RAD, SPEED_MPS = 0.4, 0.5, 0.8
+WHEELBASE_M, MAX_RAD, SPEED_MPS = 0.4, 0.5, 0.8
 TIME_S = np.arange(0, 20, 0.05)
 LINK = "<collision><geometry><{0}/></geometry></collision><inertial><mass value='1'/></inertial>"
 
@@ -30,7 +30,7 @@ def car() -> str:
         return (
             f"<joint name='{child}_joint' type='{kind}'><parent link='{parent}'/>"
             f"<child link='{child}'/><origin xyz='{xyz}'/><axis xyz='{axis}'/>"
-            f"<limit lower='-{MOST_RAD}' upper='{MOST_RAD}' effort='1' velocity='9'/></joint>"
+            f"<limit lower='-{MAX_RAD}' upper='{MAX_RAD}' effort='1' velocity='9'/></joint>"
         )
 
     wheel, parts = "cylinder radius='0.05' length='0.03'", []
@@ -66,7 +66,7 @@ def turns(kind: str) -> Any:
 def reading(kind: str) -> TurnReading:
     stamp_ns = (TIME_S * 1e9).astype(np.int64)
     return turn_reading(
-        TIME_S, *told(), PoseSeries(stamp_ns, *driven(turns(kind))), WHEELBASE_M, MOST_RAD
+        TIME_S, *told(), PoseSeries(stamp_ns, *driven(turns(kind))), WHEELBASE_M, MAX_RAD
     )
 
 
@@ -76,7 +76,7 @@ def test_how_it_turned_tells_a_yaw_rate_from_a_steering_angle() -> None:
     assert reading("angle").is_angle
     assert "neither" in reading("mirrored").problem
     assert reading("straight") == TurnReading(
-        too_tight=0, least_m=WHEELBASE_M / float(np.tan(MOST_RAD))
+        too_tight=0, least_m=WHEELBASE_M / float(np.tan(MAX_RAD))
     )  # held up, or no turn at all: as the message says
 
 

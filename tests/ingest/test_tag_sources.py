@@ -19,14 +19,14 @@ from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.storage import (
-    LONGEST_TEXT,
-    MOST_ENTRIES,
+    MAX_ENTRIES,
+    MAX_TEXT,
     Metadata,
     custom_data,
 )
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.profile.tag_rules import TagRules, path_pattern, resolve_tags
-from restock.ingest.task.tags import MOST_TAGS
+from restock.ingest.task.tags import MAX_TAGS
 from restock.replay.store.store import Store
 
 
@@ -114,13 +114,13 @@ def test_hostile_metadata_is_bounded_and_counted(tmp_path):
     path.write_bytes(raw)
     (large, rest), notes = said(path)
     assert large[2] == {"robot": r"amr\x1b[2J"}
-    assert len(rest[2]) == MOST_ENTRIES - 1
+    assert len(rest[2]) == MAX_ENTRIES - 1
     assert r"key \xff\xfe\xfd07" in rest[2]
-    left_out = 1 + 5_000 - (MOST_ENTRIES - 1)
+    left_out = 1 + 5_000 - (MAX_ENTRIES - 1)
     assert notes[0].startswith(f"{left_out:,} entries of its metadata: not text, longer than")
     told = resolve_tags(TagRules(), path, [large, rest], {}, {})
-    assert len(told.tags) == MOST_TAGS
-    assert f"{MOST_ENTRIES - MOST_TAGS:,} names in its metadata cannot be tags" in told.notes[0]
+    assert len(told.tags) == MAX_TAGS
+    assert f"{MAX_ENTRIES - MAX_TAGS:,} names in its metadata cannot be tags" in told.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -143,9 +143,7 @@ def test_custom_data_that_cannot_be_used(tmp_path, text, says):
 
 
 def test_entries_of_custom_data_that_are_no_text_are_counted():
-    text = (
-        f"custom_data:\n  a: [1]\n  b: c\n\n  d: {{e: f}}\n  g: ~\n  h: {'x' * LONGEST_TEXT}\nz: 1"
-    )
+    text = f"custom_data:\n  a: [1]\n  b: c\n\n  d: {{e: f}}\n  g: ~\n  h: {'x' * MAX_TEXT}\nz: 1"
     (source, _, entries), more = custom_data(text, "metadata.yaml")
     assert source == "custom_data in metadata.yaml"
     assert (list(entries), entries["b"], more) == (["b", "h"], "c", 2)

@@ -15,7 +15,7 @@ from support.stores import manifest, recording_transitions
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.task.tags import MOST_TAGS, parse_tags
+from restock.ingest.task.tags import MAX_TAGS, parse_tags
 from restock.replay.store.store import Store
 
 
@@ -111,7 +111,7 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
         (["robot=a", "robot=b"], "robot is given twice, as 'a' and as 'b'"),
         ([f"robot={'x' * 257}"], "the value of robot has 257 characters, more than 256"),
         (["robot=\x1b[2J"], "the value of robot has control characters"),
-        ([f"t{n}=x" for n in range(MOST_TAGS + 1)], "65 tags are too many: at most 64 are allowed"),
+        ([f"t{n}=x" for n in range(MAX_TAGS + 1)], "65 tags are too many: at most 64 are allowed"),
     ],
 )
 def test_tags_of_another_form_are_refused(texts, says):

@@ -180,7 +180,7 @@ def test_a_ring_that_is_chosen_stays_in_memory(
     panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = ring_capacity.row_bytes(panel.observation_size)
-    monkeypatch.setattr(ring_capacity, "MOST_BYTES", 40 * size)
+    monkeypatch.setattr(ring_capacity, "MAX_BYTES", 40 * size)
     auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
     prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
     assert prepared.config.replay.ring_rows == 40

@@ -94,7 +94,7 @@ def test_any_batches_in_any_order_give_the_same_table(
         random.shuffle(batches)  # type: ignore[attr-defined]
     with pytest.MonkeyPatch.context() as patch:
         if few:  # short stretches: rows are sorted
-            patch.setattr(rows_in_order, "MOST_STRETCHES", 0)
+            patch.setattr(rows_in_order, "MAX_STRETCHES", 0)
         check(in_order(batches, table.schema), table)
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from restock.replay.store.same_drives import (
     FEW,
-    LEAST_ROWS,
-    LEAST_SHARE,
+    MIN_ROWS,
+    MIN_SHARE,
     WITHIN_NS,
     MovingRows,
     same_drives,
@@ -42,7 +42,7 @@ def looped(rows: list[Row]) -> set[tuple[str, str, int, float, float]]:
         shift = median_low(gaps)
         same = sum(abs(gap - shift) <= WITHIN_NS for gap in gaps)
         share = same / min(distinctive[one], distinctive[other])
-        if same >= LEAST_ROWS and share >= LEAST_SHARE:
+        if same >= MIN_ROWS and share >= MIN_SHARE:
             pairs.add((f"r{one}", f"r{other}", same, share, shift / 1e9))
     return pairs
 

@@ -128,6 +128,6 @@ def test_a_rescue_shows_who_failed_beside_who_arrived(
     alone = len(film.drive_again(plan, next(r for r in rows if r["policy"] == "agent"))[1])
     with Image.open(paths[0]) as shown:
         assert shown.width > 1.9 * shown.height  # two floors of 12 x 9 m, about
-        assert getattr(shown, "n_frames", 1) == min(film.MOST_FRAMES, max(alone, 2))
+        assert getattr(shown, "n_frames", 1) == min(film.MAX_FRAMES, max(alone, 2))
     (document,) = json.loads((path / film.FOLDER / film.DOCUMENT).read_text())["films"]
     assert document["rescued_from"] == "run:out/before"

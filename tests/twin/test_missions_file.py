@@ -22,7 +22,7 @@ from restock.train.twin.floors.layout import default_warehouse, strip_warehouse
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Perturbation
-from restock.train.twin.recording.missions import MOST_DRIVEN, OrderedMissions, meets
+from restock.train.twin.recording.missions import MAX_DRIVEN, OrderedMissions, meets
 from restock.train.twin.recording.recorder import RecordingPlan
 
 FLOOR = default_warehouse()
@@ -89,8 +89,8 @@ def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> 
             # Every second slip is met, a near collision never.
             missions.note(mission, met=mission.order == 0 and number % 2 == 0)
     kinds = [mission.spec.condition for mission in driven]
-    assert kinds.count("near_collision") == MOST_DRIVEN * 2
-    assert missions.met[0] == 4 or kinds.count("wheel_slip") == MOST_DRIVEN * 4
+    assert kinds.count("near_collision") == MAX_DRIVEN * 2
+    assert missions.met[0] == 4 or kinds.count("wheel_slip") == MAX_DRIVEN * 4
     assert len({mission.spec.seed for mission in driven}) == len(driven)
     assert not missions.owed()
 

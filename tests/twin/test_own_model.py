@@ -16,7 +16,7 @@ from restock.cli.twin.robot import RobotCommand
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
-from restock.ingest.profile.robot_file import LARGEST_BYTES, mjcf_problem
+from restock.ingest.profile.robot_file import MAX_BYTES, mjcf_problem
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -111,7 +111,7 @@ def test_what_a_model_lacks_is_said_by_name(old: str, new: str, message: str) ->
         ("<mujoco>" + "<body>" * 101 + "</body>" * 101 + "</mujoco>", "101 of <body>"),
         ("<robot/>", "is not MJCF: its root is <robot>"),
         ("<mujoco>", "is not XML"),
-        ("<mujoco>" + " " * LARGEST_BYTES + "</mujoco>", "is longer than"),
+        ("<mujoco>" + " " * MAX_BYTES + "</mujoco>", "is longer than"),
     ],
 )  # fmt: skip
 def test_a_hostile_file_is_refused_by_name(text: str, message: str) -> None:

@@ -5,7 +5,7 @@ differs, unless the feed is what is compared (`treatment="mixture"`).
 
 Outcomes are differences with intervals, paired by episode: Student's t over runs (seeds) and
 episodes, so that an interval holds both what another seed and what other episodes would have
-changed. From fewer than `LEAST_RUNS` runs an arm or `LEAST_EPISODES` episodes there is none, nor
+changed. From fewer than `MIN_RUNS` runs an arm or `MIN_EPISODES` episodes there is none, nor
 where every run ended every episode alike: only values. The
 probability of improvement and the interquartile mean are those of arXiv:2108.13264.
 """
@@ -39,13 +39,13 @@ from restock.train.comparison.comparability import (
     check_feeds,
     worst,
 )
-from restock.train.evaluation.regression import LEAST_EPISODES, agent_episodes
+from restock.train.evaluation.regression import MIN_EPISODES, agent_episodes
 from restock.train.run.run import Run
 from restock.words import counted, quoted
 
 Cell = tuple[str, str]  # perturbation, condition (with the kind of block)
 _SAME_TOTAL = 1.02  # ratio of environment steps, and of updates
-LEAST_RUNS = 3  # seeds of each arm: with fewer there is no interval
+MIN_RUNS = 3  # seeds of each arm: with fewer there is no interval
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def _outcome(
     missing = _why_no_interval(a, b, difference)
     # Episode by episode, over all pairs of runs.
     better = improvement_of_arms(b[..., 1], a[..., 1], rng=np.random.default_rng(0))
-    few = min(len(a), len(b)) < LEAST_RUNS or a.shape[1] < LEAST_EPISODES
+    few = min(len(a), len(b)) < MIN_RUNS or a.shape[1] < MIN_EPISODES
     return {
         "perturbation": cell[0],
         "condition": cell[1],
@@ -214,10 +214,10 @@ def _why_no_interval(a: F64, b: F64, difference: ConfidenceInterval) -> str | No
     if np.isnan(difference.value):
         return "the task has no goal: compare the returns"
     runs, episodes = min(len(a), len(b)), a.shape[1]
-    if runs < LEAST_RUNS:
-        return f"{counted(runs, 'run')} an arm, at least {LEAST_RUNS} are needed"
-    if episodes < LEAST_EPISODES:
-        return f"{counted(episodes, 'episode')}, at least {LEAST_EPISODES} are needed"
+    if runs < MIN_RUNS:
+        return f"{counted(runs, 'run')} an arm, at least {MIN_RUNS} are needed"
+    if episodes < MIN_EPISODES:
+        return f"{counted(episodes, 'episode')}, at least {MIN_EPISODES} are needed"
     if difference.low == difference.high:
         return "every run ended every episode in the same way: nothing varies"
     return None
@@ -259,4 +259,4 @@ def last_evaluation(run: Run) -> pa.Table:
     return table.filter(pc.equal(table["gradient_steps"], last))
 
 
-__all__ = ["LEAST_EPISODES", "Comparison", "compare", "last_evaluation"]
+__all__ = ["MIN_EPISODES", "Comparison", "compare", "last_evaluation"]

@@ -32,7 +32,7 @@ from restock.words import counted
 
 WINDOWS = 3  # the last, that figures are the median of
 _SETTLED_LAGS = 10  # updates, in mean ages of the target: then even a young critic's L is low
-_LEAST_UPDATES = 1500  # of a slower rule: no excuse, unless L is falling
+_MIN_UPDATES = 1500  # of a slower rule: no excuse, unless L is falling
 _FALLING = 0.75  # the last L over the first of the last windows
 _WORKING_LAGS = 50, 800  # updates: the mean age of a target that most critics can learn from
 ALONE = "a policy from these logs alone never learns what it leads to"
@@ -142,10 +142,10 @@ def _too_young(last: Sequence[Window], rule: TargetRule) -> str:
     updates, settled = last[-1].gradient_steps, _SETTLED_LAGS * rule.effective_lag
     if updates >= settled:
         return ""
-    if updates < _LEAST_UPDATES:
+    if updates < _MIN_UPDATES:
         return (
             f"after {updates:,} updates any target lags; L is judged from "
-            f"{min(settled, _LEAST_UPDATES):,.0f} on"
+            f"{min(settled, _MIN_UPDATES):,.0f} on"
         )
     if last[-1].lag < _FALLING * last[0].lag:
         lags = ", ".join(f"{window.lag:.2f}" for window in last)

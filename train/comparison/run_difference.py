@@ -20,7 +20,7 @@ from restock.replay.fleet.panel_difference import diff_panels
 from restock.replay.panel.panel import Panel
 from restock.stats import mean_over_strata
 from restock.train.comparison.arms import differences
-from restock.train.comparison.compare import LEAST_EPISODES, compare, last_evaluation
+from restock.train.comparison.compare import MIN_EPISODES, compare, last_evaluation
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.measures import cell_name
 from restock.train.run.run import Run
@@ -162,7 +162,7 @@ def _evaluation(
         line |= {f"{name}_a": float(of_both[:, 0].mean()), f"{name}_b": float(of_both[:, 1].mean())}
         found = mean_over_strata([of_both[:, 1] - of_both[:, 0]], rng=rng)
         line[keys[0]] = found.value
-        if len(pairs) >= LEAST_EPISODES and found.low < found.high:
+        if len(pairs) >= MIN_EPISODES and found.low < found.high:
             line |= {keys[1]: found.low, keys[2]: found.high}
     return line
 

@@ -35,9 +35,9 @@ from restock.train.run.run import Run
 Cause = Literal[
     "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
 ]
-_LEAST_ROWS = 20  # held out, for a condition to be diagnosed
-_LEAST_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
-_LEAST_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
+_MIN_ROWS = 20  # held out, for a condition to be diagnosed
+_MIN_TD_ROWS = 100  # for its TD errors to be judged: those of a few episodes scatter by factors
+_MIN_LOGGED = 100  # different logged rows of a condition, for an action to be lacking there
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Window:
         return [
             symptom
             for symptom in self.actions
-            if symptom.condition_rows >= _LEAST_LOGGED
+            if symptom.condition_rows >= _MIN_LOGGED
             and symptom.wanted_low >= limits.wanted
             and symptom.logs_share <= limits.logged
         ]
@@ -261,8 +261,8 @@ def windows_of(run: Run) -> list[Window]:
 
 
 def _window(rows: list[dict[str, Any]], bound: float) -> Window:
-    known_well = [row for row in rows if row["evaluation_rows"] >= _LEAST_ROWS] or rows
-    judged = [row for row in known_well if row["evaluation_rows"] >= _LEAST_TD_ROWS]
+    known_well = [row for row in rows if row["evaluation_rows"] >= _MIN_ROWS] or rows
+    judged = [row for row in known_well if row["evaluation_rows"] >= _MIN_TD_ROWS]
     middle = median(row["evaluation_td"] for row in judged or known_well)
     symptoms = [
         Symptom(

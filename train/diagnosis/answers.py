@@ -28,9 +28,9 @@ UNEXPLAINED = 0.2
 NOISY_UNEXPLAINED = 0.4  # where it depends on who drives, and where
 _KNOWN_GAIN = 0.3  # of logs over the twin's, for a delay to mean something
 HELD = 3  # steps of one action in a row, for its motion to be that action's
-_FEWEST_HELD = 15
+_MIN_HELD = 15
 _AWAY = 0.25  # of the fastest action on each axis
-_MOST_ROWS = 0.8  # of an action's, those with the motion of one other
+_MAX_ROWS = 0.8  # of an action's, those with the motion of one other
 TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and what it leaves out
 
 
@@ -154,20 +154,20 @@ def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comp
     expected = np.array(logs.task.actions, np.float64)
     scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)
     for action, motion in enumerate(held_motion(twin) if twin is not None else []):
-        if len(motion) >= _FEWEST_HELD:
+        if len(motion) >= _MIN_HELD:
             expected[action] = np.median(motion, axis=0)
     names = logs.task.action_names
     for action, motion in enumerate(held_motion(logs)):
         name = names[action]
         what = f"motion under the action {name!r}, held"
-        if len(motion) < _FEWEST_HELD:
+        if len(motion) < _MIN_HELD:
             yield not_run(f"action: {name}", what, "hardly held in the logs"), action
             continue
         away = np.linalg.norm((motion[:, None] - expected) / scale, axis=2)  # (n, A)
         middle = np.median(away, axis=0)
         nearest = int(np.bincount(away.argmin(axis=1)).argmax())
         share = float((away.argmin(axis=1) == nearest).mean())
-        is_other = nearest != action and middle[action] > _AWAY and share >= _MOST_ROWS
+        is_other = nearest != action and middle[action] > _AWAY and share >= _MAX_ROWS
         speed, turn = np.median(motion, axis=0)
         distance = float(middle[action])
         row = judged(

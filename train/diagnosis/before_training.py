@@ -35,7 +35,7 @@ from restock.train.run.run_profile import carried_profile, profile_of_panel
 from restock.train.twin.physics.perturbation import Perturbation
 
 Verdict = Literal["HEALTHY", "BUFFER", "UNDETERMINED"]
-FEWEST_ROWS = 500  # of the logs, for silence to mean health
+MIN_ROWS = 500  # of the logs, for silence to mean health
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def diagnose_rows(
     if twin is None:
         comparisons.append(not_run("twin", "rows of the twin", reason))
     verdict: Verdict = "BUFFER" if found else "HEALTHY"
-    if not found and (len(rows) < FEWEST_ROWS or any(row.suspicious for row in comparisons)):
+    if not found and (len(rows) < MIN_ROWS or any(row.suspicious for row in comparisons)):
         verdict = "UNDETERMINED"
     about = {
         "rows": len(rows),

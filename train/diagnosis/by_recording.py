@@ -20,7 +20,7 @@ from restock.train.diagnosis.causes import Finding, findings
 from restock.train.diagnosis.evidence import Comparison, not_run
 from restock.train.diagnosis.fed_rows import FedRows
 
-FEWEST_ROWS = 500  # of a recording, or of several short ones, that are compared by themselves
+MIN_ROWS = 500  # of a recording, or of several short ones, that are compared by themselves
 MOST = 40  # parts, of the most rows
 CHECK = "recordings"
 _SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wrong in all rows
@@ -36,10 +36,10 @@ def unlike_recordings(
         return [], []
     part, kind = _parts(logs)
     names, rows = np.unique(part, return_counts=True)
-    chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= FEWEST_ROWS).sum(), MOST)]
+    chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= MIN_ROWS).sum(), MOST)]
     what = f"each of the {kind} by itself"
     if len(chosen) < 2:
-        return [], [not_run(CHECK, what, f"there are no two {kind} with {FEWEST_ROWS} rows")]
+        return [], [not_run(CHECK, what, f"there are no two {kind} with {MIN_ROWS} rows")]
     found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
     off: list[Comparison] = []
     of_twin: TwinFits = {}  # the same for every recording
@@ -56,7 +56,7 @@ def unlike_recordings(
     compared = Comparison(
         CHECK, what, "recordings", "off" if some else "ok",
         logs_rows=int(inside.sum()),
-        note=f"{len(chosen)} {kind} with {FEWEST_ROWS} rows were compared:"
+        note=f"{len(chosen)} {kind} with {MIN_ROWS} rows were compared:"
         f" {len(np.unique(logs.recording[inside]))} of {recordings} recordings",
     )  # fmt: skip
     return [_joined(each, len(chosen), kind) for each in some], [compared, *(off if some else [])]
@@ -65,7 +65,7 @@ def unlike_recordings(
 def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
     """Which part each row (N,) is compared with, and what the parts are called."""
     place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
-    is_short = (rows < FEWEST_ROWS)[place.reshape(-1)]
+    is_short = (rows < MIN_ROWS)[place.reshape(-1)]
     tagged = is_short & (logs.robot != "")
     part = np.where(tagged, np.char.add("robot ", logs.robot), logs.recording).astype(object)
     untagged = is_short & ~tagged
@@ -78,14 +78,14 @@ def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
 
 def _by_start(logs: FedRows) -> NDArray[np.str_]:
     """The group of each row (N,): recordings that started one after the other, in groups of
-    `FEWEST_ROWS` rows at least, as many as let `MOST` groups hold all."""
+    `MIN_ROWS` rows at least, as many as let `MOST` groups hold all."""
     names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
     place = place.reshape(-1)
     start = np.full(len(names), np.iinfo(np.int64).max)
     np.minimum.at(start, place, logs.logged_ns)
     order = np.argsort(start, kind="stable")
     middle = np.cumsum(rows[order]) - rows[order] / 2
-    groups = np.clip(len(logs) // (FEWEST_ROWS + rows.max()), 1, MOST)  # each loses half of two
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # each loses half of two
     begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
     named = np.empty(len(names), object)
     for first, end in pairwise(begins.tolist()):

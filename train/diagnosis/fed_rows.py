@@ -29,7 +29,7 @@ _COLUMNS = (
 )
 FEW_EPISODES = 20  # fewer than these are drawn in stretches of
 BLOCK_STEPS = 50  # steps: longer than what a step still shows of those before it
-MOST_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
+MAX_ROWS = 40_000  # of a store or panel, in whole episodes chosen by hash
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class FedRows:
         return rows[:, self.task.observation_names.index(name)].astype(np.float64)
 
 
-def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
+def of_panel(panel: Panel, most: int = MAX_ROWS) -> FedRows:
     """The rows of a panel. Those whose next step is not in the panel are left out where its returns
     are of several steps, and counted.
 
@@ -149,7 +149,7 @@ def of_panel(panel: Panel, most: int = MOST_ROWS) -> FedRows:
     return _one_step(rows, np.asarray(far, np.bool_)) if far.any() else rows
 
 
-def of_store(store: Store, task_hash: str, most: int = MOST_ROWS) -> FedRows:
+def of_store(store: Store, task_hash: str, most: int = MAX_ROWS) -> FedRows:
     """The rows of a task of a store.
 
     Raises:
@@ -257,4 +257,4 @@ def _vectors(column: pa.ChunkedArray, size: int) -> F32:
     return np.ascontiguousarray(flat, np.float32).reshape(-1, size)
 
 
-__all__ = ["MOST_ROWS", "FedRows", "of_panel", "of_store"]
+__all__ = ["MAX_ROWS", "FedRows", "of_panel", "of_store"]

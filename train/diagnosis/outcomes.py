@@ -24,7 +24,7 @@ from restock.train.diagnosis.evidence import (
     shares_compared,
 )
 from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.response import FEWEST_CLUSTERS, RESAMPLES
+from restock.train.diagnosis.response import MIN_CLUSTERS, RESAMPLES
 
 SCALE = 1.2
 OTHER = 0.1  # of the rows
@@ -84,7 +84,7 @@ def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> I
     what = "reward against the task's own, of the same observations"
     implied = implied_reward(logs)
     telling = np.abs(implied) > _TELLING  # False for NaN
-    if len(np.unique(logs.cluster[telling])) < FEWEST_CLUSTERS:
+    if len(np.unique(logs.cluster[telling])) < MIN_CLUSTERS:
         yield not_run(
             "reward scale", what, "too few rows whose reward follows from their observations"
         )

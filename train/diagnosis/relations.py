@@ -29,7 +29,7 @@ _JUMP_M = 0.6
 _AHEAD = 0.5  # sine of the waypoint's bearing, at most, for the way to be what is driven
 _MOST = 0.5  # of what moves
 _CLEAN = 0.1  # of what moves in a recording, in episodes without slip, for slip to be the floor's
-_FEWEST_EPISODES = 5  # of a recording that is judged by itself
+_MIN_EPISODES = 5  # of a recording that is judged by itself
 _NEAR_STEPS = 5
 _FAR = 0.97  # of the lidar's range: nothing was seen
 SlipLeftOut = Literal["episodes", "rows", "none"]
@@ -106,7 +106,7 @@ def _on_ice(rows: FedRows, moves: F64) -> Bools:
     _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
     slipped = np.bincount(episode, _slips(rows)) > 0  # (E,)
     recording = np.unique(rows.recording[first], return_inverse=True)[1] + 1  # (E,)
-    recording[np.bincount(recording)[recording] < _FEWEST_EPISODES] = 0
+    recording[np.bincount(recording)[recording] < _MIN_EPISODES] = 0
     moved = np.bincount(episode, moves)
     clean = np.bincount(recording, moved * ~slipped)  # (R,)
     ice = clean >= np.maximum(_CLEAN * np.bincount(recording, moved), 1e-12)

@@ -18,7 +18,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, percentiles
 
 RESAMPLES = 200
-FEWEST_CLUSTERS = 5
+MIN_CLUSTERS = 5
 _RIDGE = 1e-4  # of the mean diagonal: lags that the rows do not tell apart
 
 
@@ -47,7 +47,7 @@ def fit_response(
     x, y = x[known], y[known]
     place = np.unique(cluster[known], return_inverse=True)[1].reshape(-1)
     clusters = int(place.max(initial=-1)) + 1
-    if clusters < FEWEST_CLUSTERS or not (y**2).sum() or not (x**2).sum():
+    if clusters < MIN_CLUSTERS or not (y**2).sum() or not (x**2).sum():
         return None
     joint = np.concatenate([x, y[:, None]], axis=1)
     width = joint.shape[1]

@@ -17,7 +17,7 @@ from restock.train.diagnosis.fed_rows import FedRows
 
 MOST = 0.02  # of the rows
 _EQUAL = 1e-4
-_FEWEST_STEPS = 10  # of an episode, for its repetition to be no accident
+_MIN_STEPS = 10  # of an episode, for its repetition to be no accident
 
 
 def row_order(rows: FedRows) -> Iterator[Comparison]:
@@ -85,7 +85,7 @@ def _repeated(rows: FedRows) -> Comparison:
     same_step = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 0)
     repeated = int(same_step.sum())
     for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-        if end - begin < _FEWEST_STEPS:
+        if end - begin < _MIN_STEPS:
             continue
         content = hash((rows.observation[begin:end].tobytes(), rows.action[begin:end].tobytes()))
         repeated += (end - begin) if content in seen else 0

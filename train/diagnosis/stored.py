@@ -20,7 +20,7 @@ from restock.ingest.task.task import terminated
 from restock.replay.store.parquet_views import passed_in
 from restock.replay.store.store import Store
 from restock.train.diagnosis.evidence import Comparison, not_run, share_judged
-from restock.train.diagnosis.fed_rows import MOST_ROWS, FedRows
+from restock.train.diagnosis.fed_rows import MAX_ROWS, FedRows
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
 
 FAR = 0.25  # from a command to its action, in units of the fastest action
@@ -86,7 +86,7 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
     ).fetchall()
     same = [(name, count) for name, labels, count in found if labels == version]
     total = np.cumsum([count for _, count in same])
-    chosen = [name for (name, _), sum_ in zip(same, total, strict=True) if sum_ <= MOST_ROWS]
+    chosen = [name for (name, _), sum_ in zip(same, total, strict=True) if sum_ <= MAX_ROWS]
     chosen = chosen or [name for name, _ in same[:1]]
     others = len(found) - len(same)
     note = (

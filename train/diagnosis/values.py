@@ -22,7 +22,7 @@ from restock.stats import (
 )
 from restock.train.diagnosis.evidence import Comparison, judged, not_run, share_judged
 from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.response import FEWEST_CLUSTERS, RESAMPLES, ratio_of
+from restock.train.diagnosis.response import MIN_CLUSTERS, RESAMPLES, ratio_of
 
 BEYOND = 0.02  # of the rows
 SPREAD = 10.0  # of logs over the twin's, or its inverse
@@ -45,7 +45,7 @@ def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Compa
     if twin is None:
         yield not_run("range", "values against the twin's", "no twin to compare with")
     else:
-        few = len(np.unique(logs.episode)) < FEWEST_CLUSTERS
+        few = len(np.unique(logs.episode)) < MIN_CLUSTERS
         for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
             for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
                 yield replace(row, status="undecided") if few and row.off else row
@@ -140,7 +140,7 @@ def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
     seen: Bools = straight[:, None] & (now < most) & (after < most) & (np.abs(after - now) < 0.5)
     place = np.unique(rows.cluster, return_inverse=True)[1].reshape(-1)
     clusters = int(place.max(initial=-1)) + 1
-    if clusters < FEWEST_CLUSTERS or seen.sum() < 100:
+    if clusters < MIN_CLUSTERS or seen.sum() < 100:
         return None
     above, below = np.zeros((2, clusters, task.sectors))
     np.add.at(above, place, np.where(seen, (now - after) * driven[:, None], 0.0))

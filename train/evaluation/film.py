@@ -41,7 +41,7 @@ WORST, RESCUE = "worst failure", "rescue"
 RESCUED_FROM = ("planner", "cloned", "operator")  # and other runs: they come first
 OTHER_RUN = "run:"
 CAPTION_PIXELS, GAP_PIXELS = 44, 12
-MOST_FRAMES = 60
+MAX_FRAMES = 60
 FRAME_MS = 100
 STRIP = 6  # frames of the strip, first and last among them
 _SAME = ("success", "bumps", "time_s", "failure")
@@ -303,10 +303,10 @@ def _beside(
 
 
 def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """An endless WebP of at most MOST_FRAMES frames; the last one stays for a second."""
+    """An endless WebP of at most MAX_FRAMES frames; the last one stays for a second."""
     from io import BytesIO
 
-    picked = np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))
+    picked = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))
     images = [Image.fromarray(frames[i]) for i in picked.tolist()]
     durations = [FRAME_MS] * (len(images) - 1) + [1000]
     out = BytesIO()

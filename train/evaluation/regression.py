@@ -31,8 +31,8 @@ AGENT = "agent"
 FOLDER = Path("baselines")  # where names are looked up, in the working directory
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
-LEAST_EPISODES = 10  # of a row; fewer give no interval and no verdict
-LEAST_OF_A_KIND = 5  # … and of each condition in the row of all, whose spreads are added up
+MIN_EPISODES = 10  # of a row; fewer give no interval and no verdict
+MIN_OF_A_KIND = 5  # … and of each condition in the row of all, whose spreads are added up
 _KEY = b"restock-baseline"
 _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 _Episodes = dict[_Key, tuple[float, float]]  # success and return
@@ -115,7 +115,7 @@ def regression(
     """One row a perturbation and condition of the baseline, and one of each perturbation's all.
 
     `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
-    `better` is an interval above 0. From fewer than `LEAST_EPISODES` neither is told: the row is
+    `better` is an interval above 0. From fewer than `MIN_EPISODES` neither is told: the row is
     `inconclusive`. A cell whose episodes are not the same is `refused`.
 
     Raises:
@@ -209,10 +209,10 @@ def _row(
 def _too_few(episodes: Sequence[int]) -> str | None:
     """Why so many episodes of each condition are too few for an interval, or None."""
     total, least = sum(episodes), min(episodes)
-    if total < LEAST_EPISODES:
-        return f"{counted(total, 'episode')}, at least {LEAST_EPISODES} are needed"
-    if len(episodes) > 1 and least < LEAST_OF_A_KIND:
-        return f"{least} of a condition, at least {LEAST_OF_A_KIND} are needed"
+    if total < MIN_EPISODES:
+        return f"{counted(total, 'episode')}, at least {MIN_EPISODES} are needed"
+    if len(episodes) > 1 and least < MIN_OF_A_KIND:
+        return f"{least} of a condition, at least {MIN_OF_A_KIND} are needed"
     return None
 
 

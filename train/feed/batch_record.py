@@ -44,7 +44,7 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-_MOST_HELD = 1 << 21  # fresh rows; beyond, the oldest interval is written as it is
+_MAX_HELD = 1 << 21  # fresh rows; beyond, the oldest interval is written as it is
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
 
@@ -254,7 +254,7 @@ class FeedRecord(Stateful):
             interval.fill(self.labels)
         self.labels.clear()
         rows = sum(len(interval.rows["td"]) for interval in self._held)
-        while self._held and (rows > _MOST_HELD or not self._held[0].waits):
+        while self._held and (rows > _MAX_HELD or not self._held[0].waits):
             interval = self._held.pop(0)
             rows -= len(interval.rows["td"])
             self._write_fresh(interval)

@@ -14,7 +14,7 @@ from restock.arrays import F64, Ints
 from restock.train.feed.sampled_rows import Columns, episode_sums
 
 _SHORT = 1e-3  # of the rows fed: less is rounding
-_MOST_MARKS = 1 << 25  # keys that are marked in place; those of a wider range are sorted instead
+_MAX_MARKS = 1 << 25  # keys that are marked in place; those of a wider range are sorted instead
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def one_of_each(key: Ints) -> Ints:
     """
     first = int(key.min()) if len(key) else 0
     span = int(key.max(initial=first)) - first + 1
-    if span > _MOST_MARKS:
+    if span > _MAX_MARKS:
         sorted_places: Ints = np.unique(key, return_index=True)[1]
         return sorted_places
     marked, place = np.zeros(span, np.bool_), np.empty(span, np.int32)

@@ -24,7 +24,7 @@ from restock.train.feed.logs import Logs
 from restock.train.feed.probe import Probe
 
 ROWS = 512  # of each condition, chosen by hash
-_LEAST_ROWS = 50  # of a condition, to count
+_MIN_ROWS = 50  # of a condition, to count
 _SHRINKAGE = 0.05  # of the covariance towards its diagonal's mean
 _RIDGE = 1.0  # on standardised features
 
@@ -58,7 +58,7 @@ class LogFidelity:
             for name, (begin, end) in zip(probe.conditions, pairwise(probe.bounds), strict=True):
                 steps.setdefault(name, []).append(observation[begin:end])
         every = {name: np.concatenate(parts) for name, parts in sorted(steps.items())}
-        names = [name for name, rows in every.items() if len(rows) >= _LEAST_ROWS]
+        names = [name for name, rows in every.items() if len(rows) >= _MIN_ROWS]
         if len(names) < 2:
             return {}
         parts = [every[name] for name in names]
@@ -92,7 +92,7 @@ class LogFidelity:
         return [
             (name, slice(self._bounds[index], self._bounds[index + 1]))
             for index, name in enumerate(self._names)
-            if self._bounds[index + 1] - self._bounds[index] >= _LEAST_ROWS
+            if self._bounds[index + 1] - self._bounds[index] >= _MIN_ROWS
         ]
 
 

@@ -21,7 +21,7 @@ from restock.state import Stateful
 from restock.train.feed.fresh_log import FreshPerturbations
 from restock.train.feed.logs import Coded, Logs
 
-_MOST_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead
+_MAX_CELLS = 1 << 22  # of a dense count; wider ranges of episodes are sorted instead
 _BATCH: dict[str, DTypeLike] = {
     **dict.fromkeys(("td", "q", "weight"), "f4"),
     "action": "i2",
@@ -41,7 +41,7 @@ FRESH: dict[str, DTypeLike] = {
 }
 
 _OF_RING = ("episode", "episode_step", "behaviour_policy", "env_step", "gradient_step")
-_LEAST_ROOM = 1 << 12  # rows
+_MIN_ROOM = 1 << 12  # rows
 
 Columns = dict[str, Any]  # arrays, lists, or scalars that hold for all rows
 Arrays = Mapping[str, NDArray[Any]]  # (n,) each
@@ -66,7 +66,7 @@ class SampledRows(Stateful):
         begin, self._last = self._count, self._count
         self._count += rows
         if self._count > len(self._held[0]):
-            longer = self._made(max(2 * self._count, _LEAST_ROOM))
+            longer = self._made(max(2 * self._count, _MIN_ROOM))
             for column, old in zip(longer, self._held, strict=True):
                 column[:begin] = old[:begin]
             self._held = longer
@@ -176,7 +176,7 @@ def episode_sums(
     """
     first = int(episode.min(initial=0))
     key = (episode.astype(np.int64) - first) * pairs + pair
-    if int(key.max(initial=0)) < _MOST_CELLS:
+    if int(key.max(initial=0)) < _MAX_CELLS:
         drawn = np.bincount(key)
         cells = np.flatnonzero(drawn)
         count, total = drawn[cells], np.bincount(key, weight)[cells]

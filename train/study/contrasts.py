@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
-from restock.stats import LEAST_PAIRS, holm, nothing_varies, paired_t
+from restock.stats import MIN_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
 from restock.train.twin.missions.registry import MISSIONS
@@ -165,8 +165,8 @@ def contrast(
 
 def _why_no_interval(ahead: F64) -> str | None:
     """What `paired_t` lacks in paired differences (n,), or None."""
-    if (seeds := len(ahead)) < LEAST_PAIRS:
-        return f"{counted(seeds, 'seed')}, at least {LEAST_PAIRS} are needed"
+    if (seeds := len(ahead)) < MIN_PAIRS:
+        return f"{counted(seeds, 'seed')}, at least {MIN_PAIRS} are needed"
     return "the same in every seed: nothing varies" if nothing_varies(ahead) else None
 
 

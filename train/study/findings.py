@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from restock.errors import RunError
-from restock.stats import LEAST_PAIRS, paired_t, paired_t_power
+from restock.stats import MIN_PAIRS, paired_t, paired_t_power
 from restock.train.comparison.compare import Comparison
 from restock.train.comparison.curves import learning_curves, training_cost
 from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
@@ -24,7 +24,7 @@ from restock.words import counted
 # Columns of the table of arms, besides success by cell.
 SAFETY = ("bumps_per_km", "closest_person_m", "time_lost_s", "discounted_return")
 NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
-MOST_NAMED = 4  # checks that refuse a comparison
+MAX_NAMED = 4  # checks that refuse a comparison
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
@@ -86,8 +86,8 @@ def _why_refused(pair: Pair, comparison: Comparison) -> str:
                 ' (schedule.updates_per_env_step), treatment = "method" does not'
             )
     names = list(dict.fromkeys(check.name for check in failed))
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{comparison.verdict} in {', '.join(names[:MOST_NAMED])}{more}"
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return f"{comparison.verdict} in {', '.join(names[:MAX_NAMED])}{more}"
 
 
 def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
@@ -129,7 +129,7 @@ def power_of(plan: StudyPlan) -> Power | None:
     pair = next(p for p in study.pairs if (p.arm.name, p.baseline.name) == (arm, baseline))
     pairs = _Curves(plan).pairs(pair.arm, pair.baseline)
     made = contrast(arm, baseline, measure, pairs)
-    if made is not None and made.sd and made.pairs >= LEAST_PAIRS:
+    if made is not None and made.sd and made.pairs >= MIN_PAIRS:
         sd, source = made.sd, f"{made.pairs} seeds of this study"
     elif study.power is not None:
         kinds = len(study.rare) if measure.endswith("_rare") else 1
@@ -161,11 +161,11 @@ def too_small(plan: StudyPlan, power: Power | None) -> str | None:
     if power is not None:
         return study_power.warning(power) if power.too_small else None
     first, seeds = plan.study.primary, len(plan.study.seeds)
-    if first is None or seeds >= LEAST_PAIRS:
+    if first is None or seeds >= MIN_PAIRS:
         return None
     return (
         f"the study is too small for its contrast: {first.measure} of {first.arm} against"
-        f" {first.baseline} has {counted(seeds, 'seed')}; below {LEAST_PAIRS} seeds there is no"
+        f" {first.baseline} has {counted(seeds, 'seed')}; below {MIN_PAIRS} seeds there is no"
         " interval, so no difference is found"
     )
 

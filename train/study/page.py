@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from restock.stats import LEAST_PAIRS, interval_text, no_interval_text, which_adjusted
-from restock.train.comparison.compare import LEAST_EPISODES, LEAST_RUNS
+from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
+from restock.train.comparison.compare import MIN_EPISODES, MIN_RUNS
 from restock.train.study.findings import SAFETY
 
 FEW_SETTINGS = 4  # that differ, to be named in a line
@@ -37,7 +37,7 @@ def power_sentence(power: dict[str, Any]) -> str:
         f" ({power['spread_from']})."
     )
     if power["least_effect"] is None:
-        text += f" Below {LEAST_PAIRS} seeds there is no interval, so no difference is found."
+        text += f" Below {MIN_PAIRS} seeds there is no interval, so no difference is found."
     else:
         text += (
             f" A true difference of {power['least_effect']:.3f} is found with a probability of .8."
@@ -93,7 +93,7 @@ def _arms(arms: list[dict[str, Any]]) -> list[str]:
         *("", "## Success and safety at the end", ""),
         "Of the kept policies on the unperturbed episodes, means with 95 % over seeds; from bumps"
         " on, in the rare missions. Time is lost against the planner, where both arrived. From"
-        f" fewer than {LEAST_PAIRS} seeds, and where all came to the same, there are values alone.",
+        f" fewer than {MIN_PAIRS} seeds, and where all came to the same, there are values alone.",
         "",
         f"| | {' | '.join(heads)} |",
         f"| --- |{' --- |' * len(names)}",
@@ -124,7 +124,7 @@ def _comparison(comparison: dict[str, Any]) -> list[str]:
         return [*lines, f"Not compared: {comparison['why']}."]
     lines += [
         "Intervals are 95 %, over seeds and episodes; bold where they exclude 0. From fewer than"
-        f" {LEAST_RUNS} seeds or {LEAST_EPISODES} episodes, and where nothing varies, there are"
+        f" {MIN_RUNS} seeds or {MIN_EPISODES} episodes, and where nothing varies, there are"
         " values alone.",
         "",
         f"| perturbation | condition | {baseline} | {comparison['arm']} | difference |"

@@ -1,7 +1,7 @@
 """Is a study large enough for its primary contrast: power, the least effect seen, seeds needed.
 
 The spread is that of the paired differences between seeds: of the study's own finished runs where
-there are at least `LEAST_PAIRS` of both arms, else from the pilots that the study names.
+there are at least `MIN_PAIRS` of both arms, else from the pilots that the study names.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Annotated, Any
 
 import msgspec
 
-from restock.stats import LEAST_PAIRS, paired_t_power
+from restock.stats import MIN_PAIRS, paired_t_power
 from restock.toml import Checked
 
 ENOUGH = 0.8
-MOST_SEEDS = 1000
+MAX_SEEDS = 1000
 SUCCESS = 0.7  # that the noise of episodes is reckoned at
 
 
@@ -47,7 +47,7 @@ class Power:
     effect: float | None  # None: the study names none
     power: float | None  # of that effect
     least_effect: float  # that is seen with a probability of ENOUGH
-    seeds_needed: int | None  # for the effect; None: no effect named, or more than MOST_SEEDS
+    seeds_needed: int | None  # for the effect; None: no effect named, or more than MAX_SEEDS
 
     @property
     def too_small(self) -> bool:
@@ -76,10 +76,10 @@ def spread(config: PowerConfig, *, at_end: bool, kinds: int, episodes: int) -> t
 
 def least_effect(sd: float, seeds: int) -> float:
     """The least true difference that is found with a probability of `ENOUGH`; infinity below
-    `LEAST_PAIRS` seeds, which find none."""
+    `MIN_PAIRS` seeds, which find none."""
     from scipy.optimize import brentq
 
-    if seeds < LEAST_PAIRS:
+    if seeds < MIN_PAIRS:
         return float("inf")
     most = sd
     while paired_t_power(most, sd, seeds) < ENOUGH:
@@ -89,7 +89,7 @@ def least_effect(sd: float, seeds: int) -> float:
 
 def seeds_needed(effect: float, sd: float) -> int | None:
     """The fewest seeds that find an effect with a probability of `ENOUGH`."""
-    tried = range(LEAST_PAIRS, MOST_SEEDS + 1)
+    tried = range(MIN_PAIRS, MAX_SEEDS + 1)
     place = bisect_left(tried, ENOUGH, key=lambda seeds: paired_t_power(effect, sd, seeds))
     return tried[place] if place < len(tried) else None
 
@@ -105,7 +105,7 @@ def warning(power: Power) -> str:
         f"the least effect that they find with a probability of {ENOUGH:g} is"
         f" {power.least_effect:.3f}"
         if math.isfinite(power.least_effect)
-        else f"below {LEAST_PAIRS} seeds there is no interval"
+        else f"below {MIN_PAIRS} seeds there is no interval"
     )
     return (
         f"the study is too small for its contrast: {power.measure} of {power.arm} against"
@@ -116,7 +116,7 @@ def warning(power: Power) -> str:
 
 __all__ = [
     "ENOUGH",
-    "LEAST_PAIRS",
+    "MIN_PAIRS",
     "Power",
     "PowerConfig",
     "least_effect",

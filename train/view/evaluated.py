@@ -33,7 +33,7 @@ from restock.words import quoted
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
-_MOST_SEEDS = 8  # that an error names
+_MAX_SEEDS = 8  # that an error names
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,8 @@ def _recorded(plan: EvaluationPlan, name: str) -> dict[str, Any]:
     for row in rows:
         of.setdefault(row["condition"], []).append(row["episode_seed"])
     known = "; ".join(
-        f"{condition}/{', '.join(map(str, sorted(seeds)[:_MOST_SEEDS]))}"
-        + (" …" if len(seeds) > _MOST_SEEDS else "")
+        f"{condition}/{', '.join(map(str, sorted(seeds)[:_MAX_SEEDS]))}"
+        + (" …" if len(seeds) > _MAX_SEEDS else "")
         for condition, seeds in of.items()
     )
     raise ConfigError(

@@ -28,7 +28,7 @@ from restock.ingest.decoding.columns import gather
 from restock.ingest.decoding.messages import Channel
 
 # A chunk's uncompressed size is the file's claim: beyond this it is refused, not allocated.
-LARGEST_CHUNK = 4 << 30
+MAX_CHUNK = 4 << 30
 LATEST_NS = 2**63 - 1
 STEP = 1 << 12  # of damaged data at a time: damage costs no more than what is near it
 
@@ -101,7 +101,7 @@ def refuse_implausible(chunk: Chunk) -> None:
         BadChunk: it is more than its stored bytes can hold.
     """
     stored = chunk.stop - chunk.start
-    if chunk.size > min(most_bytes(stored), LARGEST_CHUNK):
+    if chunk.size > min(most_bytes(stored), MAX_CHUNK):
         raise BadChunk(f"{stored:,} bytes that claim to hold {chunk.size:,}")
 
 
@@ -148,7 +148,7 @@ def _check(chunk: Chunk, data: bytes | memoryview) -> None:
         raise BadChunk("its CRC does not match")
 
 
-def inflate_partly(chunk: Chunk, file: Buffer, limit: int = LARGEST_CHUNK) -> bytes:
+def inflate_partly(chunk: Chunk, file: Buffer, limit: int = MAX_CHUNK) -> bytes:
     """Return the first records of a chunk, up to `limit` bytes and as far as they decompress;
     unchecked."""
     limit = min(limit, chunk.size, most_bytes(chunk.stop - chunk.start))

@@ -19,7 +19,7 @@ import numpy as np
 from restock.arrays import Bools, Ints
 
 LEAF, INTERIOR = 0x0D, 0x05  # of a table
-SMALLEST_CELL = 4  # bytes
+MIN_CELL = 4  # bytes
 INT_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}  # by serial type
 
 
@@ -206,7 +206,7 @@ def _pointers(page: bytes, start: int) -> tuple[int, ...]:
     if not count or start + 2 * count > len(page):
         raise NotAPage
     places: tuple[int, ...] = struct.unpack_from(f">{count}H", page, start)
-    if min(places) < start + 2 * count or max(places) + SMALLEST_CELL > len(page):
+    if min(places) < start + 2 * count or max(places) + MIN_CELL > len(page):
         raise NotAPage
     return places
 

@@ -20,15 +20,15 @@ from restock.arrays import F64
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.task.signals import wrap_angle
 
-LEAST_GAP_S = 0.4  # shorter ones say little
+MIN_GAP_S = 0.4  # shorter ones say little
 WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
 MOVES = 0.25  # of what was commanded: less is standing
 STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
-LONGEST_S = 60.0
-LONGEST_GAP_S = 3600.0  # between two commands; longer: their log times are wrong
+MAX_S = 60.0
+MAX_GAP_S = 3600.0  # between two commands; longer: their log times are wrong
 SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
 NEARLY = 0.8  # of the fastest command counts as it
-LEAST_SAMPLES = 10
+MIN_SAMPLES = 10
 HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached its limit
 
 
@@ -55,11 +55,7 @@ def command_hold(
     ends = np.append(time_s[1:], at[-1])
     on, stopped, stood, went = [], [], 0, 0
     for begin, end, speed, turn in zip(time_s, ends, speed_mps, yaw_rate_radps, strict=True):
-        if (
-            not LEAST_GAP_S <= end - begin <= LONGEST_GAP_S
-            or at[0] > begin
-            or at[-1] < end - within
-        ):
+        if not MIN_GAP_S <= end - begin <= MAX_GAP_S or at[0] > begin or at[-1] < end - within:
             continue
         if speed == 0 and turn == 0:
             settled = min(begin + 1.0, end)  # it brakes first
@@ -109,10 +105,10 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
     comments = []
     age = None
     if on:
-        age = min(max(on), LONGEST_S)
+        age = min(max(on), MAX_S)
         comments.append(
             f"the robot drove on to the end of {len(on)} of {len(on) + len(stopped)} gaps of"
-            f" {LEAST_GAP_S:g} s and more between commands, the longest of {max(on):.1f} s"
+            f" {MIN_GAP_S:g} s and more between commands, the longest of {max(on):.1f} s"
         )
     if stopped:
         middle = float(np.median(stopped))
@@ -152,7 +148,7 @@ def limit_of(settled: F64, fastest: float) -> float | None:
     Ahead and about share the wheels, so that the quickest tenth is taken, where the other motion
     asked least of them.
     """
-    if len(settled) < LEAST_SAMPLES:
+    if len(settled) < MIN_SAMPLES:
         return None
     reached = float(np.percentile(settled, 90))
     return float(f"{reached:.3g}") if 0.01 < reached < HELD_BACK * fastest else None

@@ -29,13 +29,13 @@ SETTLED_S = 1.0  # a command is no older
 ANSWERED_S = 0.5  # after its end in which a turn still answers it
 SPOT_M = 0.1  # the circle of a turn on the spot, at most: no car is so small
 TURNS_RADPS = 0.15  # less is a slope of noise
-LEAST_PIVOT_S, LEAST_PIVOT_RAD = 0.5, 0.5  # of one turn on the spot, and of all
+MIN_PIVOT_S, MIN_PIVOT_RAD = 0.5, 0.5  # of one turn on the spot, and of all
 STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpest turn that is told
-LEAST_ASKED_RAD, LEAST_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
-LEAST_HALF_RAD = 1.0  # … of which following half is turning on the spot
-LEAST_DRIVEN_M = 0.05  # else it may not have been able to move
-LEAST_TIGHT, TIGHTER, AS_ONE, SPEEDS = 20, 1.5, 0.25, 1.5
-LEAST_TURNS = 20  # moments of driving in a turn
+MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
+MIN_HALF_RAD = 1.0  # … of which following half is turning on the spot
+MIN_DRIVEN_M = 0.05  # else it may not have been able to move
+MIN_TIGHT, TIGHTER, AS_ONE, SPEEDS = 20, 1.5, 0.25, 1.5
+MIN_TURNS = 20  # moments of driving in a turn
 WHEELBASES_M = (0.05, 10.0)  # of what drives
 WELL, CLEARLY = 0.5, 0.5  # of the turning, left unexplained; of what the other reading leaves
 
@@ -56,8 +56,8 @@ class DriveEvidence:
     @property
     def pivots(self) -> bool:
         """It turns on the spot."""
-        turned = self.pivoted_rad >= max(LEAST_PIVOT_RAD, FOLLOWS * self.asked_rad)
-        half = self.asked_rad >= LEAST_HALF_RAD and self.followed_rad >= self.asked_rad / 2
+        turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.asked_rad)
+        half = self.asked_rad >= MIN_HALF_RAD and self.followed_rad >= self.asked_rad / 2
         return turned or half
 
     @property
@@ -68,8 +68,8 @@ class DriveEvidence:
     @property
     def _declined(self) -> bool:
         """Told to turn on the spot it did not, though it can move."""
-        told = self.asked_rad >= LEAST_ASKED_RAD and self.spells >= LEAST_SPELLS
-        drove = self.driven_m >= LEAST_DRIVEN_M
+        told = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
+        drove = self.driven_m >= MIN_DRIVEN_M
         return told and drove and self.followed_rad < FOLLOWS * self.asked_rad
 
     @property
@@ -136,7 +136,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     tick_s = TICK_NS * 1e-9
     way = np.hypot(speed, sideways)
     spot = (np.abs(turn) >= TURNS_RADPS) & (way <= SPOT_M * np.abs(turn))
-    spot = _spells_of(spot, round(max(LEAST_PIVOT_S, window_s) / tick_s))
+    spot = _spells_of(spot, round(max(MIN_PIVOT_S, window_s) / tick_s))
     sharp = float(np.percentile(np.abs(told_radps), 98))
     fast = float(np.percentile(np.abs(told_mps), 98))
     asked, spells, followed = _on_the_spot(told_s, told_mps, told_radps, poses, sharp)
@@ -152,7 +152,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
         spells=spells,
         followed_rad=followed,
         curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
-        tightest_m=float(np.percentile(circles, 5)) if len(circles) >= LEAST_TURNS else None,
+        tightest_m=float(np.percentile(circles, 5)) if len(circles) >= MIN_TURNS else None,
         stops_at_m=_stops_at(told_s, told_mps, told_radps, middle_s, speed, turn, drives),
     )
 
@@ -214,7 +214,7 @@ def _stops_at(
     used &= (told_s[row] <= at_s) & (at_s - told_s[row] < SETTLED_S)
     curved = np.abs(turn[used]) / np.abs(speed[used])
     tight = told_w[used] >= TIGHTER * curved * told_v[used]
-    if tight.sum() < LEAST_TIGHT:
+    if tight.sum() < MIN_TIGHT:
         return None
     low, middle, high = np.percentile(curved[tight], (10, 50, 90))
     slow, fast = np.percentile(np.abs(speed[used][tight]), (10, 90))
@@ -247,7 +247,7 @@ def _answers(told_s: F64, turn: F64, poses: PoseSeries) -> Iterator[tuple[F64, F
         told = turn[np.maximum(index, 0)]
         used = (index >= 0) & (motion.problem == "") & (np.abs(speed) > 0.05)
         used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(told) > 0.03)
-        if used.sum() >= LEAST_TURNS and (turned[used] ** 2).sum() > 0:
+        if used.sum() >= MIN_TURNS and (turned[used] ** 2).sum() > 0:
             yield told[used], speed[used], turned[used]
 
 

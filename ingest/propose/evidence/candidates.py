@@ -17,8 +17,8 @@ from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.profile.custom_signal import CustomSignal, name_problem
 from restock.ingest.steps.custom_columns import column_of, custom_reduction
 
-MOST_A_TOPIC = 8
-MOST_WORDS = 8  # different texts of a topic that become numbers
+MAX_A_TOPIC = 8
+MAX_WORDS = 8  # different texts of a topic that become numbers
 # A field's path -> its unit, by the end of the path. Messages of ROS use SI units (REP 103).
 UNITS = (
     (r"angular_velocity\.\w|angular\.[xyz]|velocity\[.*\]", "rad/s"),
@@ -89,7 +89,7 @@ def candidates(
         if topic.name in without:
             continue
         possible = [c for c in _of_topic(recording, topic) if (topic.name, c.path) not in used]
-        for one in _changing(recording, topic, possible)[:MOST_A_TOPIC]:
+        for one in _changing(recording, topic, possible)[:MAX_A_TOPIC]:
             name, count = one.name, 2
             while name in named or name_problem(name):
                 name, count = f"{one.name}_{count}", count + 1
@@ -198,7 +198,7 @@ def _text(recording: Recording, topic: TopicInfo, path: str) -> Iterator[Candida
     """A text that takes few values, as numbers."""
     columns: TopicColumns = recording.read({topic.name: [path]})[topic.name]
     texts = sorted({str(text) for text in np.asarray(columns.fields[path])})
-    if 1 < len(texts) <= MOST_WORDS and all(len(text) <= 40 for text in texts):
+    if 1 < len(texts) <= MAX_WORDS and all(len(text) <= 40 for text in texts):
         if all(_number(text) for text in texts):
             yield _one(topic, path)
             return

@@ -24,8 +24,8 @@ FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
 EVENTS_S = 0.2  # the control period where commands are not steady
 STEADY_S = (0.08, 0.5)  # commands this far apart make the ticks themselves
 PAUSE = 5.0  # a gap of more median gaps is a pause in driving
-LONGEST_HOLD_S = 5.0
-MOST_OFF_CLOCK = 0.05  # of a topic's messages
+MAX_HOLD_S = 5.0
+MAX_OFF_CLOCK = 0.05  # of a topic's messages
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class ClockChoice:
             period,
             max(0.5, _up(max(2.5 * period, 1.2 * driving if steady else 0.0))),
             max(
-                float(np.clip(_up(max(2.5 * period, 1.2 * driving)), 0.2, LONGEST_HOLD_S)),
+                float(np.clip(_up(max(2.5 * period, 1.2 * driving)), 0.2, MAX_HOLD_S)),
                 _up((gaps.hold_s or 0.0) * pace),
             ),
             pace,
@@ -174,6 +174,6 @@ def _left_out(columns: dict[str, TopicColumns], report: ClockReport) -> str:
     lost = [
         f"{count:,} of {len(columns[topic]):,} of {topic} are off the clock"
         for topic, count in report.off_clock.items()
-        if count > MOST_OFF_CLOCK * len(columns[topic])
+        if count > MAX_OFF_CLOCK * len(columns[topic])
     ]
     return ", ".join(lost)

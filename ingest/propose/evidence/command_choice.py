@@ -25,9 +25,9 @@ from restock.ingest.propose.evidence.roles import BY_HAND, NAVIGATION, Kind
 
 JOY = "sensor_msgs/msg/Joy"
 WITHIN_S = 0.5
-LEAST_PASSED, LEAST_SHARE, MOSTLY = 5, 0.02, 0.5  # changes that one topic took over from another
-LEAST_HELD, FITS = 10, 0.9  # commands while a button is held; of them, how many are an axis's
-LEAST_TOLD, FOLLOWS, EXACTLY = 20, 0.95, 0.98  # commands that tell; of them, how many follow
+MIN_PASSED, MIN_SHARE, MOSTLY = 5, 0.02, 0.5  # changes that one topic took over from another
+MIN_HELD, FITS = 10, 0.9  # commands while a button is held; of them, how many are an axis's
+MIN_TOLD, FOLLOWS, EXACTLY = 20, 0.95, 0.98  # commands that tell; of them, how many follow
 TARGET_S, SAME = 1.0, 1e-4  # how old what it goes towards may be; m/s and rad/s
 _STEERED = "wheelbase_m"
 Fit = tuple[TopicInfo, Kind]
@@ -79,7 +79,7 @@ class _Told:
             good |= near & (part >= 0) & (part <= 1)
             telling |= (np.abs(target - before).max(axis=1) > SAME) | (now != before).any(axis=1)
         counted = fresh & telling
-        return float(good[counted].mean()) if counted.sum() >= LEAST_TOLD else 0.0
+        return float(good[counted].mean()) if counted.sum() >= MIN_TOLD else 0.0
 
     @property
     def changes(self) -> int:
@@ -130,7 +130,7 @@ def _read(recording: Recording, fit: Fit) -> _Told:
 
 def _inputs(told: Sequence[_Told], output: _Told) -> list[_Told]:
     """Those whose commands it passes on."""
-    return [one for one in told if one is not output and _feeds(one, output, LEAST_SHARE)]
+    return [one for one in told if one is not output and _feeds(one, output, MIN_SHARE)]
 
 
 def _through(told: Sequence[_Told], first: _Told) -> tuple[_Told | None, _Told]:
@@ -183,7 +183,7 @@ def _age_s(one: _Told) -> float:
 
 def _feeds(one: _Told, output: _Told, share: float) -> bool:
     passed = one.passed_on(output)
-    enough = passed >= max(LEAST_PASSED, share * output.changes)
+    enough = passed >= max(MIN_PASSED, share * output.changes)
     return enough and passed > output.passed_on(one)
 
 
@@ -254,11 +254,11 @@ def _held(command: _Told, log_time_ns: Ints, axes: object, buttons: object) -> i
     for button in range(pressed.shape[1]):
         held = known & pressed[:, button]
         moving = held & (speed != 0)
-        if moving.sum() < LEAST_HELD:
+        if moving.sum() < MIN_HELD:
             continue
         for axis in stick.T:
             ratio = speed[moving & (axis != 0)] / axis[moving & (axis != 0)]
-            if len(ratio) < LEAST_HELD or len(np.unique(axis[moving])) < 3:
+            if len(ratio) < MIN_HELD or len(np.unique(axis[moving])) < 3:
                 continue
             near = np.abs(speed[held] - np.median(ratio) * axis[held]) <= 0.01 + 0.01 * np.abs(
                 speed[held]

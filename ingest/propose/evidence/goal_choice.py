@@ -9,7 +9,7 @@ from restock.ingest.profile.inputs import HINDSIGHT
 from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
-FEWEST_ROWS = 100  # with a goal in hindsight, where these are wanted and the rest is left out
+MIN_ROWS = 100  # with a goal in hindsight, where these are wanted and the rest is left out
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class GoalChoice:
         """The choice after a trial: no goal where hindsight finds none for most of the drive, or,
         where it is wanted, for all but a few rows."""
         without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
-        enough = self.hindsight_wanted and transitions >= FEWEST_ROWS
+        enough = self.hindsight_wanted and transitions >= MIN_ROWS
         if self.source != "hindsight" or without <= transitions or enough:
             return self
         return GoalChoice(

@@ -20,7 +20,7 @@ from restock.ingest.steps.frames import Edges, frame_id_path, plain
 from restock.ingest.task.signals import yaw_of
 from restock.ingest.urdf.description import BASE_FRAMES
 
-LEAST_ASIDE_M = 0.05  # of the middle: a lidar whose input must say where it is
+MIN_ASIDE_M = 0.05  # of the middle: a lidar whose input must say where it is
 WIDE_RAD = math.radians(150)  # a depth camera's scan is narrower, and of no height of a lidar
 Place = tuple[float, float, float]  # ahead and to the left (m), and turned (rad)
 _TURN = 2 * math.pi
@@ -105,7 +105,7 @@ def lidars_of(
     found = _several(recording, fits, scanned, edges, footprint.middle_m) if len(fits) > 1 else {}
     if len(found) > 1:
         return found
-    if abs(footprint.lidar_y_m) <= LEAST_ASIDE_M:
+    if abs(footprint.lidar_y_m) <= MIN_ASIDE_M:
         return {}
     lidar = MountedLidar(
         footprint.lidar_x_m or 0.0,

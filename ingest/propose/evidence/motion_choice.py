@@ -24,9 +24,9 @@ from restock.ingest.steps.motion import PoseSeries, poses_along
 from restock.ingest.task.signals import wrap_angle, yaw_of
 
 SMALL_MPS, SMALL_RADPS = 0.04, 0.08  # how far a speed may scatter
-SHORTEST_S, LONGEST_S = 0.2, 2.0
-LEAST_POSES = 3
-LEAST_CHANGES = 20
+MIN_S, MAX_S = 0.2, 2.0
+MIN_POSES = 3
+MIN_CHANGES = 20
 
 
 @dataclass(frozen=True)
@@ -52,22 +52,22 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
     """How speeds are to come from the recording's poses, which are from this `source`."""
     gaps = np.diff(poses.stamp_ns) * 1e-9
     period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
-    least = (LEAST_POSES - 1) * usual * 1.1
-    if len(poses) < LEAST_POSES or least > LONGEST_S:
+    least = (MIN_POSES - 1) * usual * 1.1
+    if len(poses) < MIN_POSES or least > MAX_S:
         span = recording.span_ns or (0, 0)
         problem = (
             f"no odometry, and {source} has {len(poses)} poses in {(span[1] - span[0]) * 1e-9:.0f}"
             " s: too few, or too far apart, to tell speeds from;"
             " record nav_msgs/msg/Odometry, or a pose at least every"
-            f" {LONGEST_S / LEAST_POSES:.1f} s"
+            f" {MAX_S / MIN_POSES:.1f} s"
         )
         return MotionChoice(0.0, period, problem=problem)
     poses = _changes(poses)  # a transform that is held says nothing of noise
     period = max(period, float(np.median(np.diff(poses.stamp_ns))) * 1e-9)
     noise_m = float(np.hypot(_scatter(poses.x_m), _scatter(poses.y_m)) / np.sqrt(2))
     noise_rad = _scatter(np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))]))
-    window = float(np.ceil(max(SHORTEST_S, least) * 10) / 10)
-    while window < LONGEST_S and not _small(noise_m, noise_rad, period, window):
+    window = float(np.ceil(max(MIN_S, least) * 10) / 10)
+    while window < MAX_S and not _small(noise_m, noise_rad, period, window):
         window = round(window + 0.1, 1)
     speed, turn = (_slope_scatter(noise, period, window) for noise in (noise_m, noise_rad))
     comments = (
@@ -154,7 +154,7 @@ def _changes(poses: PoseSeries) -> PoseSeries:
     """Those that differ from the one before, if there are enough of them to tell noise by."""
     columns = (poses.x_m, poses.y_m, poses.yaw_rad)
     new = np.concatenate([[True], np.any([np.diff(column) != 0 for column in columns], axis=0)])
-    if new.sum() < LEAST_CHANGES:
+    if new.sum() < MIN_CHANGES:
         return poses
     return PoseSeries(poses.stamp_ns[new], *(column[new] for column in columns))
 

@@ -23,7 +23,7 @@ from restock.toml import toml_value
 BY_TURNS = "by which its steering angles explain best how it turned: MEASURE IT"
 WHEELBASE_PART = 0.6  # of the outline's length, where nothing says
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
-MOST_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
+MAX_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
 
 def _beams(view: View, notes: list[str]) -> dict[str, Any]:
     """The beams and the field of view of the twin's lidar."""
-    every = -(-view.beams // MOST_BEAMS)
+    every = -(-view.beams // MAX_BEAMS)
     if every > 1:
         notes.append(f"the twin has every {every}. of the lidar's {view.beams} beams")
     return {
@@ -258,7 +258,7 @@ def _lidars(lidars: Sequence[tuple[SeenScans, MountedLidar]], notes: list[str]) 
     if joined is not None:
         return _beams(joined, notes)
     beams = round(2 * math.pi / min(view.step_rad for view, _ in views))
-    return {"lidar.beams": min(beams, MOST_BEAMS)}  # all around, as its angles are by default
+    return {"lidar.beams": min(beams, MAX_BEAMS)}  # all around, as its angles are by default
 
 
 def _key(key: str) -> str:

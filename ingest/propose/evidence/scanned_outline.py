@@ -32,15 +32,15 @@ from restock.ingest.urdf.description import BASE_FRAMES
 
 BINS = 60  # of the full circle
 NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field's name holds a space
-LEAST_SCANS = 20
+MIN_SCANS = 20
 OFTEN = 0.005  # of the scans, and at least three: one odd return says nothing
 TIGHT_PER_WIDTH = 0.3  # room, by the robot's width: less is a near collision
-LEAST_M = 0.05  # half of a robot's length
-LEAST_RANGE_M = 0.01
+MIN_M = 0.05  # half of a robot's length
+MIN_RANGE_M = 0.01
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
-FACING_RAD, LEAST_FACINGS, LEAST_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
-MOST_ASIDE_M = 3.0  # of the middle: a lidar
+FACING_RAD, MIN_FACINGS, MIN_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
+MAX_ASIDE_M = 3.0  # of the middle: a lidar
 _LIMITS = ("range_min", "range_max")
 
 
@@ -58,7 +58,7 @@ class ScannedOutline:
 
     def footprint(self, guess: Footprint) -> Footprint | None:
         """The outline by these scans, where they say more than the guess that there is without."""
-        half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(LEAST_M, self.nearest_m))
+        half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(MIN_M, self.nearest_m))
         own = 2 * np.abs(self.own_m).max(axis=0, initial=0.0)
         length, width = (
             max(min(usual, 2 * half_m), float(least))
@@ -88,7 +88,7 @@ def scanned_outline(
     reduction = Reduction(tuple(paths), partial(_nearest, source))
     columns = recording.read({topic: []}, {topic: reduction})[topic]
     nearest = np.asarray(columns.fields[NEAREST], np.float32)
-    if len(nearest) < LEAST_SCANS:
+    if len(nearest) < MIN_SCANS:
         return None
     own = np.zeros(BINS, np.bool_)
     if poses is not None and len(poses):
@@ -106,8 +106,8 @@ def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
     """The bearings (BINS,) at which the range stays, whichever way the robot faces."""
     facing = np.floor(yaw_rad / FACING_RAD).astype(np.int64)
     ways, counts = np.unique(facing, return_counts=True)
-    ways = ways[counts >= LEAST_A_FACING]
-    if len(ways) < LEAST_FACINGS:
+    ways = ways[counts >= MIN_A_FACING]
+    if len(ways) < MIN_FACINGS:
         return np.zeros(BINS, np.bool_)
     ranges = np.where(np.isfinite(nearest), nearest, 1e3)
     middle = np.median(ranges, axis=0)
@@ -166,8 +166,8 @@ def _range_m(
         return 0.05, 4.0, ""
     own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
     why = ""
-    if low < LEAST_RANGE_M:
-        low, why = LEAST_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
+    if low < MIN_RANGE_M:
+        low, why = MIN_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
     if own_m > low:
         low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
     return round(low, 3), min(round(high, 3), 4.0), why
@@ -204,7 +204,7 @@ def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPla
         at = Tree(usual, kept, segments).place(scan_frame, times)
         x, y = (float(way) for way in at.translation_m[0, :2])
         yaw = float(at.yaw_rad[0])
-        if at.problem[0] == "" and max(abs(x), abs(y)) < MOST_ASIDE_M and np.isfinite(yaw):
+        if at.problem[0] == "" and max(abs(x), abs(y)) < MAX_ASIDE_M and np.isfinite(yaw):
             return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
     return None
 

@@ -3,8 +3,8 @@
 #include "layers.h"
 #include "products.h"
 
-#define MOST_LAYERS 64
-#define MOST_GIVEN ((Size)1 << 32) /* rows: sizes in bytes stay far below what overflows */
+#define MAX_LAYERS 64
+#define MAX_GIVEN ((Size)1 << 32) /* rows: sizes in bytes stay far below what overflows */
 
 typedef struct {
     PyObject_HEAD
@@ -13,10 +13,10 @@ typedef struct {
     const Tiles *tiles;
     const Rows *by_row;
     int hidden;                         /* layers; the head is one more */
-    Size width[MOST_LAYERS + 2];        /* observation, hidden layers, actions */
-    Size weight[MOST_LAYERS + 1];       /* where each layer's weight begins in `values` */
-    Size bias[MOST_LAYERS + 1], end;    /* … its bias, its gain and shift behind it */
-    Hidden layer[MOST_LAYERS];
+    Size width[MAX_LAYERS + 2];        /* observation, hidden layers, actions */
+    Size weight[MAX_LAYERS + 1];       /* where each layer's weight begins in `values` */
+    Size bias[MAX_LAYERS + 1], end;    /* … its bias, its gain and shift behind it */
+    Hidden layer[MAX_LAYERS];
     Size room, given; /* rows that `memory` is for; of the last first input, -1: none */
     float *memory, *input, *down, *spare, *packed;
 } Network;
@@ -44,7 +44,7 @@ static void lay_out(Network *self) {
 static int make_room(Network *self, Size rows) {
     if (self->memory && rows <= self->room)
         return 0;
-    if (rows > MOST_GIVEN) {
+    if (rows > MAX_GIVEN) {
         PyErr_Format(PyExc_ValueError, "%zd rows at once", rows);
         return -1;
     }
@@ -224,8 +224,8 @@ static PyObject *network_backward(PyObject *object, PyObject *from) {
 
 static int read_widths(Network *self, PyObject *widths) {
     Size count = PyTuple_Size(widths), at = 0;
-    if (count < 3 || count > MOST_LAYERS + 2) {
-        PyErr_Format(PyExc_ValueError, "between 3 and %d widths, got %zd", MOST_LAYERS + 2, count);
+    if (count < 3 || count > MAX_LAYERS + 2) {
+        PyErr_Format(PyExc_ValueError, "between 3 and %d widths, got %zd", MAX_LAYERS + 2, count);
         return -1;
     }
     self->hidden = (int)count - 2;

@@ -7,7 +7,7 @@
 #include "buffers.h"
 
 #define PANEL 32    /* columns of a product that are made together */
-#define MOST_ROWS 8 /* of a product that are made together */
+#define MAX_ROWS 8 /* of a product that are made together */
 
 /* Element (m, k) of the left matrix is a[m * row + k * column]; the right one is packed (K, PANEL). */
 typedef void Tile(const float *a, Size row, Size column, const float *b, Size depth, float *out,
@@ -109,14 +109,14 @@ typedef struct {
     Tile *tile, *single;
 } Tiles;
 
-static const Tiles WIDE_TILES = {MOST_ROWS, wide_tile_8, wide_tile_1};
+static const Tiles WIDE_TILES = {MAX_ROWS, wide_tile_8, wide_tile_1};
 static const Tiles NARROW_TILES = {6, narrow_tile_6, narrow_tile_1};
 
 /* out (rows, width) = left (rows, depth) right (depth, width); see `Tile` and `pack`. */
 static void multiply(const Tiles *by, const float *left, Size left_row, Size left_column,
                      const float *right, Size right_row, Size right_column, float *out, Size rows,
                      Size width, Size depth, float *packed) {
-    float narrow[MOST_ROWS * PANEL];
+    float narrow[MAX_ROWS * PANEL];
     pack(right, right_row, right_column, depth, width, packed);
     for (Size n = 0; n < width; n += PANEL) {
         const float *panel = packed + n * depth;

@@ -66,7 +66,7 @@ from restock.words import counted
 
 Report = Callable[[str], None]
 
-FEWEST_SEGMENTS = 8
+MIN_SEGMENTS = 8
 COARSE_SEGMENTS = 16
 HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
 
@@ -186,12 +186,12 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
     stamps = held_out_from(segments, config.held_out, config.seed)
     ordinary, left_out = ordinary_driving(segments)
     chosen = np.flatnonzero(split_at(ordinary, stamps)[0])
-    if len(chosen) < FEWEST_SEGMENTS:
+    if len(chosen) < MIN_SEGMENTS:
         counts = {"held out": len(ordinary) - len(chosen), **left_out}
         raise StoreError(
             f"{counted(len(chosen), 'segment')} of {config.horizon_s:g} s to fit,"
             " fewer than"
-            f" {FEWEST_SEGMENTS} (of {len(segments)}:"
+            f" {MIN_SEGMENTS} (of {len(segments)}:"
             f" {', '.join(f'{count} {reason}' for reason, count in counts.items())})",
             where=str(store.path),
             remedy="ingest more driving, or give a shorter horizon",

@@ -39,7 +39,7 @@ from restock.train.twin.floors.occupancy_grid import (
 
 Mode = Literal["trinary", "scale", "raw"]
 FURTHEST_M = 1e6  # of an origin: beyond it a coordinate has no millimetres left
-LARGEST_YAML = 1 << 20  # bytes
+MAX_YAML = 1 << 20  # bytes
 _FORMATS = ("PPM", "PNG", "BMP")  # PPM: Pillow's name for PGM and its kin
 
 
@@ -101,7 +101,7 @@ def read_grid(path: Path) -> OccupancyGrid:
 
 def _read_yaml(path: Path) -> MapDescription:
     try:
-        if path.stat().st_size > LARGEST_YAML:
+        if path.stat().st_size > MAX_YAML:
             raise ConfigError("is too large for a map.yaml", where=str(path))
         document: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     except OSError as error:

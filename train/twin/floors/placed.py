@@ -19,7 +19,7 @@ PLACED = 0.8  # of the poses, on free ground
 # Of the returns, that near to a wall. Measured on real drives and the sample logs: on the floors
 # that were made of them .78 to .98, on those of other frames up to .61.
 SEEN, NEAR_M = 0.7, 0.25
-FEWEST_RETURNS = 50  # fewer say nothing
+MIN_RETURNS = 50  # fewer say nothing
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def placed_on(floor: Warehouse, drive: Drive) -> bool:
     )
     if float(on_free_ground(floor, places).mean()) < PLACED:
         return False
-    if len(returns) < FEWEST_RETURNS:
+    if len(returns) < MIN_RETURNS:
         return True
     return float((from_walls_m(floor, returns) < NEAR_M).mean()) >= SEEN
 

@@ -27,8 +27,8 @@ from restock.train.twin.physics.robot_parts import actuator_places, wheels_of
 
 TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5
-MOST_TILT_RAD = 0.05
-LEAST_OUTSIDE_M = 0.01  # that is said of a part
+MAX_TILT_RAD = 0.05
+MIN_OUTSIDE_M = 0.01  # that is said of a part
 TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
 
 
@@ -91,7 +91,7 @@ def _settled(robot: RobotModel) -> RobotModel:
     _run(model, data, SETTLE_S)
     _, x, y, _ = data.qpos[3:7]
     tilt = float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
-    if not np.isfinite(data.qpos).all() or tilt > MOST_TILT_RAD:
+    if not np.isfinite(data.qpos).all() or tilt > MAX_TILT_RAD:
         raise _unfit(f"standing still it tips over, by {np.degrees(tilt):.0f} degrees")
     return replace(robot, rest_z_m=float(data.qpos[2]))
 
@@ -175,7 +175,7 @@ def outside(model: RobotModel, body: Body) -> list[str]:
     found = []
     for name, (x, y) in places.items():
         over_m = max(abs(x) - body.length_m / 2, abs(y) - body.width_m / 2)
-        if over_m > LEAST_OUTSIDE_M:
+        if over_m > MIN_OUTSIDE_M:
             found.append(f"{name} is {over_m:.2f} m outside the outline of [task.body]")
     return found
 

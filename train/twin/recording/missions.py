@@ -28,7 +28,7 @@ VERSIONS = {one.name: one.version for one in (PlannerFollower, Operator, RandomP
 BLOCK = 20  # missions dealt at a time, so that every condition comes up in a short recording too
 
 PAUSE_S = (4.0, 12.0)  # between missions, unrecorded
-MOST_DRIVEN = 3  # missions for each that was ordered, where some do not meet what they should
+MAX_DRIVEN = 3  # missions for each that was ordered, where some do not meet what they should
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class OrderedMissions:
     """The missions of a file, in rounds: until as many as were ordered met their kind.
 
     Who plans pallets in an aisle cannot know that the robot comes past them. Each round drives
-    what is still owed, mixed, and never more than MOST_DRIVEN times what was ordered.
+    what is still owed, mixed, and never more than MAX_DRIVEN times what was ordered.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class OrderedMissions:
         owed = {}
         for number, order in enumerate(self.orders.orders):
             wanted = order.missions or 0
-            left = min(wanted - self.met[number], MOST_DRIVEN * wanted - self.driven[number])
+            left = min(wanted - self.met[number], MAX_DRIVEN * wanted - self.driven[number])
             if left > 0:
                 owed[number] = left
         return owed

@@ -77,7 +77,7 @@ DELAYS = {
     "/cmd_vel_nav": Delay(0.2),
     "/cmd_vel": Delay(0.2),
 }
-MOST_NETWORK_MS = 3.0
+MAX_NETWORK_MS = 3.0
 
 
 Hertz = Annotated[float, Meta(gt=0, le=200)]
@@ -387,7 +387,7 @@ def send(
     spread = 0.8 + 0.4 * rng.random((2, len(data)))
     sent_ms = delay.driver_ms * spread[0]
     network_ms = delay.network_ms * (spread[1] + rng.exponential(0.5, len(data)))
-    received_ms = sent_ms + np.minimum(network_ms, MOST_NETWORK_MS)
+    received_ms = sent_ms + np.minimum(network_ms, MAX_NETWORK_MS)
     publish = measured_ns + np.rint(sent_ms * 1e3).astype(np.int64) * 1000
     log = measured_ns + np.rint(received_ms * 1e3).astype(np.int64) * 1000
     rows = zip(log.tolist(), publish.tolist(), data, strict=True)

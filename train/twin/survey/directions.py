@@ -20,7 +20,7 @@ from restock.train.twin.floors.occupancy_grid import (
 )
 
 AGREEING = 0.25  # of the weight, less than this says nothing
-LEAST_TURN_RAD = np.deg2rad(3.0)
+MIN_TURN_RAD = np.deg2rad(3.0)
 _SUB = 3  # points a cell and axis that a turned cell is looked up at
 
 
@@ -51,7 +51,7 @@ def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
     columns, rows = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     part = grid.cut(int(columns[0]), int(columns[-1]) + 1, int(rows[0]), int(rows[-1]) + 1)
     turn = walls_direction(part)
-    if abs(turn) < LEAST_TURN_RAD:
+    if abs(turn) < MIN_TURN_RAD:
         return grid, 0.0
     cell_m, size = part.cell_m, np.array(part.occupancy.shape) * part.cell_m
     corners = np.array([[0.0, 0.0], [1, 0], [0, 1], [1, 1]]) * size

@@ -13,7 +13,7 @@ from restock.train.twin.floors.occupancy_grid import (
     OccupancyGrid,
     out_of_frame,
 )
-from restock.train.twin.floors.placed import FEWEST_RETURNS, NEAR_M
+from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M
 from restock.train.twin.survey.logged_drives import RETURNS, WITHIN_M
 from restock.train.twin.survey.scans import PlacedScans
 
@@ -54,7 +54,7 @@ def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
     ]
     returns = np.concatenate([np.zeros((0, 2)), *nearby])
     walls = _walls(grid)
-    if len(returns) < FEWEST_RETURNS or not len(walls):
+    if len(returns) < MIN_RETURNS or not len(walls):
         return None
     apart = cKDTree(walls).query(returns[:: len(returns) // RETURNS + 1])[0]
     return float((apart <= NEAR_M + grid.cell_m / 2).mean())

@@ -37,7 +37,7 @@ from restock.ingest.steps.frames import (
 )
 from restock.ingest.task.signals import yaw_of
 
-MOST_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
+MAX_APART_NS = 1_000_000_000  # between two poses that one in between is taken from
 JUMP_M = 1.0  # between two poses: it was carried, or relocalised, and did not drive
 WELL_PLACED = 0.9  # of the poses on free floor
 FURTHEST_M = 1e5  # from the middle of the poses: one beyond is a fault
@@ -70,7 +70,7 @@ def shared_clock(one: Times, other: Times) -> bool:
     """Whether both carry stamps of one clock: most of `other`'s lie within `one`'s."""
     if not (one.stamped and other.stamped):
         return False
-    low, high = one.stamp_ns.min() - MOST_APART_NS, one.stamp_ns.max() + MOST_APART_NS
+    low, high = one.stamp_ns.min() - MAX_APART_NS, one.stamp_ns.max() + MAX_APART_NS
     return bool(((other.stamp_ns >= low) & (other.stamp_ns <= high)).mean() > 0.5)
 
 
@@ -125,8 +125,8 @@ def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bool
     found = np.stack(
         [np.interp(asked_ns - origin, known - origin, column) for column in values.T], axis=-1
     )
-    near = np.abs(known[after] - asked_ns) <= MOST_APART_NS
-    near &= np.abs(asked_ns - known[before]) <= MOST_APART_NS
+    near = np.abs(known[after] - asked_ns) <= MAX_APART_NS
+    near &= np.abs(asked_ns - known[before]) <= MAX_APART_NS
     return found, near & np.isfinite(found).all(axis=1)
 
 

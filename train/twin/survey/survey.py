@@ -41,14 +41,14 @@ MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
 TURN_MARGIN_M = 0.07  # beyond the circle around its corners, when it turns
 STAND_IN = Footprint(0.7, 0.5, "the twin's default robot: the size of this robot is not known")
 NEAREST_SHARE = 0.05  # of the poses: as near as these it came, to walls that may be blurred
-LEAST_BODY_M = 0.15
-FEWEST_SCANS = 8
+MIN_BODY_M = 0.15
+MIN_SCANS = 8
 AGREEING, WELL_AGREEING = 0.5, 0.8  # of the ends of scans, on walls that they made together
 CLOCKS_APART = 0.1  # more of them by another clock: that one is right
-MOST_OFF = 0.5  # of the poses: a map that fewer lie on is not theirs
+MAX_OFF = 0.5  # of the poses: a map that fewer lie on is not theirs
 # Of a lidar's returns: on the walls of a map that fewer lie on, the poses are not in its frame.
 # Measured on other people's robots with their own maps: .58 (badly localised) to 1.0.
-FEWEST_ON_WALLS = 0.5
+MIN_ON_WALLS = 0.5
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,9 @@ def _grid(
             remedy="record /map, localisation, odometry, or /tf and /tf_static; or give a "
             "map.yaml as the floor: `restock twin layout map.yaml`",
         )
-    usable = [scans for scans in evidence.scans if len(scans) >= FEWEST_SCANS]
+    usable = [scans for scans in evidence.scans if len(scans) >= MIN_SCANS]
     if usable:
-        half_m = LEAST_BODY_M / 2 if body is None else body.width_m / 2
+        half_m = MIN_BODY_M / 2 if body is None else body.width_m / 2
         made = _scanned(usable, poses, half_m + MARGIN_M)
         if made.agree >= AGREEING or by == "scans":
             notes += made.notes
@@ -248,7 +248,7 @@ def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
     cells, inside = grid.cells_at(poses.places_m)
     room = ndimage.distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] * grid.cell_m
     near = float(np.quantile(room[tuple(cells[inside].T)], NEAREST_SHARE)) if inside.any() else 0.0
-    side = max(2 * (near - MARGIN_M), LEAST_BODY_M)
+    side = max(2 * (near - MARGIN_M), MIN_BODY_M)
     if side >= STAND_IN.width_m:
         return STAND_IN
     return Footprint(
@@ -292,7 +292,7 @@ def _check_frames(
     frames = ""
     if grid.frame and poses.frame and grid.frame != poses.frame:
         frames = f"; the map is in frame {grid.frame!r}, they are in {poses.frame!r}"
-    if off + walls + unknown > MOST_OFF:
+    if off + walls + unknown > MAX_OFF:
         raise ConfigError(
             f"{said}, and {int((found == FREE).sum()):,} on its free floor{_apart(grid, poses)}"
             f"{frames}: it is not a map of these poses",
@@ -315,7 +315,7 @@ def _check_walls(
     by_clock = [returns_on_walls(one, grid) for one in scans]
     agree = max((share for share in by_clock if share is not None), default=1.0)
     said = f"{agree:.0%} of the lidar's returns lie on walls of the map"
-    if agree < FEWEST_ON_WALLS:
+    if agree < MIN_ON_WALLS:
         raise ConfigError(
             f"only {said}: it is not a map of this place, or the poses are in another frame",
             where=f"{where}, {source}",

@@ -14,7 +14,7 @@ from restock.toml import toml_value
 from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.floors.occupancy_grid import out_of_frame
 
-LEAST_SIDE_M = 2.0  # of a floor that is worth quartering
+MIN_SIDE_M = 2.0  # of a floor that is worth quartering
 _QUARTERS = (("south", "west"), ("south", "east"), ("north", "west"), ("north", "east"))
 
 
@@ -23,7 +23,7 @@ def with_zones(floor: Warehouse) -> Warehouse:
     if floor.segments:
         named = ((f"crossing_{k + 1}", area) for k, area in enumerate(floor.crossings))
         return replace(floor, cross_zones=tuple(named))
-    if min(floor.width_m, floor.depth_m) < LEAST_SIDE_M:
+    if min(floor.width_m, floor.depth_m) < MIN_SIDE_M:
         return floor
     half_x, half_y = floor.width_m / 2, floor.depth_m / 2
     quarters = []

@@ -110,13 +110,13 @@ def compression_of(entry: Mapping[str, Any], *, salvage: bool = False) -> dict[s
 
 
 def _may_have_messages(entry: Mapping[str, Any], file: Path) -> bool:
-    from restock.ingest.containers.discover import LARGEST_METADATA, METADATA
+    from restock.ingest.containers.discover import MAX_METADATA, METADATA
 
     if entry["format"] == "ros1" or any(chunks["compression"] for chunks in entry["chunks"]):
         return False
     said = ""
     with suppress(OSError), (file.parent / METADATA).open(encoding="utf-8", errors="replace") as it:
-        said = it.read(LARGEST_METADATA)
+        said = it.read(MAX_METADATA)
     if said and (Path(entry["path"]).is_dir() or file.name in said):
         return any(mode.upper() == "MESSAGE" for mode in _MODE.findall(said))
     return entry["format"] == "rosbag2-sqlite3" or "rosbag2" in entry["metadata"]

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
 ODOMETRY = "--odometry-as-command"
-MOST_FLOORS = 6
+MAX_FLOORS = 6
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"
 
 
@@ -238,7 +238,7 @@ class Way:
         """Floors of recordings in other frames than that floor's, with room for the same."""
         kinds, used = set(floor.document.get("episodes", [])), []
         left = list(floor.document.get("elsewhere", [])) if kinds else []
-        for number in range(2, MOST_FLOORS + 1):
+        for number in range(2, MAX_FLOORS + 1):
             if not left:
                 break
             made = self.to.out / f"floor-{number}.toml"

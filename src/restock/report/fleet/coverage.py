@@ -31,8 +31,8 @@ from restock.report.look.blocks import (
 from restock.report.look.queries import ask, statements
 from restock.words import by_priority, counted, plural, uncertain_labels
 
-MOST_DOTS = 1500
-MOST_CELLS_ACROSS = 90  # of the map
+MAX_DOTS = 1500
+MAX_CELLS_ACROSS = 90  # of the map
 PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
 
 
@@ -44,10 +44,10 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
     found = {name: ask(store.connection, sql[name]) for name in names}
     (bounds,) = found["bounds"]
     across = max((bounds["x1"] or 0.0) - (bounds["x0"] or 0.0), 1.0)
-    cell_m = max(0.25, math.ceil(across / MOST_CELLS_ACROSS / 0.25) * 0.25)
+    cell_m = max(0.25, math.ceil(across / MAX_CELLS_ACROSS / 0.25) * 0.25)
     bounds["cell_m"] = cell_m
     found["visited"] = ask(store.connection, sql["visited"], cell_m=cell_m)
-    found["rare"] = ask(store.connection, sql["rare"], most=MOST_DOTS)
+    found["rare"] = ask(store.connection, sql["rare"], most=MAX_DOTS)
     found["priority"] = [{"condition": name} for name in store.priority()]
     return found
 

@@ -18,12 +18,12 @@ from restock.report.fleet.drift_signals import (
     value_text,
 )
 from restock.report.look import charts
-from restock.report.look.blocks import MOST_ROWS, Figure, Rows, Section, Table, words
+from restock.report.look.blocks import MAX_ROWS, Figure, Rows, Section, Table, words
 from restock.words import counted, plural
 
-MOST_ROBOTS = 12  # in a chart: those with findings first
-MOST_PERIODS = 26  # the newest
-MOST_FINDINGS = 8  # with a chart of their own
+MAX_ROBOTS = 12  # in a chart: those with findings first
+MAX_PERIODS = 26  # the newest
+MAX_FINDINGS = 8  # with a chart of their own
 _BEYOND = 3.0  # sizes past it look alike
 _BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
 _VERDICTS = ("changed", "undecided", "unchanged", "too few")
@@ -108,7 +108,7 @@ def findings_section(drift: Drift) -> Section:
         }
         for row in drift.findings
     ]
-    shown = [row for row in drift.findings if row["part"] != "conditions"][:MOST_FINDINGS]
+    shown = [row for row in drift.findings if row["part"] != "conditions"][:MAX_FINDINGS]
     return Section(
         "findings",
         "What has changed",
@@ -334,7 +334,7 @@ def _comparisons_section(own: Rows) -> Section | None:
                 rows[:120],
                 numbers=numbers,
                 title=counted(min(len(rows), 120), "comparison"),
-                folded=len(rows) > MOST_ROWS,
+                folded=len(rows) > MAX_ROWS,
             ),
             Table(meanings(newest.values()), title="What the signals are", folded=True),
         ],
@@ -342,13 +342,13 @@ def _comparisons_section(own: Rows) -> Section | None:
 
 
 def _chosen(robots: set[str], first: set[str]) -> list[str]:
-    """At most MOST_ROBOTS, these first; in the order of their names."""
-    return sorted((sorted(robots & first) + sorted(robots - first))[:MOST_ROBOTS])
+    """At most MAX_ROBOTS, these first; in the order of their names."""
+    return sorted((sorted(robots & first) + sorted(robots - first))[:MAX_ROBOTS])
 
 
 def _newest(rows: Rows) -> Rows:
     """The rows of the newest periods."""
-    kept = sorted({row["period"] for row in rows})[-MOST_PERIODS:]
+    kept = sorted({row["period"] for row in rows})[-MAX_PERIODS:]
     return [row for row in rows if row["period"] in kept]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from restock.report.look.blocks import Rows, Section, Table, count, words
 from restock.words import counted, plural
 
-MOST_GAPS = 20  # in the table
+MAX_GAPS = 20  # in the table
 
 
 def to_log(gaps: dict[str, Any]) -> dict[str, str]:
@@ -71,7 +71,7 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
             "best": words(gap["best"]) if gap["best"] else _no_rate(gap),
             "asked by": gap["asked_by"],
         }
-        for gap in ordered[:MOST_GAPS]
+        for gap in ordered[:MAX_GAPS]
     ]
     left = len(gaps["gaps"]) - len(table)
     unknown = _to_see_one([gap for gap in gaps["gaps"] if gap["best"] is None])

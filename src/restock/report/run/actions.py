@@ -11,9 +11,9 @@ from restock.report.look.blocks import Drawing, Figure, Rows, Section, Table, co
 from restock.report.run.facts import Facts
 
 KINDS = ("logs", "fresh", "wanted")
-_LEAST_AUDITED = 20  # rows in which the policy was asked, for a line of the table
+_MIN_AUDITED = 20  # rows in which the policy was asked, for a line of the table
 _LINES = 12
-LEAST_TILE_PX = 34  # for a number in it
+MIN_TILE_PX = 34  # for a number in it
 
 
 def actions_section(facts: Facts) -> Section | None:
@@ -94,7 +94,7 @@ def _heatmap(cells: Rows) -> Drawing:
             )
         )
         layers = [tiles]
-        if tile >= LEAST_TILE_PX:
+        if tile >= MIN_TILE_PX:
             number = alt.condition("datum.share > 0.35", alt.value("#fdfdfd"), alt.value("#1f2937"))
             layers.append(base.mark_text(fontSize=12).encode(text="text:N", color=number))
         layered = alt.layer(*layers).properties(width=tile * len(set(actions)), height=alt.Step(24))
@@ -119,7 +119,7 @@ def _table(rows: Rows) -> list[Table]:
     gaps = []
     for row in rows:
         drawn = of_condition.get(row["condition"], 0)
-        if row["source"] != "fresh" or not drawn or (row["audited_rows"] or 0) < _LEAST_AUDITED:
+        if row["source"] != "fresh" or not drawn or (row["audited_rows"] or 0) < _MIN_AUDITED:
             continue
         share = logged.get((row["condition"], row["action"]), 0) / drawn
         if row["wanted_share"] > 2 * share:

@@ -31,7 +31,7 @@ from restock.train.twin.survey.logged_drives import COMPARED, logged_drives
 PACKAGE = "restock.report.run"
 CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined."
-MOST_DOTS = 1500
+MAX_DOTS = 1500
 _TABLES = (  # of a run, that run.sql asks
     *("strata", "conditions", "actions", "ages", "policies", "evaluations", "probe", "progress"),
 )
@@ -237,7 +237,7 @@ def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
     x_m, y_m, yaw_rad = facts.floor.map_origin
     frame = {"recordings": here, "x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}
     facts.visited = _store_rows(store, "visited", cell_m=CELL_M, **frame)
-    facts.rare = _store_rows(store, "rare", most=MOST_DOTS, **frame)
+    facts.rare = _store_rows(store, "rare", most=MAX_DOTS, **frame)
 
 
 def _floors(facts: Facts) -> tuple[Warehouse, ...]:

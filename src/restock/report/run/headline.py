@@ -20,7 +20,7 @@ BASELINES = {
     "cloned": "the logs' drivers, cloned,",
     "random": "a random policy",
 }
-MOST_NAMED = 3  # conditions of a verdict in the headline
+MAX_NAMED = 3  # conditions of a verdict in the headline
 _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planner`"
 
 
@@ -147,8 +147,8 @@ def _few(rows: Rows) -> str:
 
 def _named(rows: Rows) -> str:
     ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
-    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MOST_NAMED]]
-    return _listed(named + [f"{len(rows) - MOST_NAMED} more"] * (len(rows) > MOST_NAMED))
+    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MAX_NAMED]]
+    return _listed(named + [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED))
 
 
 def _listed(names: list[str]) -> str:

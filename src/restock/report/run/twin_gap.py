@@ -14,7 +14,7 @@ from restock import __version__
 from restock.errors import RestockError
 from restock.report.look import charts
 from restock.report.look.blocks import (
-    MOST_ROWS,
+    MAX_ROWS,
     Drawing,
     Figure,
     Rows,
@@ -291,7 +291,7 @@ def _signals_section(gap: TwinGap) -> Section | None:
                 rows,
                 numbers={"segments", *sources},
                 title=counted(len(rows), "median"),
-                folded=len(rows) > MOST_ROWS,
+                folded=len(rows) > MAX_ROWS,
             )
         ],
     )

@@ -8,10 +8,10 @@ from typing import Any
 from restock import __version__
 from restock.report.look.blocks import Figure, Rows, Section, Table, count, number, span, words
 from restock.report.study import charts
-from restock.stats import LEAST_PAIRS, interval_text
+from restock.stats import MIN_PAIRS, interval_text
 from restock.words import counted, verdict_said
 
-MOST_NAMED = 3
+MAX_NAMED = 3
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
 _INTERVALS = (
     "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
@@ -89,7 +89,7 @@ def why_refused(found: dict[str, Any]) -> str:
         for check in found["checks"]
         if check["verdict"] == found["verdict"] and check.get("decides", True)
     ]
-    shown = ", ".join(list(dict.fromkeys(names))[:MOST_NAMED])
+    shown = ", ".join(list(dict.fromkeys(names))[:MAX_NAMED])
     if found["verdict"] == "inconclusive":
         return f"too few episodes or seeds to show that they were fed the same ({shown})"
     return f"their critics were fed differently ({shown})"
@@ -97,8 +97,8 @@ def why_refused(found: dict[str, Any]) -> str:
 
 def _named(rows: Rows) -> str:
     ordered = sorted(rows, key=lambda row: -abs(row["difference"]))
-    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MOST_NAMED]]
-    named += [f"{len(rows) - MOST_NAMED} more"] * (len(rows) > MOST_NAMED)
+    named = [f"{words(row['condition'])} ({_difference(row)})" for row in ordered[:MAX_NAMED]]
+    named += [f"{len(rows) - MAX_NAMED} more"] * (len(rows) > MAX_NAMED)
     return named[0] if len(named) == 1 else ", ".join(named[:-1]) + " and " + named[-1]
 
 
@@ -183,7 +183,7 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
     bands = (
         f"Bands are 95 % over up to {most} seeds (Student's t)."
         if any(row["low"] is not None for row in rows)
-        else f"There is no band from fewer than {LEAST_PAIRS} seeds, and none where all came to"
+        else f"There is no band from fewer than {MIN_PAIRS} seeds, and none where all came to"
         " the same; another seed would give another curve."
     )
     return Section(

@@ -15,7 +15,7 @@ from restock.report.study.comparison import (
     outcome_sections,
     why_refused,
 )
-from restock.stats import LEAST_PAIRS, interval_text, no_interval_text, which_adjusted
+from restock.stats import MIN_PAIRS, interval_text, no_interval_text, which_adjusted
 
 SAFETY = {
     "bumps_per_km": ("bumps per km", ".1f"),
@@ -168,7 +168,7 @@ def _arms(arms: Rows, order: list[str]) -> Section | None:
         "Success and safety at the end",
         intro="The kept policies on the unperturbed episodes, means with 95 % intervals over "
         "seeds; safety in the rare missions. Time lost is against the planner, where both "
-        f"arrived. From fewer than {LEAST_PAIRS} seeds, and where all came to the same, there are "
+        f"arrived. From fewer than {MIN_PAIRS} seeds, and where all came to the same, there are "
         "values alone.",
         figures=[Figure(charts.intervals(cells, names), "Success by condition")] if cells else [],
         two=True,
