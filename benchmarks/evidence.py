@@ -187,16 +187,18 @@ def _make_stores(store: Path, logs: Logs, hours: int, workers: int, small: bool)
         _make_store(store.with_name(logs.archive), incidents, workers)
 
 
-def _make_store(store: Path, asked: list[tuple[Path, list[str], str]], workers: int) -> None:
+def _make_store(store: Path, requested: list[tuple[Path, list[str], str]], workers: int) -> None:
     """Of recordings: their paths, flags and conditions."""
 
     def make() -> None:
         with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(lambda one: _record(*one), asked))
-        run_restock(["ingest", *(str(path) for path, *_ in asked), "--store", str(store)])
+            list(pool.map(lambda one: _record(*one), requested))
+        run_restock(["ingest", *(str(path) for path, *_ in requested), "--store", str(store)])
 
-    told = [f"{path.name} {' '.join(flags)} {conditions}" for path, flags, conditions in asked]
-    once(store.with_name(f"{store.name}.json"), told, make)
+    reported = [
+        f"{path.name} {' '.join(flags)} {conditions}" for path, flags, conditions in requested
+    ]
+    once(store.with_name(f"{store.name}.json"), reported, make)
 
 
 def _record(recording: Path, flags: list[str], conditions: str) -> None:

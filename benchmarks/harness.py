@@ -81,20 +81,20 @@ def run_restock(arguments: Sequence[str]) -> None:
         raise SystemExit(f"restock {' '.join(arguments)} failed")
 
 
-def once(mark: Path, asked: Sequence[str], do: Callable[[], object]) -> None:
+def once(mark: Path, requested: Sequence[str], do: Callable[[], object]) -> None:
     """Do what is asked, and keep in `mark` what that was: it is not done again.
 
     Raises:
         SystemExit: it was done as something else was asked.
     """
-    text = json.dumps(asked, indent=1) + "\n"
+    text = json.dumps(requested, indent=1) + "\n"
     if not mark.exists():
         do()
         write_text(mark, text)
     elif mark.read_text(encoding="utf-8") != text:
         raise SystemExit(
-            f"{mark}: is not of what is asked for now ({', '.join(asked)}): remove it and what it"
-            " is of, or name another --out"
+            f"{mark}: holds other measurements than these ({', '.join(requested)}): remove it"
+            " and its files, or name another --out"
         )
 
 

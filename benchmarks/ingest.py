@@ -253,7 +253,10 @@ def targets(
         f"peak memory at most {MEMORY_MB} MB": (peak, peak <= MEMORY_MB),
         f"images raise peak memory by at most {IMAGES_MB} MB": (images, images <= IMAGES_MB),
     }
-    return {n: (value, None if math.isnan(value) else met) for n, (value, met) in found.items()}
+    return {
+        n: (value, None if math.isnan(value) else observed)
+        for n, (value, observed) in found.items()
+    }
 
 
 def lines(answer: dict[str, Any]) -> Iterator[str]:
@@ -284,7 +287,7 @@ def lines(answer: dict[str, Any]) -> Iterator[str]:
         f" two: {workers['faster']:.2f}x (load average {workers['load']:.1f})\n"
     )
     verdicts = {True: "met", False: "MISSED", None: "not measured"}
-    yield from (f"{verdicts[met]:12} {name}" for name, met in answer["targets"].items())
+    yield from (f"{verdicts[observed]:12} {name}" for name, observed in answer["targets"].items())
 
 
 def main() -> int:
@@ -317,9 +320,11 @@ def main() -> int:
         "memory": used,
         "mb_an_hour": (used[LONG]["peak_mb"] - used[PLAIN]["peak_mb"])
         / ((LONGER - 1) * seconds / 3600),
-        "targets": {name: met for name, (_, met) in goals.items()},
+        "targets": {name: observed for name, (_, observed) in goals.items()},
     }
-    missed = [f"{name}: {value:.2f}" for name, (value, met) in goals.items() if met is False]
+    missed = [
+        f"{name}: {value:.2f}" for name, (value, observed) in goals.items() if observed is False
+    ]
     return finish(options, answer, missed, lines(answer))
 
 

@@ -146,10 +146,10 @@ def _pair(precision: float | None, recall: float | None) -> str:
 def reliability_table(bins: Sequence[Mapping[str, Any]]) -> str:
     """A row a condition, a column a tenth of probability: the share that is true."""
     names = sorted({row["condition"] for row in bins})
-    told = {(row["condition"], round(row["from_probability"] * 10)): row for row in bins}
+    one = {(row["condition"], round(row["from_probability"] * 10)): row for row in bins}
     rows = [
-        [f"`{name}`", *(f"{told[name, tenth]['true_share']:.2f} of {told[name, tenth]['known']:,}"
-                        if (name, tenth) in told else "" for tenth in range(10))]
+        [f"`{name}`", *(f"{one[name, tenth]['true_share']:.2f} of {one[name, tenth]['known']:,}"
+                        if (name, tenth) in one else "" for tenth in range(10))]
         for name in names
     ]  # fmt: skip
     return markdown(["probability", *(f"{tenth / 10:g} to {tenth / 10 + 0.1:.1f}"

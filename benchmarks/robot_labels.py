@@ -56,12 +56,12 @@ def scores(profile: Profile, seed: int, steps: int) -> Iterator[dict[str, Any]]:
     """Of each condition and exposure: precision, recall, and how many steps it is true of."""
     table, truth = driven(profile, seed, steps)
     known = shipped(profile.constants) | shipped(profile.constants, "exposure")
-    for name, told in label(table, list(known.values())).items():
+    for name, reported in label(table, list(known.values())).items():
         true = np.array([name in names for names in truth], np.bool_)
-        right = int((told & true).sum())
+        right = int((reported & true).sum())
         yield {
             "condition": name,
-            "precision": right / int(told.sum()) if told.any() else None,
+            "precision": right / int(reported.sum()) if reported.any() else None,
             "recall": right / int(true.sum()) if true.any() else None,
             "true steps": int(true.sum()),
         }

@@ -66,7 +66,7 @@ def main() -> int:
     robots = []
     for kind in kinds_of(paths, options.out / "kinds.json"):
         folder = options.out / kind.key
-        print(f"{folder}: {kind.told}", file=sys.stderr)
+        print(f"{folder}: {kind.reported}", file=sys.stderr)
         if not options.kept:
             start(kind, folder, options.minutes, options.twin)
         if (folder / "start").is_dir():
@@ -78,12 +78,12 @@ def main() -> int:
 class Kind:
     """One kind of robot, in its own words, and its recordings."""
 
-    told: str
+    reported: str
     paths: tuple[str, ...]
 
     @property
     def key(self) -> str:
-        return hashlib.blake2b(self.told.encode(), digest_size=4).hexdigest()
+        return hashlib.blake2b(self.reported.encode(), digest_size=4).hexdigest()
 
 
 def kinds_of(paths: Sequence[Path], kept: Path) -> list[Kind]:
@@ -97,9 +97,9 @@ def kinds_of(paths: Sequence[Path], kept: Path) -> list[Kind]:
             traits.append(robot_traits(recording))
     kinds = []
     for members in robot_kinds(traits):
-        told = max((str(traits[one]) for one in members), key=len)
-        kinds.append(Kind(told, tuple(str(paths[one]) for one in members)))
-    rows = [{"told": kind.told, "paths": kind.paths} for kind in kinds]
+        reported = max((str(traits[one]) for one in members), key=len)
+        kinds.append(Kind(reported, tuple(str(paths[one]) for one in members)))
+    rows = [{"told": kind.reported, "paths": kind.paths} for kind in kinds]
     write_text(kept, json.dumps({"files": files, "kinds": rows}, indent=1) + "\n")
     return kinds
 
@@ -140,7 +140,7 @@ def measured(
         if (file := folder / "start" / f"{name}.json").is_file()
     }
     figures = {
-        "robot": kind.told,
+        "robot": kind.reported,
         "recordings": len(kind.paths),
         "minutes_it_took": round(sum(one.get("seconds") or 0 for one in stages.values()) / 60, 1),
         "stopped": "; ".join(documents.get("propose", {}).get("problems", [])),

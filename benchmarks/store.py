@@ -122,7 +122,7 @@ def ask(store: Path, question: str) -> dict[str, float]:
     return {"wall_s": wall, "cpu_s": cpu, "peak_bytes": peak}
 
 
-def asked(store: Path, question: str, limit_s: float) -> dict[str, float]:
+def requested(store: Path, question: str, limit_s: float) -> dict[str, float]:
     """The same in a process of its own; empty where it is not done after `limit_s`."""
     command = [sys.executable, __file__, "--ask", question, str(store)]
     print(f"  {question} …", file=sys.stderr)
@@ -153,7 +153,7 @@ def measure(name: str, folder: Path, *, rounds: int, compact: bool) -> dict[str,
     figures["as written"] = _answers(store, size, rounds)
     if compact:
         joined = store.rename(store.with_name(f"{store.name}_compacted"))
-        figures["compact"] = asked(joined, "compact", size.limit_s)
+        figures["compact"] = requested(joined, "compact", size.limit_s)
         figures["compacted"] = _answers(joined, size, rounds)
     return figures
 
@@ -164,7 +164,7 @@ def _answers(store: Path, size: Size, rounds: int) -> dict[str, dict[str, float]
         if question == "one_day_alone" and not any(files_of_day(store, DAY)):
             continue  # joined, or of fewer days
         times = rounds if question not in ("audit", "mix") else 1
-        several = [asked(store, question, size.limit_s) for _ in range(times)]
+        several = [requested(store, question, size.limit_s) for _ in range(times)]
         done = sorted((one for one in several if one), key=lambda one: one["wall_s"])
         answers[question] = done[len(done) // 2] if done else {}
     return answers

@@ -188,7 +188,7 @@ def command_and_pose_s(recording: Recording) -> float:
     command = max(commanding, key=lambda t: (t.name.endswith("cmd_vel"), t.expected))
     paths = list(COMMANDS[command.type])
     columns = recording.read({command.name: paths})[command.name]
-    told = sorted(
+    reported = sorted(
         (int(t) / NS, float(v), float(w))
         for t, v, w in zip(columns.log_time_ns, *(columns.fields[p] for p in paths), strict=True)
     )
@@ -205,7 +205,7 @@ def command_and_pose_s(recording: Recording) -> float:
         )
     else:
         poses = _transformed(recording)
-    return STEP_S * sum(_in_force_and_known(told, poses, recording.span_ns[1] / NS))
+    return STEP_S * sum(_in_force_and_known(reported, poses, recording.span_ns[1] / NS))
 
 
 def _transformed(recording: Recording) -> list[tuple[float, float, float, float]]:
@@ -227,27 +227,27 @@ def _transformed(recording: Recording) -> list[tuple[float, float, float, float]
 
 
 def _in_force_and_known(
-    told: list[tuple[float, float, float]],
+    reported: list[tuple[float, float, float]],
     poses: list[tuple[float, float, float, float]],
     end: float,
 ) -> list[bool]:
     """Every STEP_S from the first command to the end: whether both are so."""
     both = []
     command, pose, since = 0, -1, 0.0  # since: how long the robot has done something else
-    now, earlier = told[0][0], 0
+    now, earlier = reported[0][0], 0
     while now <= end:
-        while command + 1 < len(told) and told[command + 1][0] <= now:
+        while command + 1 < len(reported) and reported[command + 1][0] <= now:
             command, since = command + 1, 0.0
         while pose + 1 < len(poses) and poses[pose + 1][0] <= now:
             pose += 1
         known = pose >= 0 and now - poses[pose][0] <= KNOWN_S
-        in_force = now - told[command][0] <= KNOWN_S
+        in_force = now - reported[command][0] <= KNOWN_S
         if not in_force and known and since < KNOWN_S:
             while poses[earlier][0] < now - KNOWN_S and earlier < pose:
                 earlier += 1
             (_, x0, y0, yaw0), (_, x, y, yaw) = poses[earlier], poses[pose]
             turned = (yaw - yaw0 + math.pi) % (2 * math.pi) - math.pi
-            moved, (_, speed, turn) = math.hypot(x - x0, y - y0) > MOVED_M, told[command]
+            moved, (_, speed, turn) = math.hypot(x - x0, y - y0) > MOVED_M, reported[command]
             if abs(speed) > 1e-3:
                 obeys = moved
             elif abs(turn) > 1e-3:

@@ -142,25 +142,25 @@ def prepare(
         settle(recording.recording_id)
         before = _before(store, recording)
         tagged = (before or {}).get("tags") or {}
-        told = resolve_tags(profile.tags, Path(path), recording.metadata, how.tags, tagged)
+        reported = resolve_tags(profile.tags, Path(path), recording.metadata, how.tags, tagged)
         if (
             store is not None
             and before is not None
             and not how.force
             and _unchanged(before, profile)
         ):
-            new: dict[str, Any] = {"tags": told.tags}
+            new: dict[str, Any] = {"tags": reported.tags}
             if _other_robot(before, profile):
                 new["profile_toml"] = profile_toml(profile)
                 new["uncertain_conditions"] = uncertain_conditions(profile)
-            elif told.tags == (before["tags"] or {}):
+            elif reported.tags == (before["tags"] or {}):
                 return Prepared(IngestResult(str(path), "unchanged", before))
             staged = _tag(store, before, new)
-            result = IngestResult(str(path), "tagged", before | new, notes=told.notes)
+            result = IngestResult(str(path), "tagged", before | new, notes=reported.notes)
             return Prepared(result, staged)
         try:
-            told = replace(told, notes=[*told.notes, *renamed])
-            return _Ingest(str(path), recording, profile, told, how.repeated, before).run(store)
+            reported = replace(reported, notes=[*reported.notes, *renamed])
+            return _Ingest(str(path), recording, profile, reported, how.repeated, before).run(store)
         except RecordingError as error:
             if error.where:
                 raise
@@ -209,11 +209,11 @@ class _Ingest:
         path: str,
         recording: Recording,
         profile: Profile,
-        told: Told,
+        reported: Told,
         repeated: OnRepeat,
         before: Mapping[str, Any] | None,
     ) -> None:
-        self.path, self.recording, self.profile, self.told = path, recording, profile, told
+        self.path, self.recording, self.profile, self.reported = path, recording, profile, reported
         self.repeated, self.before = repeated, before or {}
         self.corrections = corrections_in(self.before)
         self.ingest_id = uuid.uuid4().hex[:16]
@@ -248,7 +248,7 @@ class _Ingest:
         scores = label_scores(table, rows.labels, profile.task.control_period_s)
         facts = recorded_facts(self.recording, profile, columns, steps, episodes, rows)
         facts |= {
-            "tags": self.told.tags,
+            "tags": self.reported.tags,
             "labels_version": table["labels_version"][0].as_py(),
             "corrections": correction_rows(self.corrections),
         }
@@ -273,7 +273,7 @@ class _Ingest:
             scores,
             dict(Counter(episode.ended_by for episode in episodes.episodes).most_common()),
             self._lost_messages(steps),
-            [one.told for one in steps.findings if not one.repaired],
+            [one.reported for one in steps.findings if not one.repaired],
             self._notes(steps, table),
         )
         return Prepared(result, staged, self.repeated, profile.task.control_period_s)
@@ -348,9 +348,9 @@ class _Ingest:
 
     def _notes(self, steps: Steps, table: pa.Table) -> list[str]:
         clock = steps.clock
-        notes = [*self.recording.notes, *self.told.notes, *steps.notes]
+        notes = [*self.recording.notes, *self.reported.notes, *steps.notes]
         notes += unknown_directions(self.recording, self.profile)
-        notes += [one.told for one in steps.findings if one.repaired]
+        notes += [one.reported for one in steps.findings if one.repaired]
         if (other := self.before.get("profile", self.profile.name)) != self.profile.name:
             notes.append(
                 f"in place of its {self.before['transitions']:,} transitions by the profile"

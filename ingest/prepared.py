@@ -181,14 +181,14 @@ def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]
     stays; and what is to be said."""
     why = "it has steps that this one has not"
     if part.is_part:
-        (told,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
-        if not told.corrections:
+        (reported,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
+        if not reported.corrections:
             removed = remove_recordings(store, [part.recording_id])
             return removed.version, (
                 f"in place of {part.source_file} (recording {part.recording_id}), a part of it, "
                 "which was removed"
             )
-        why = f"people corrected {counted(told.corrections, 'label')} of it"
+        why = f"people corrected {counted(reported.corrections, 'label')} of it"
     return None, f"{part}. It stays, as {why}: {_removal(store, part.recording_id)} takes it out"
 
 

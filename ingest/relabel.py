@@ -45,8 +45,8 @@ from restock.ingest.task.conditions import (
     labels_version,
     of_kind,
     primary,
+    reported,
     runnable,
-    told,
     too_near_to_call,
     unknown_rows,
 )
@@ -144,7 +144,7 @@ def relabel_rows(
     every_condition, every_exposure = (of_kind(definitions, k) for k in ("outcome", "exposure"))
     task = msgspec.json.decode(row["task_json"], type=Task, strict=False)
     conditions, situations_told = (
-        told(several, lidar=task.lidar, driven_plan=driven_plan(rows))
+        reported(several, lidar=task.lidar, driven_plan=driven_plan(rows))
         for several in (every_condition, every_exposure)
     )
     if row["format"] == TWIN:  # which fills none of the profile's own signals

@@ -106,12 +106,12 @@ def audit_reward(
         return RewardAudit(discount, returns, order, findings)
 
 
-def _discount_of(run: Path, asked: float | None) -> float:
+def _discount_of(run: Path, requested: float | None) -> float:
     config = read_json(run / RUN_CONFIG, error=RunError)["config"]
     discount = float(config["loss"]["discount"])
-    if asked is not None and abs(asked - discount) > 1e-9:
+    if requested is not None and abs(requested - discount) > 1e-9:
         raise ConfigError(
-            f"the evaluations of {run} are discounted by {discount:g}, not {asked:g}",
+            f"the evaluations of {run} are discounted by {discount:g}, not {requested:g}",
             where="--discount",
             remedy="leave it out: returns by step are not kept of an evaluation",
         )

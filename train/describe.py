@@ -51,11 +51,11 @@ def describe_run(prepared: Prepared) -> str:
         has = "there is no panel" if panel is None else "the panel holds out no rows"
         lines += [
             f"{name} has no effect: {has} ([evaluation_split] of a mixture)"
-            for name, asked in (
+            for name, requested in (
                 ("offline_start.choose", config.offline_start.choose),
                 ("evaluation.off_policy", config.evaluation.off_policy),
             )
-            if asked
+            if requested
         ]
     if config.env.twin:
         lines += _not_evaluated(document)

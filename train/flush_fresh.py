@@ -20,7 +20,7 @@ from restock.ingest.store.episode_rows import EpisodeRows, label_table
 from restock.ingest.store.manifest import definitions, manifest_row, software_version
 from restock.ingest.store.transitions import Provenance, TransitionValues, transition_table
 from restock.ingest.store.writer import StoreWriter
-from restock.ingest.task.conditions import label, probabilities, runnable, told
+from restock.ingest.task.conditions import label, probabilities, reported, runnable
 from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
@@ -106,7 +106,7 @@ def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
     evaluated = [condition for condition in profile.conditions if condition.name in labels]
     steps = label_table(signals, number, step, pa.table({}))
     probable = probabilities(steps, evaluated)
-    situations = told(profile.exposures, lidar=profile.task.lidar)
+    situations = reported(profile.exposures, lidar=profile.task.lidar)
     exposures = label(steps, runnable(steps, situations))
     return EpisodeRows(
         tick, number, step, is_end, signals, labels, pa.table({}), probable, exposures
@@ -133,7 +133,7 @@ def _values(
         terminates=np.array([episode.terminated for episode in episodes])[number],
         zone=_zones(rows, episodes, profile)[begin].tolist(),
         truth=each("truth").tolist(),
-        true_exposure=[told or None for told in each("exposure").tolist()],
+        true_exposure=[reported or None for reported in each("exposure").tolist()],
         policy=[POLICIES[code] for code in each("policy")],
         policy_version=[version[episode] for episode in number],
         probability=each("probability"),

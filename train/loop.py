@@ -405,10 +405,10 @@ def _close_interval(session: Session, phase: str, notify: Notify) -> None:
 def _note_silence(session: Session, notify: Notify) -> None:
     """Tell whoever watches that the teacher has answered nothing so far."""
     teacher = session.collector.teacher
-    if teacher is None or teacher.answered or teacher.asked == session.silence_noted:
+    if teacher is None or teacher.answered or teacher.requested == session.silence_noted:
         return
-    session.silence_noted = teacher.asked
-    notify("teacher", {"asked": teacher.asked, "answered": 0})
+    session.silence_noted = teacher.requested
+    notify("teacher", {"asked": teacher.requested, "answered": 0})
 
 
 def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:

@@ -98,8 +98,8 @@ def check_missions(config: TrainConfig, profile: Profile, panel: Panel | None) -
     logged = None
     if panel is not None:
         meta = panel.meta
-        met, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
-        logged = logged_shares(met, episode, list(config.env.conditions))
+        observed, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
+        logged = logged_shares(observed, episode, list(config.env.conditions))
     arms, goal = mission_arms(config).arms, profile.task.goal != "none"
     Practice(config.practice, arms, goal=goal, logged=logged)
 

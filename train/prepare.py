@@ -78,7 +78,7 @@ class Prepared:
     resumed: Run | None = None
     from_env_steps: int | None = None  # of an earlier checkpoint than the latest
     teacher: Any = None  # that Python code passed in
-    asked: AskedTeacher | None = None  # that a new run's config names
+    requested: AskedTeacher | None = None  # that a new run's config names
 
     def open(self) -> Session:
         """Make the run directory (or take up the old one), the twin and the learner.
@@ -87,7 +87,7 @@ class Prepared:
             RunError: another process trains this run; or it cannot go on, and why.
         """
         env = make_twin(self.config, self.profile, self.config.env.num_envs)
-        teacher = self.asked
+        teacher = self.requested
         if teacher is None:
             teacher = open_teacher(
                 self.config.teacher, self.profile.task, seed=self.config.seed, given=self.teacher
@@ -251,13 +251,13 @@ def prepare_new(
     refuse_nothing_to_learn(config.teacher, drivers)
     config, ring = resolve_ring_capacity(resolve_config(config, panel), panel)
     check_new_run(config, profile.task, panel)
-    asked = None
+    requested = None
     if config.teacher.source != GIVEN:  # made once: it may be large
-        asked = open_teacher(config.teacher, profile.task, seed=config.seed)
+        requested = open_teacher(config.teacher, profile.task, seed=config.seed)
     written = _document(config, profile, panel)
     if ring is not None:
         written["ring_capacity"] = ring
-    return Prepared(out, config, profile, panel, written, asked=asked)
+    return Prepared(out, config, profile, panel, written, requested=requested)
 
 
 def prepare_resumed(

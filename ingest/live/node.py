@@ -86,7 +86,7 @@ class PolicyNode:
         )
         self.shadow = bool(self._value("shadow"))
         pilot = Pilot(policy, limits, self._value("takeover_topic"))
-        told = profile.inputs.behaviour_policy
+        reported = profile.inputs.behaviour_policy
         kinds = {
             "proposal": (PROPOSAL, self.form.type),
             "action": (ACTION, "std_msgs/msg/Int16"),
@@ -95,7 +95,7 @@ class PolicyNode:
         }
         if not self.shadow:
             kinds["command"] = (self.form.topic, self.form.type)
-            kinds["behaviour"] = (BEHAVIOUR if told is None else told.topic, STRING)
+            kinds["behaviour"] = (BEHAVIOUR if reported is None else reported.topic, STRING)
         self._said = ""
         self._classes = {name: self._class(kind) for name, (_, kind) in kinds.items()}
         heard = {topic: self._class(kind) for topic, kind in pilot.topics.items()}
@@ -297,9 +297,9 @@ class PolicyNode:
         for name in Limiter.__struct_fields__:
             value = None if profile.limiter is None else getattr(profile.limiter, name)
             self._profiles(f"limiter_{name}", -1.0 if value is None else float(value))
-            asked = float(self._value(f"limiter_{name}"))
-            if not asked < 0:  # 0 and NaN are refused where they are no limit
-                given[name] = asked
+            requested = float(self._value(f"limiter_{name}"))
+            if not requested < 0:  # 0 and NaN are refused where they are no limit
+                given[name] = requested
         if not self._value("limiter"):
             return None
         if not profile.task.lidar:

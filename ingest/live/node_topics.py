@@ -109,8 +109,8 @@ def with_node_topics(profile: Profile) -> Profile:
     )
     inputs, people = profile.inputs, profile.command_sources
     if inputs.behaviour_policy is None:
-        told = Input(BEHAVIOUR, STRING, {"text": "data"}, optional=True)
-        inputs = msgspec.structs.replace(inputs, behaviour_policy=told)
+        reported = Input(BEHAVIOUR, STRING, {"text": "data"}, optional=True)
+        inputs = msgspec.structs.replace(inputs, behaviour_policy=reported)
     if "operator" not in people:
         button = Input(TAKEOVER, "std_msgs/msg/Bool", {"pressed": "data"})
         people = {**people, "operator": button}

@@ -62,15 +62,15 @@ class TagRules(Checked, frozen=True):
                     if problem := tag_problem(name, value):
                         raise RecordingError(problem, where=str(path), remedy="rename the folder")
                 return {f"its path ({pattern})": tags}
-        asked = {name for pattern in self.patterns for name in path_pattern(pattern).groupindex}
-        if asked <= set(given):
+        requested = {name for pattern in self.patterns for name in path_pattern(pattern).groupindex}
+        if requested <= set(given):
             return {}
         listed = " nor ".join(map(repr, self.patterns))
         raise RecordingError(
             f"its path does not match {listed}, the from_path in {_TABLE}",
             where=place,
             remedy='correct the pattern, add one for such paths (from_path = ["…", "…"]), or give'
-            f" {' '.join(f'--tag {name}=…' for name in sorted(asked))}",
+            f" {' '.join(f'--tag {name}=…' for name in sorted(requested))}",
         )
 
     def of_metadata(
@@ -115,8 +115,8 @@ class TagRules(Checked, frozen=True):
     def _names(self, record: str, key: str) -> list[str]:
         """The tags that an entry of the metadata is."""
         wanted = (key, f"{record}.{key}")
-        asked = [name for name, source in self.from_metadata.items() if source in wanted]
-        return asked or [key] * (key not in self.from_metadata)
+        requested = [name for name, source in self.from_metadata.items() if source in wanted]
+        return requested or [key] * (key not in self.from_metadata)
 
 
 @dataclass
@@ -153,13 +153,13 @@ def resolve_tags(
         for name, value in entries.items():
             if tags.setdefault(name, (value, source))[0] != value and name not in given:
                 raise _contradiction(name, tags[name], (value, source), str(path))
-    told = {name: value for name, (value, _) in tags.items()} | dict(given)
-    kept = {name: value for name, value in before.items() if name not in told}
+    reported = {name: value for name, (value, _) in tags.items()} | dict(given)
+    kept = {name: value for name, value in before.items() if name not in reported}
     if kept:
         notes.append(
             f"tags kept from the earlier ingest: {in_words(kept)} (--tag NAME= removes one)"
         )
-    return Told({name: value for name, value in (told | kept).items() if value}, notes)
+    return Told({name: value for name, value in (reported | kept).items() if value}, notes)
 
 
 def _contradiction(

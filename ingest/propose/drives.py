@@ -228,16 +228,16 @@ def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
     driven = [one for one in drives if one.commands.count]
     if not driven:
         return base
-    told = [
+    reported = [
         commanded(one.recording, one.roles["command"][0], one.robot.values.get("wheelbase_m"))
         for one in driven
     ]
-    speed, turn = (np.concatenate([each[part] for each in told]) for part in (2, 3))
+    speed, turn = (np.concatenate([each[part] for each in reported]) for part in (2, 3))
     count = sum(one.commands.count for one in driven)
     pooled = replace(base.fastest(speed, turn), count=count)
     settled = [
         settled_at_most(one.recording, one.roles, pooled, *each[1:])
-        for one, each in zip(driven, told, strict=True)
+        for one, each in zip(driven, reported, strict=True)
     ]
     ahead, about = (np.concatenate([each[part] for each in settled]) for part in (0, 1))
     return pooled.limited(limit_of(ahead, pooled.speed_mps), limit_of(about, pooled.yaw_rate_radps))
@@ -245,11 +245,11 @@ def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:
     """The longest that any drive shows; a command to stop holds where all say so."""
-    told = [one for one in drives if one.comments]
-    if not told:
+    reported = [one for one in drives if one.comments]
+    if not reported:
         return CommandHold()
-    best = max(told, key=lambda one: one.age_s or 0.0)
-    return replace(best, stops_hold=all(one.stops_hold for one in told))
+    best = max(reported, key=lambda one: one.age_s or 0.0)
+    return replace(best, stops_hold=all(one.stops_hold for one in reported))
 
 
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
@@ -305,7 +305,9 @@ def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives
         lines.append(f"#   {_name(drive.recording.path)}: {trial.transitions:,}{why}")
     if unread:
         lines.append(f"# NOT READ, of that kind: {names_of(unread)}")
-    return lines + [f"# NOT OF THAT KIND: {_name(path)}: {told}" for path, told in drives.others]
+    return lines + [
+        f"# NOT OF THAT KIND: {_name(path)}: {reported}" for path, reported in drives.others
+    ]
 
 
 def names_of(paths: Sequence[Path]) -> str:

@@ -101,14 +101,14 @@ class RobotTraits:
         return self.inputs == other.inputs and shared >= SHARED * len(self.topics | other.topics)
 
     def __str__(self) -> str:
-        told = [
+        reported = [
             self.named and f"described as {self.named}",
             str(self.lidar or ""),
             self.frames,
             self.command.split("/")[-1],
         ]
         topics = ", ".join(sorted(name for name, _ in self.inputs))
-        return "; ".join(filter(None, told)) or topics or "nothing that describes a robot"
+        return "; ".join(filter(None, reported)) or topics or "nothing that describes a robot"
 
 
 def robot_traits(recording: Recording) -> RobotTraits:
@@ -155,8 +155,8 @@ def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
 
 
 def _known(traits: RobotTraits) -> int:
-    told = (traits.description, traits.lidar, traits.frames, traits.command)
-    return sum(bool(each) for each in told)
+    reported = (traits.description, traits.lidar, traits.frames, traits.command)
+    return sum(bool(each) for each in reported)
 
 
 def _lidar(recording: Recording, best: Sequence[tuple[TopicInfo, Kind]]) -> Lidar | None:
@@ -193,28 +193,28 @@ def no_wheeled_robot(
     types = {topic.type for topic in recording.topics.values() if topic.expected}
     flying = sorted({t.split("/")[0] for t in types if t.startswith(DRONES) or t == MULTI_DOF})
     if not (command and located) and flying:
-        told = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
-        return f"this looks like a drone's recording (it has {told}): {ON_WHEELS}"
+        reported = ", ".join(sorted(t for t in types if t.split("/")[0] in flying)[:3])
+        return f"this looks like a drone's recording (it has {reported}): {ON_WHEELS}"
     rises_m, lifted = _rises_m(recording), _lifted(recording, command)
     if rises_m > RISES_M and (flying or lifted):
-        told = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
+        reported = "commands go up and down" if lifted else f"it has topics of {flying[0]}"
         return (
-            f"this looks like a drone's recording (it rises by {rises_m:.1f} m, {told}): "
+            f"this looks like a drone's recording (it rises by {rises_m:.1f} m, {reported}): "
             f"{ON_WHEELS}"
         )
     if command:
-        off, asked = off_the_floor(recording, command[0])
-        if 2 * off <= asked:
+        off, requested = off_the_floor(recording, command[0])
+        if 2 * off <= requested:
             return None
         return (
-            f"this looks like a robot arm's or a drone's recording ({off:,} of the {asked:,} "
+            f"this looks like a robot arm's or a drone's recording ({off:,} of the {requested:,} "
             f"commands to move of {command[0][0].name} have linear.z, angular.x or angular.y): "
             f"{ON_WHEELS}"
         )
     arm = sorted(t for t in types if t.startswith(ARMS))
     if arm and not located:
-        told = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
-        return f"this looks like a robot arm's recording ({told}): {ON_WHEELS}"
+        reported = f"it has {', '.join(arm[:2])}, no velocity command and no pose"
+        return f"this looks like a robot arm's recording ({reported}): {ON_WHEELS}"
     rest = [t for t in types if not CAMERAS.search(t) and not ALONGSIDE.match(t)]
     if types and not rest and any(CAMERAS.search(t) for t in types):
         return (

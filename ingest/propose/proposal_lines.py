@@ -275,14 +275,14 @@ def _input_lines(
 ) -> list[str]:
     why = seen.unmeasured.get(role, "")
     if not fitting:
-        told = [f"# {line}" for line in textwrap.wrap(why, 96)]
+        reported = [f"# {line}" for line in textwrap.wrap(why, 96)]
         if role in REQUIRED:
             fits = " or ".join(dict.fromkeys(kind.type for kind in KINDS[role]))
             if role == "pose":
                 fits += ", or transforms that join two frames"
             named = ", ".join(f'{key} = "FIELD"' for key in BY_HAND[role])
             return [
-                *told,
+                *reported,
                 f"# MISSING, and required: no topic of {fits}.",
                 "# If one of another type has it (JSON, protobuf, the robot's own), name it here:",
                 f"# [inputs.{role}]",
@@ -295,14 +295,14 @@ def _input_lines(
         if role == "wheels":
             by_hand = ["# [motion]", "# window_s = 0.5"] if seen.motion is None else []
             return [
-                *told,
+                *reported,
                 "# [inputs.wheels]  # no usable odometry; instead: speeds from poses",
                 *by_hand,
                 "",
             ]
         fallback = FALLBACKS.get(role) or seen.goal.fallback(role)
         none = "none of use" if why else "no topic seen"
-        return [*told, f"# [inputs.{role}]  # {none}; instead: {fallback}", ""]
+        return [*reported, f"# [inputs.{role}]  # {none}; instead: {fallback}", ""]
     topic, kind = fitting[0]
     rate = topic.expected / seen.recorded_s if seen.recorded_s > 0 else 0.0
     beside = dict.fromkeys(other.name for other, _ in fitting if other.name != topic.name)

@@ -157,15 +157,15 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         why = f"poses are far from 0 (UTM coordinates?): positions are from {list(seen.origin_m)}"
         advice.append(Advice("origin_m", f"{why}, and so are zones and floors"))
     if seen.commands.steered and not seen.robot.wheelbase_from:
-        told = "a guess, and with it every yaw rate that was commanded: measure it"
-        advice.append(Advice("inputs.command.wheelbase_m", told))
+        reported = "a guess, and with it every yaw rate that was commanded: measure it"
+        advice.append(Advice("inputs.command.wheelbase_m", reported))
     if not seen.footprint.measured and seen.roles["scan"]:
         said = seen.footprint.source.replace("A GUESS", "a guess").replace("MEASURE IT", "")
         advice.append(Advice("task.body", f"{said}--footprint"))
     if clouds := clouds_alone(recording, seen.roles):
         advice.append(Advice("inputs.scan", clouds))
-    if told := lidar_guess(seen.footprint):
-        advice.append(Advice("task.body.lidar_yaw_rad", told.replace("A GUESS", "a guess")))
+    if reported := lidar_guess(seen.footprint):
+        advice.append(Advice("task.body.lidar_yaw_rad", reported.replace("A GUESS", "a guess")))
     if len(seen.lidars) > 1:
         scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)
         advice.append(Advice("inputs.scan", f"the lidars of {scans} are put together"))
@@ -204,11 +204,11 @@ def _odd_commands(seen: Evidence) -> list[Advice]:
     if not seen.roles["command"]:
         return []
     topic, kind = seen.roles["command"][0]
-    told = Input(topic.name, topic.type, dict(kind.fields))
-    path, found = sideways_path(told), []
+    reported = Input(topic.name, topic.type, dict(kind.fields))
+    path, found = sideways_path(reported), []
     if path in seen.recording.leaves(topic.name):
         fields = seen.recording.read({topic.name: [path]})[topic.name].fields
-        notes = sideways_notes(told, fields)
+        notes = sideways_notes(reported, fields)
         found = [Advice("inputs.command", note.removeprefix("command: ")) for note in notes]
     if seen.commands.still:
         text = f"{topic.name} never asks the robot to move: the actions are a guess"

@@ -33,8 +33,8 @@ def task_lines(seen: Evidence, trial: Trial) -> list[str]:
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
-        f"# {told} beyond {reached:g} {unit} were commanded, but not reached by the robot."
-        for told, reached, unit in zip(
+        f"# {reported} beyond {reached:g} {unit} were commanded, but not reached by the robot."
+        for reported, reached, unit in zip(
             ("Speeds", "Yaw rates"), commands.reached, ("m/s", "rad/s"), strict=True
         )
         if reached is not None

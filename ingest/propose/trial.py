@@ -80,8 +80,14 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     if not len(steps):
         return Trial(problem=why)
     endings = Counter(episode.ended_by for episode in episodes.episodes)
-    asked = _Advisor(profile, topics, steps, episodes)
-    advice = [*asked.ages(), *asked.gaps(), *asked.ticks(), *asked.outline(), *asked.limit()]
+    requested = _Advisor(profile, topics, steps, episodes)
+    advice = [
+        *requested.ages(),
+        *requested.gaps(),
+        *requested.ticks(),
+        *requested.outline(),
+        *requested.limit(),
+    ]
     worst = sorted(episodes.dropped.items(), key=lambda item: -item[1])
     problem = "" if episodes.transitions else f"no transition: {why}"
     stamps = steps.signals["stamp_ns"]

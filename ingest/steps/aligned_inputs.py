@@ -326,11 +326,13 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
         notes.append(f"transforms: a frame was given another parent {changes}")
     if profile.frames is None:
         found = {name: set(inputs.frames_of(name)) - {""} for name in ("pose", "goal", "plan")}
-        told = [f"{name} {', '.join(sorted(frames))}" for name, frames in found.items() if frames]
+        reported = [
+            f"{name} {', '.join(sorted(frames))}" for name, frames in found.items() if frames
+        ]
         if ("goal" in inputs.by_name) and len(set().union(*found.values())) > 1:
             notes.append(
-                f"frames: {'; '.join(told)}: they are treated as if they were one: the profile has "
-                "no [frames]"
+                f"frames: {'; '.join(reported)}: they are treated as if they were one: the profile "
+                "has no [frames]"
             )
     return notes
 

@@ -58,7 +58,7 @@ class Finding:
         return f"{self.topic}: {self.what} ({self.steps:,} steps); {self.cause}; {self.remedy}"
 
     @property
-    def told(self) -> str:
+    def reported(self) -> str:
         """Return it as a line for people."""
         return f"{'repaired' if self.repaired else 'contradicts itself'}: {self}"
 
@@ -259,8 +259,8 @@ def _compared(windows: tuple[F64, F64], of: tuple[str, str, str, str], steps: in
 def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Finding]:
     """Find motion that comes before the command that it follows."""
     for name in ("speed_mps", "yaw_rate_radps"):
-        asked, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
-        by_lag, most = _by_lag(asked, did, drive.joined, period_s)
+        requested, did = (np.asarray(drive.signals[f"{by}_{name}"]) for by in ("command", "wheel"))
+        by_lag, most = _by_lag(requested, did, drive.joined, period_s)
         best = int(np.argmax(by_lag))
         lead = most - best  # steps by which the motion comes before
         # One step is no clock: a command may be sent when the motion of its step is over.
@@ -272,7 +272,7 @@ def _order(drive: Drive, command: str, wheels: str, period_s: float) -> list[Fin
                     f"its motion comes {lead * period_s:.1f} s before the commands of {command}"
                     f" that it follows (correlation {by_lag[best]:.2f}, {by_lag[most]:.2f} as"
                     " stamped)",
-                    len(asked),
+                    len(requested),
                     "one of the two has the times of another clock",
                     'set [clock] alignment = "log_time" in the profile, and synchronise the clocks',
                 )
@@ -322,22 +322,22 @@ def _turned(sectors: F64) -> F64:
     return np.concatenate([turns[np.argmax((part @ waves).real, axis=1)] for part in parts])
 
 
-def _by_lag(asked: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
+def _by_lag(requested: F64, did: F64, joined: Bools, period_s: float) -> tuple[list[float], int]:
     """Return `_correlation` at each lag from -n to n steps, and n."""
     most = max(1, round(MAX_LEAD_S / period_s))
-    return [_correlation(asked, did, joined, lag) for lag in range(-most, most + 1)], most
+    return [_correlation(requested, did, joined, lag) for lag in range(-most, most + 1)], most
 
 
-def _correlation(asked: F64, did: F64, joined: Bools, lag: int) -> float:
+def _correlation(requested: F64, did: F64, joined: Bools, lag: int) -> float:
     """Return how well a motion (T,) follows a command (T,) `lag` steps later; -1: unknown."""
     if lag > 0:
-        asked, did, joined = asked[:-lag], did[lag:], joined[:-lag] & joined[lag:]
+        requested, did, joined = requested[:-lag], did[lag:], joined[:-lag] & joined[lag:]
     elif lag < 0:
-        asked, did, joined = asked[-lag:], did[:lag], joined[-lag:] & joined[:lag]
-    asked, did = asked[joined], did[joined]
-    if len(asked) < MIN_FOLLOWED or asked.std() < 1e-3 or did.std() < 1e-3:
+        requested, did, joined = requested[-lag:], did[:lag], joined[-lag:] & joined[:lag]
+    requested, did = requested[joined], did[joined]
+    if len(requested) < MIN_FOLLOWED or requested.std() < 1e-3 or did.std() < 1e-3:
         return -1.0
-    return float(np.corrcoef(asked, did)[0, 1])
+    return float(np.corrcoef(requested, did)[0, 1])
 
 
 __all__ = ["Finding", "clock_findings", "findings_of"]

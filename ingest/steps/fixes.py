@@ -50,10 +50,10 @@ class Fixes:
         std = np.full(len(self.time_ns), np.nan)
         if self.covariance_m2 is not None:
             variance = self.covariance_m2[:, [0, 4]].max(axis=1)
-            told = variance > 0  # False for NaN
+            reported = variance > 0  # False for NaN
             if self.covariance_type is not None:
-                told &= self.covariance_type > 0
-            std[told] = np.sqrt(variance[told])
+                reported &= self.covariance_type > 0
+            std[reported] = np.sqrt(variance[reported])
         return std
 
     def problems(self, max_std_m: float) -> NDArray[Any]:
@@ -106,9 +106,9 @@ def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None =
     for key, path in fields.items():
         column = columns.fields.get(path)
         if isinstance(column, Ragged) and key == "covariance_m2":  # no type fixes its length
-            told = np.flatnonzero(column.lengths == COVARIANCES)
+            reported = np.flatnonzero(column.lengths == COVARIANCES)
             rows = np.full((len(column), COVARIANCES), np.nan)
-            rows[told] = np.asarray(column.take(told).values).reshape(-1, COVARIANCES)
+            rows[reported] = np.asarray(column.take(reported).values).reshape(-1, COVARIANCES)
             column = rows
         if isinstance(column, np.ndarray):
             named[key] = np.asarray(column, np.float64)

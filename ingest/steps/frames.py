@@ -155,11 +155,11 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
 def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
     """Which of the plain names, sorted, each of these frames (N,) has; and the names."""
     place: dict[str, int] = {}  # of each name as it is written, in the order they are met
-    met = [place.setdefault(name, len(place)) for name in frames.tolist()]
+    observed = [place.setdefault(name, len(place)) for name in frames.tolist()]
     each = [plain(name) for name in place]
     names = sorted(set(each))
     number = {name: code for code, name in enumerate(names)}
-    return np.array([number[name] for name in each], np.int64)[np.array(met, np.int64)], names
+    return np.array([number[name] for name in each], np.int64)[np.array(observed, np.int64)], names
 
 
 def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:

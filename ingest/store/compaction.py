@@ -133,8 +133,8 @@ class _Fold:
         files = store.files(RECORDINGS)
         live = [one for file in files for one in file.ingests if one.ingest_id in shown]
         names = pa.schema([("ingest_id", pa.string()), ("summary_version", pa.int32())])
-        told = store.manifests(live, names).to_pylist()
-        current = {one["ingest_id"] for one in told if one["summary_version"] == VERSION}
+        reported = store.manifests(live, names).to_pylist()
+        current = {one["ingest_id"] for one in reported if one["summary_version"] == VERSION}
         current -= set(changed)
 
         chosen = []
@@ -191,8 +191,8 @@ def _keep_replaced(store: StoreWriter, plan: _Fold) -> None:
 def _changed(store: StoreWriter, files: Sequence[StoredFile]) -> set[str]:
     """The ingests of these files whose rows are not those that their manifests describe."""
     names = pa.schema([("ingest_id", pa.string()), ("transitions", pa.int64())])
-    told = store.manifests([one for file in files for one in file.ingests], names)
-    written = dict(zip(*(told[name].to_pylist() for name in names.names), strict=True))
+    reported = store.manifests([one for file in files for one in file.ingests], names)
+    written = dict(zip(*(reported[name].to_pylist() for name in names.names), strict=True))
     return set(changed_by_others(files, written))
 
 
@@ -203,10 +203,10 @@ def _groups(store: StoreWriter) -> Iterator[list[StoredFile]]:
     small = [file for file in files if file.rows < FILE_ROWS / 2 or not file.listed]
     names = ("ingest_id", "tags", "start_stamp_ns")
     schema = pa.schema([field for field in recording_schema() if field.name in names])
-    told = store.manifests([one for file in small for one in file.ingests], schema)
+    reported = store.manifests([one for file in small for one in file.ingests], schema)
     driven = {
         row["ingest_id"]: (dict(row["tags"] or {}).get("robot", ""), row["start_stamp_ns"] or 0)
-        for row in told.to_pylist()
+        for row in reported.to_pylist()
     }
     group: list[StoredFile] = []
     for file in sorted(

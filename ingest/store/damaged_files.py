@@ -145,8 +145,8 @@ def verify_store(path: str | Path | Location) -> Verified:
         frames = [f"{FRAMES}/{path}" for path in frame_files(store.live())]
         damaged += verify_files(store.path, frames, again=True)
         paths += frames
-    told = [DamagedFile(path, damage_remedy(store.path, path)) for path in damaged]
-    return Verified(len(paths), told)
+    reported = [DamagedFile(path, damage_remedy(store.path, path)) for path in damaged]
+    return Verified(len(paths), reported)
 
 
 def verify_files(place: Location, paths: Iterable[str], *, again: bool = False) -> list[str]:
@@ -206,11 +206,11 @@ def _remembered(place: Location, stamps: Mapping[str, list[int]]) -> dict[str, l
     """The files that were found whole and have not changed since."""
     try:
         with place.reading(VERIFIED) as source:
-            told = json.loads(source.read())
+            reported = json.loads(source.read())
     except (OSError, ValueError, StoreError):
         return {}
-    told = told if isinstance(told, dict) else {}
-    return {path: stamp for path, stamp in stamps.items() if told.get(path) == stamp}
+    reported = reported if isinstance(reported, dict) else {}
+    return {path: stamp for path, stamp in stamps.items() if reported.get(path) == stamp}
 
 
 def _damaged(place: Location, paths: Sequence[str]) -> list[str]:
@@ -252,8 +252,8 @@ def _sources(place: Location, name: str, path: str, rows: int, readable: Files) 
         return []
     there = [one for file in readable[TRANSITIONS] for one in file.ingests]
     known = {one.recording_id for one in there}  # also those that were ingested again since
-    told = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
-    untold = {one.ingest_id for one in there} - told
+    reported = {one.ingest_id for file in readable.get(RECORDINGS, ()) for one in file.ingests}
+    untold = {one.ingest_id for one in there} - reported
     found = []
     for file in (held_by(place, name, one) for one in paths):
         kept = [

@@ -14,7 +14,7 @@ from restock.ingest.profile.profile import Profile
 from restock.ingest.steps.episodes import Split, changed_route, with_route
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.summary import ENDS
-from restock.ingest.task.conditions import label_with_probabilities, told
+from restock.ingest.task.conditions import label_with_probabilities, reported
 from restock.ingest.task.schema import signal_columns
 from restock.ingest.task.signals import Signals
 
@@ -113,7 +113,7 @@ def episode_rows(
     table = label_table(signals, episode, step, custom)
     lidar, driven_plan = profile.task.lidar, profile.goal_source == "hindsight"
     conditions, situations = (
-        told(several, lidar=lidar, driven_plan=driven_plan)
+        reported(several, lidar=lidar, driven_plan=driven_plan)
         for several in (profile.conditions, profile.exposures)
     )
     held, probable = label_with_probabilities(table, [*conditions, *situations])

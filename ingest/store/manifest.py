@@ -21,7 +21,7 @@ from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps
 from restock.ingest.store.episode_rows import EpisodeRows
 from restock.ingest.store.transitions import Provenance
-from restock.ingest.task.conditions import Condition, told, unknown_rows, unseen
+from restock.ingest.task.conditions import Condition, reported, unknown_rows, unseen
 from restock.ingest.task.label_scores import LabelScore
 from restock.ingest.task.signals import OUTLINE_SIGNALS
 
@@ -96,7 +96,7 @@ def uncertain_conditions(profile: Profile) -> list[str]:
     if profile.robot is None or not profile.robot.outline_guessed:
         return []
     hindsight = profile.goal_source == "hindsight"
-    known = told(profile.definitions, lidar=profile.task.lidar, driven_plan=hindsight)
+    known = reported(profile.definitions, lidar=profile.task.lidar, driven_plan=hindsight)
     return sorted(unseen(known, OUTLINE_SIGNALS))
 
 

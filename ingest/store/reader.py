@@ -131,8 +131,8 @@ class StoreReader:
         if not parts:
             raise FileNotFoundError(own)
         rows = pa.concat_tables(parts, promote_options="default").sort_by("transition_id")
-        told = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
-        return with_ends(rows, told.get(ingest_id))
+        reported = self._packed_ends([Ingest(recording_id, ingest_id, len(rows))])
+        return with_ends(rows, reported.get(ingest_id))
 
     def _files_of(self, ingest_id: str) -> list[str]:
         """The active files of transitions that hold rows of an ingest; the log is read again only
@@ -157,10 +157,10 @@ class StoreReader:
         gives them; without those that have none."""
         from restock.ingest.store.episode_rows import episode_ends
 
-        told = self._packed_ends(ingests)
+        reported = self._packed_ends(ingests)
         for one in ingests:
-            bare = with_ends(pa.table({}), told.get(one.ingest_id))
-            if not told.get(one.ingest_id):
+            bare = with_ends(pa.table({}), reported.get(one.ingest_id))
+            if not reported.get(one.ingest_id):
                 path = f"{TRANSITIONS}/{own_path(one.recording_id, one.ingest_id)}"
                 # Of an older store they lie with its rows.
                 with damage_named(self.path, path), suppress(FileNotFoundError):
@@ -172,8 +172,8 @@ class StoreReader:
     def _packed_ends(self, ingests: Sequence[Ingest]) -> dict[str, str | None]:
         """What manifests keep of the ends of episodes, by ingest."""
         schema = pa.schema([("ingest_id", pa.string()), ("packed_ends", pa.string())])
-        told = self.manifests(ingests, schema)
-        return dict(zip(*(told[name].to_pylist() for name in schema.names), strict=True))
+        reported = self.manifests(ingests, schema)
+        return dict(zip(*(reported[name].to_pylist() for name in schema.names), strict=True))
 
     def files(self, name: str, version: Version | None = None) -> list[StoredFile]:
         """The active files of one of its tables, and which ingests they hold."""
@@ -190,9 +190,9 @@ class StoreReader:
         schema = pa.schema([(name, pa.string()) for name in names])
         new = [one for one in ingests if (self.path, one.ingest_id) not in _SKETCHES]
         # What cannot be read is another recording's, which `restock sql` reports.
-        for told in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
-            hashes = read_sketch({SKETCH: (told["sketch"] or "").encode()})
-            sketch = Sketch(told["recording_id"], told["ingest_id"], hashes)
+        for reported in self.manifests(new, schema, skip=UNREADABLE).to_pylist():
+            hashes = read_sketch({SKETCH: (reported["sketch"] or "").encode()})
+            sketch = Sketch(reported["recording_id"], reported["ingest_id"], hashes)
             _SKETCHES[self.path, sketch.ingest_id] = sketch
         keys = [(self.path, one.ingest_id) for one in ingests]
         return [_SKETCHES[key] for key in keys if key in _SKETCHES]

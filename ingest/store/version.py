@@ -230,8 +230,8 @@ def expect_readable(table: DeltaTable, *, where: str) -> None:
         StoreError: the table uses a feature that Restock cannot read.
     """
     protocol = table.protocol()
-    asked = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
-    for feature, what in _asked(table, *asked, _BY_READER_VERSION, "minReaderVersion"):
+    requested = protocol.min_reader_version, _LISTED_READER, protocol.reader_features
+    for feature, what in _asked(table, *requested, _BY_READER_VERSION, "minReaderVersion"):
         if feature not in _READ:
             raise _unreadable(what, _name(table), where)
 
@@ -243,8 +243,8 @@ def expect_writable(table: DeltaTable, *, where: str, removing: bool = False) ->
         StoreError: the table uses a feature that Restock cannot write.
     """
     protocol = table.protocol()
-    asked = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
-    for feature, what in _asked(table, *asked, _BY_WRITER_VERSION, "minWriterVersion"):
+    requested = protocol.min_writer_version, _LISTED_WRITER, protocol.writer_features
+    for feature, what in _asked(table, *requested, _BY_WRITER_VERSION, "minWriterVersion"):
         if feature not in _WRITTEN and (feature != "appendOnly" or removing):
             raise _unwritable(what, _name(table), where)
 

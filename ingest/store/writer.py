@@ -307,10 +307,10 @@ class StoreWriter(TableCommits):
         for path in self.path.listing(RECORDINGS):
             if path.endswith(".parquet"):
                 try:
-                    told = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
+                    reported = self.path.read(f"{RECORDINGS}/{path}", columns=["cameras"])
                 except UNREADABLE:
                     return []  # which frames it names is not known
-                found -= set(frame_files(told))
+                found -= set(frame_files(reported))
         return [f"{FRAMES}/{path}" for path in sorted(found)]
 
     def _abandoned(self, retention_hours: int) -> list[str]:

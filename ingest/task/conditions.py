@@ -184,7 +184,7 @@ def unknown_rows(
     ]
 
 
-def told(
+def reported(
     conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
 ) -> list[Condition]:
     """The conditions that such steps can be told by."""
@@ -279,8 +279,8 @@ def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
     """
     values = {}
     for name in condition.let:
-        asked = msgspec.structs.replace(condition, sql=name)
-        column = _evaluate(steps, [asked], ("sql",))[condition.name, "sql"]
+        requested = msgspec.structs.replace(condition, sql=name)
+        column = _evaluate(steps, [requested], ("sql",))[condition.name, "sql"]
         try:
             numbers = column.cast(pa.float64())
         except pa.ArrowInvalid as error:
@@ -307,13 +307,13 @@ def _evaluate(
     steps: pa.Table, conditions: Sequence[Condition], which: Sequence[Expression]
 ) -> Columns:
     """These expressions of each condition, of those it has, over the steps."""
-    asked = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
+    requested = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
     together: dict[str, list[tuple[Condition, Expression]]] = {}  # that select from the same table
-    for condition, part in asked:
+    for condition, part in requested:
         _refuse(condition, part, steps.column_names)
         together.setdefault(_source(condition), []).append((condition, part))
     columns: Columns = {}
-    if not asked:
+    if not requested:
         return columns
     with sandbox().cursor() as connection:
         numbered = steps.append_column("row_", pa.array(range(len(steps)), pa.int64()))
@@ -327,7 +327,9 @@ def _evaluate(
             except duckdb.Error as together_error:
                 for condition, part in several:  # again one by one, to say which
                     try:
-                        _query(connection, [(condition, part)], len(steps), limit_s / len(asked))
+                        _query(
+                            connection, [(condition, part)], len(steps), limit_s / len(requested)
+                        )
                     except duckdb.Error as error:
                         _say_why(error, steps, _where(condition, part), limit_s)
                 names = ", ".join(repr(condition.name) for condition, _ in several)
@@ -402,7 +404,7 @@ def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition
 
 def _query(
     connection: duckdb.DuckDBPyConnection,
-    asked: Sequence[tuple[Condition, Expression]],
+    requested: Sequence[tuple[Condition, Expression]],
     count: int,
     limit_s: float,
 ) -> Columns:
@@ -413,16 +415,16 @@ def _query(
     """
     columns = ",\n".join(
         f"({getattr(condition, part)}\n) AS column_{place}"
-        for place, (condition, part) in enumerate(asked)
+        for place, (condition, part) in enumerate(requested)
     )
-    query = select_of(f"{columns},\nrow_", _source(asked[0][0]))
+    query = select_of(f"{columns},\nrow_", _source(requested[0][0]))
     with _interrupted_after(connection, limit_s):
         rows = connection.sql(query).to_arrow_table()
     if not np.array_equal(rows["row_"].to_numpy(), np.arange(count)):
         raise duckdb.InvalidInputException(
             f"it gives {len(rows):,} values, not one for each of the {count:,} steps"
         )
-    return {(c.name, part): rows.column(place) for place, (c, part) in enumerate(asked)}
+    return {(c.name, part): rows.column(place) for place, (c, part) in enumerate(requested)}
 
 
 @contextmanager

@@ -175,12 +175,12 @@ def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[
     """
     episode, step = rows["episode_index"].to_numpy(), rows["step_index"].to_numpy()
     scores = []
-    for column, truth, asked in (
+    for column, truth, requested in (
         ("conditions", "true_condition", list(names)),
         ("exposures", "true_exposure", exposures_named(rows)),
     ):
-        if asked:
-            labels = held(rows[column], asked)
+        if requested:
+            labels = held(rows[column], requested)
             scores += score(labels, rows[truth].to_pylist(), episode, step, period_s)
     return scores
 

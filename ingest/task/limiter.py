@@ -147,8 +147,8 @@ def limit(
         previous: (N, 2) the commands in force until now.
         unknown: (N,) where an input cannot be relied on; None: nowhere.
     """
-    told = np.isfinite(np.concatenate([proposed, previous], axis=1))  # (N, 4)
-    blind: Bools = ~told.all(axis=1)
+    reported = np.isfinite(np.concatenate([proposed, previous], axis=1))  # (N, 4)
+    blind: Bools = ~reported.all(axis=1)
     blind |= np.isnan(clearance_m).any(axis=1)
     if unknown is not None:
         blind |= unknown
@@ -212,8 +212,8 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
         rows = np.flatnonzero(of.ravel() == index)
         swept = _swept(limits, ahead, turn)  # (M, K)
         beyond = np.asarray(swept > clearance_m[rows, None] + _TOUCH_M, np.bool_)  # (n, M, K)
-        met = np.asarray(beyond.any(axis=2), np.bool_)  # (n, M)
-        first = np.where(met.any(axis=1), met.argmax(axis=1), len(swept))
+        observed = np.asarray(beyond.any(axis=2), np.bool_)  # (n, M)
+        first = np.where(observed.any(axis=1), observed.argmax(axis=1), len(swept))
         free[rows] = np.maximum(first - 1, 0) * _STEP_M
     return free
 

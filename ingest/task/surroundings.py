@@ -76,8 +76,8 @@ def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
 def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked_m: F64) -> F64:
     count, sectors = task.sectors, _sectors(task.sectors, task.body)
     # The same scan again, of a lidar slower than the steps, tells nothing.
-    told = (clearance != before[0]).any(axis=1)
-    row, sector = np.nonzero((clearance < NEAR_M) & told[:, None])
+    reported = (clearance != before[0]).any(axis=1)
+    row, sector = np.nonzero((clearance < NEAR_M) & reported[:, None])
     distance = (clearance + sectors.reach_m)[row, sector]
     lever = task.body.lidar_x_m  # points are of the lidar, turns about the middle of the body
     x, y = distance * sectors.cos[sector] + lever, distance * sectors.sin[sector]

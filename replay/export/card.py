@@ -54,8 +54,8 @@ def card(
     selection: Selection, counts: Counts, contents: Contents, to: str, identifier: str | None
 ) -> str:
     """The text of the card; without an identifier it says that no licence was given."""
-    told, task = counts.describe(), selection.task
-    size = next((name for most, name in _SIZES if told["transitions"] < most), "1M<n<10M")
+    reported, task = counts.describe(), selection.task
+    size = next((name for most, name in _SIZES if reported["transitions"] < most), "1M<n<10M")
     front = [
         *([f"license: {identifier}"] if identifier else []),
         "task_categories: [robotics, reinforcement-learning]",
@@ -77,10 +77,10 @@ def card(
     }
     lines = [
         *("---", *front, "---", "", "# A mobile robot's transitions", ""),
-        f"{told['transitions']:,} transitions of {task.control_period_s:g} s in"
-        f" {told['trajectories']:,} trajectories, made from recordings by Restock:"
-        f" {told['terminated']:,} terminated, {told['truncated']:,} truncated,"
-        f" {told['cut']:,} cut where rows were left out.",
+        f"{reported['transitions']:,} transitions of {task.control_period_s:g} s in"
+        f" {reported['trajectories']:,} trajectories, made from recordings by Restock:"
+        f" {reported['terminated']:,} terminated, {reported['truncated']:,} truncated,"
+        f" {reported['cut']:,} cut where rows were left out.",
         "",
         f"Read it with `{READ[to]}`.",
         "",
@@ -99,7 +99,7 @@ def card(
         *_table("behaviour policy", contents.policies),
         *("## How it was made", ""),
         *(f"- {name}: `{value}`" for name, value in made.items() if value is not None),
-        *(f"- left out: {count:,}, {why}" for why, count in told["left_out"].items()),
+        *(f"- left out: {count:,}, {why}" for why, count in reported["left_out"].items()),
         "",
         *("## Before it is used", ""),
         "- Conditions are labels by rules over the signals, not the truth.",

@@ -156,7 +156,7 @@ def _of_query(
         expected = _EXPECTED.get(name)
         if expected is not None and not expected.fits(str(kind)):
             raise QueryError(f"its {name} is a {kind}, not {expected.words}", where=where)
-    asked, left_out = text, dict[str, int]()
+    requested, left_out = text, dict[str, int]()
     for camera in cameras:
         text, left_out[f"no frame of camera {camera}"] = _with_frames(
             connection, text, columns, camera, where
@@ -213,7 +213,7 @@ def _of_query(
         provenance={
             "store": where,
             "store_version": store.version,
-            "query": asked,
+            "query": requested,
             "panel": Panel.open(panel).id if panel is not None else None,
             "tags": _tags(store, facts[2] or []),
             **({"cameras": list(cameras)} if cameras else {}),

@@ -92,9 +92,9 @@ def find_gaps(
     _refuse_unknown(kinds, [NOMINAL, *(one.name for one in store.conditions()), *shipped()])
     if thresholds is not None:
         check_thresholds(shipped_audits(), thresholds, others=True)
-    asked = _without_split(store, uncorrected(mixture))
-    with open_source(store, asked, folder=None if folder is None else Path(folder)) as source:
-        plan = plan_panel(source.connection, asked, source.conditions, source.others)
+    requested = _without_split(store, uncorrected(mixture))
+    with open_source(store, requested, folder=None if folder is None else Path(folder)) as source:
+        plan = plan_panel(source.connection, requested, source.conditions, source.others)
     yields = read_yields(store.connection, kinds)
     gaps = _of_strata(plan, yields, f"mixture {name}")
     if thresholds is not None:
@@ -190,18 +190,18 @@ def _of_audits(
         if rows is None:  # unknown of every recording: no drive of these robots brings any
             continue
         found = yields.rows_of({"condition": condition})
-        met = np.asarray(found > 0, np.float64)
-        asked = limits["rare_condition"]
+        observed = np.asarray(found > 0, np.float64)
+        requested = limits["rare_condition"]
         cell: dict[str, str | int] = {"condition": condition}
         by = "audit rare_condition"
-        gaps.append(Gap(by, cell, "rows", asked.get("min_rows", 0), rows, found))
-        gaps.append(Gap(by, cell, "episodes", asked.get("min_episodes", 0), episodes, met))
+        gaps.append(Gap(by, cell, "rows", requested.get("min_rows", 0), rows, found))
+        gaps.append(Gap(by, cell, "episodes", requested.get("min_episodes", 0), episodes, observed))
         least = limits["few_effective_episodes"].get("min_effective_episodes", 0)
         if effective and effective < least:  # 0: it holds in no row
             # As many more as would do if they were as uneven as those that there are.
             needed = math.ceil(least * episodes / effective)
             by = "audit few_effective_episodes"
-            gaps.append(Gap(by, cell, "episodes", needed, episodes, met))
+            gaps.append(Gap(by, cell, "episodes", needed, episodes, observed))
     least = limits["missing_cells"].get("min_rows", 0)
     install_named(connection, "cells_below")
     cells = connection.execute("FROM cells_below(?)", [least]).fetchall() if least else []

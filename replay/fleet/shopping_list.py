@@ -138,8 +138,8 @@ def shopping_list(
 
 def _may_fill(supply: Supply, gap: Gap) -> bool:
     """Whether it is of the zone and the robot that the gap names."""
-    asked = ((gap.cell.get("zone"), supply.zone), (gap.cell.get("robot"), supply.robot))
-    return all(wanted is None or wanted in ("", given) for wanted, given in asked)
+    requested = ((gap.cell.get("zone"), supply.zone), (gap.cell.get("robot"), supply.robot))
+    return all(wanted is None or wanted in ("", given) for wanted, given in requested)
 
 
 def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:

@@ -127,7 +127,7 @@ def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: 
 
 def look_for_archives(
     said: Mapping[str, Represents | None],
-    met: Mapping[str, Sequence[tuple[int, int]]],
+    observed: Mapping[str, Sequence[tuple[int, int]]],
     strata: Collection[str],
 ) -> tuple[str, ...]:
     """What to warn of: a source in which a condition is far more frequent than in the others.
@@ -150,7 +150,7 @@ def look_for_archives(
         ]
         if represents is not None or not others:
             continue
-        for name, of_sources in met.items():
+        for name, of_sources in observed.items():
             mine = of_sources[number]
             theirs = (sum(of_sources[k][0] for k in others), sum(of_sources[k][1] for k in others))
             odds, low, high = odds_ratio(mine, theirs)

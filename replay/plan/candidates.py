@@ -218,7 +218,7 @@ def episodes_met(
         f"(SELECT {STORE_COLUMN}, recording_id, episode_id, {held} AS conditions, exposures"
         f" FROM transitions WHERE coalesce(({mixture.where or 'true'}\n)::BOOLEAN, false))"
     )
-    met: dict[tuple[str, str], int] = {
+    observed: dict[tuple[str, str], int] = {
         (recording, name): episodes
         for recording, name, episodes in connection.sql(
             "SELECT recording_id, held, count(DISTINCT episode_id) FROM (SELECT recording_id,"
@@ -240,7 +240,7 @@ def episodes_met(
         for condition in conditions:
             if condition.name not in unknown and (exposed or condition.kind == "outcome"):
                 counts[condition.name][store] += (
-                    met.get((recording, condition.name), 0),
+                    observed.get((recording, condition.name), 0),
                     episodes,
                 )
     return {

@@ -171,8 +171,8 @@ def plan_panel(
     names = [named.name for named in strata]
     warnings += uncertain_labels(connection, names)
     if others:
-        met = episodes_met(connection, mixture, conditions)
-        warnings += look_for_archives(mixture.sources.said, met, names)
+        observed = episodes_met(connection, mixture, conditions)
+        warnings += look_for_archives(mixture.sources.said, observed, names)
     occurs = represented_shares(mixture, strata, given)
     unknown = unknown_conditions(connection)
     worked_out = [

@@ -98,14 +98,14 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
     rules = list(mixture.strata)
     if mixture.each_condition is not None:
         listed = {rule.name for rule in rules}
-        asked = of_kind(conditions, mixture.each_condition.kind)
-        if not asked and mixture.each_condition.kind == "exposure":
+        requested = of_kind(conditions, mixture.each_condition.kind)
+        if not requested and mixture.each_condition.kind == "exposure":
             raise ConfigError(
                 "each_condition asks for exposures, but the store has none",
                 where="mixture",
                 remedy="name some in the profile (`exposures`) and ingest the recordings again",
             )
-        names = [NOMINAL, *(c.name for c in sorted(asked, key=lambda c: (c.priority, c.name)))]
+        names = [NOMINAL, *(c.name for c in sorted(requested, key=lambda c: (c.priority, c.name)))]
         rules += [_rule_for(name, mixture.each_condition) for name in names if name not in listed]
     return [_resolve(rule, known, mixture) for rule in rules]
 

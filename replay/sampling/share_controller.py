@@ -328,8 +328,8 @@ class ShareController(Stateful):
             logs_share += parts[source.name] * online_filled
         total = shares.sum()
         shares = shares / total if total > 0 else self.shares
-        asked = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
-        self.wanted = np.bincount(self._of, asked) / max(sum(parts.values()), 1e-12)
+        requested = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
+        self.wanted = np.bincount(self._of, requested) / max(sum(parts.values()), 1e-12)
         changed = logs_share != self.logs_share or not np.array_equal(shares, self.shares)
         self.shares, self.logs_share = shares, logs_share
         return changed
@@ -365,10 +365,12 @@ class ShareController(Stateful):
         `stock` (S,) bounds what the ring gives, `limit` (K * S,) what logged rows bear.
         """
         parts = self.parts_at(self.env_steps)
-        asked = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
+        requested = np.concatenate([parts[s.name] * self._wanted(s) for s in self.sources])
         logged = sum(parts.values())
-        wanted = np.bincount(self._of, asked) + max(1.0 - logged, 0.0) * self._wanted_fresh(stock)
-        logs = np.minimum(asked, limit)
+        wanted = np.bincount(self._of, requested) + max(1.0 - logged, 0.0) * self._wanted_fresh(
+            stock
+        )
+        logs = np.minimum(requested, limit)
         if not self._steers:
             return logs, np.zeros(len(wanted)), wanted
         rest = np.maximum(wanted - np.bincount(self._of, logs), 0.0)
@@ -439,15 +441,15 @@ class ShareController(Stateful):
         for moment in moments if online else ():
             self.env_steps = float(moment)
             limits = self._limits(from_start=True)
-            of_logs, of_ring, asked = self._split(np.full(size, np.inf), limits)
+            of_logs, of_ring, requested = self._split(np.full(size, np.inf), limits)
             by_stratum = np.bincount(self._of, of_logs)
             if not self._steers:  # the ring as it is: nothing is asked of it
-                of_ring = np.maximum(asked - by_stratum, 0.0)
+                of_ring = np.maximum(requested - by_stratum, 0.0)
             part = online / total / _MOMENTS
             logs, fresh, wanted = (
                 logs + part * by_stratum,
                 fresh + part * of_ring,
-                wanted + part * asked,
+                wanted + part * requested,
             )
         self.env_steps = now
         natural = self.natural

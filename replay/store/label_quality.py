@@ -77,7 +77,7 @@ class _Recording:
     scores: list[LabelScore]
     # condition -> per episode (E, 4): labelled, support and agreed steps, uncertain ones
     episodes: dict[str, F64]
-    told: bool  # whether its rows say what is uncertain
+    reported: bool  # whether its rows say what is uncertain
 
 
 def _read(store: Store, ingest_id: str, names: Sequence[str], period_s: float) -> _Recording | None:
@@ -128,12 +128,12 @@ def _quality(
         one.episodes[score.condition] for one in recordings if score.condition in one.episodes
     ]
     episodes = np.concatenate(counted).astype(np.float64)  # (E, 4)
-    told = any(one.told for one in recordings)
+    reported = any(one.reported for one in recordings)
     draws = cluster_counts(len(episodes), RESAMPLES, rng) @ episodes  # (R, 4)
     return LabelQuality(
         value,
         score,
-        float(episodes[:, 3].sum() / score.known) if told else None,
+        float(episodes[:, 3].sum() / score.known) if reported else None,
         _of_steps(score.precision, draws[:, 2], draws[:, 0]),
         _of_steps(score.recall, draws[:, 2], draws[:, 1]),
         _of_events(score.event_right, score.event_labelled),

@@ -82,15 +82,15 @@ def same_drives(rows: MovingRows) -> pa.Table:
     near = np.abs(later - np.repeat(shift, each)) <= WITHIN_NS
     same = np.add.reduceat(near, begin, dtype=np.int64) if len(begin) else each
     share = same / np.maximum(_smaller(keys, count, distinctive), 1)
-    told = (same >= MIN_ROWS) & (share >= MIN_SHARE)
+    reported = (same >= MIN_ROWS) & (share >= MIN_SHARE)
     names = pa.array(rows.names, pa.string())
     return pa.table(
         {
-            "recording_id": names.take(pa.array(keys[told] // count)),
-            "same_as": names.take(pa.array(keys[told] % count)),
-            "rows": same[told],
-            "share": share[told],
-            "later_s": shift[told] / 1e9,
+            "recording_id": names.take(pa.array(keys[reported] // count)),
+            "same_as": names.take(pa.array(keys[reported] % count)),
+            "rows": same[reported],
+            "share": share[reported],
+            "later_s": shift[reported] / 1e9,
         }
     )
 
@@ -130,10 +130,10 @@ def _distinctive(
     """Recording, content and stamp (M,) of rows whose content is their recording's only one and may
     be another's, too, by content and recording; and how many rows of each recording (R,) have a
     content that is its only one, another's or not."""
-    met = MetTwice(len(rows.content))
-    met.add(rows.content)
-    again = met.maybe(rows.content)
-    del met
+    observed = MetTwice(len(rows.content))
+    observed.add(rows.content)
+    again = observed.maybe(rows.content)
+    del observed
     alone = np.bincount(rows.recording[~again], minlength=len(rows.names))
     rows = MovingRows(rows.names, rows.recording[again], rows.content[again], rows.stamp_ns[again])
     order = np.argsort(rows.content, kind="stable")

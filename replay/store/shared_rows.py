@@ -34,20 +34,20 @@ def install_shared_rows(
     `manifests` reads these columns of them, from the beginning each time; `recordings` names the
     recording of each ingest whose rows count, and `rows` how many these have.
     """
-    met = MetTwice(rows)
+    observed = MetTwice(rows)
     for _, lists in _of_ingests(manifests(("ingest_id", CONTENT)), recordings):
-        met.add(lists.flatten().field("content").to_numpy())
+        observed.add(lists.flatten().field("content").to_numpy())
     names: list[str] = []
     parts: dict[str, list[pa.Array]] = {"recording": [], "transition_id": [], "content": []}
     for of_ingests, lists in _of_ingests(manifests(("ingest_id", ROWS)), recordings):
         each = lists.flatten()  # structs
-        at = np.flatnonzero(met.maybe(each.field("content").to_numpy()))
+        at = np.flatnonzero(observed.maybe(each.field("content").to_numpy()))
         ends = np.cumsum(lists.value_lengths().fill_null(0).to_numpy())
         parts["recording"].append(np.searchsorted(ends, at, "right") + len(names))
         for name in ("transition_id", "content"):
             parts[name].append(each.field(name).to_numpy()[at])
         names += of_ingests
-    del met
+    del observed
     found = {
         name: np.concatenate([np.empty(0, np.int64), *several]) for name, several in parts.items()
     }

@@ -334,8 +334,8 @@ class Store:
         """`stored_summaries`, where every manifest has one and no other tool changed rows; else
         rows are scanned."""
         versions = self._manifests["summary_version"].to_pylist()
-        told = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
-        summarised = {ingest_id for ingest_id, version in told if version == SUMMARY_VERSION}
+        reported = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
+        summarised = {ingest_id for ingest_id, version in reported if version == SUMMARY_VERSION}
         held = self._ingests["ingest_id"].to_pylist()
         if not held or self.changed_by_others or not summarised.issuperset(held):
             return False

@@ -134,8 +134,8 @@ def manifest_tables(
     `stored_recordings`, and the summaries, `stored_summaries`."""
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())
-    told = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
-    brief = pa.schema([*told, SUMMARY_SCHEMA.field("summary_version")])
+    reported = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
+    brief = pa.schema([*reported, SUMMARY_SCHEMA.field("summary_version")])
     kept = [columns.field("ingest_id"), *(one for one in SUMMARY_SCHEMA if one.name in TABLES)]
     return (
         StoredTable(place, "stored_recordings", RECORDINGS, brief, paths),

@@ -13,7 +13,7 @@ from enum import IntEnum
 TRACEBACK = "RESTOCK_TRACEBACK"  # of the environment: print tracebacks
 
 
-def told(text: str, keep: str = "") -> str:
+def reported(text: str, keep: str = "") -> str:
     """Mask the key and secret of an address such as `s3://KEY:SECRET@…`; else as `visible`."""
     return visible(_SECRET.sub(r"\1***:***@", text), keep)
 
@@ -62,8 +62,8 @@ class RestockError(Exception):
 
     def __init__(self, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
         # They quote what files and people say, and end up on a terminal.
-        what, remedy = told(what, keep="\n"), remedy and told(remedy, keep="\n")
-        where = where and told(where)
+        what, remedy = reported(what, keep="\n"), remedy and reported(remedy, keep="\n")
+        where = where and reported(where)
         self.what, self.where, self.remedy = what, where, remedy
         parts = [f"{where}: {what}" if where else what]
         if remedy:

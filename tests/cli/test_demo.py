@@ -43,9 +43,9 @@ def test_two_feeds_differ_in_nothing_else(tmp_path: Path) -> None:
     settings = ("practice.rule=success", "seed=3")
     to = Settings(("logs",), tmp_path, seconds=9, train=settings)
     stage = stages.train_beside_uniform(to)
-    told = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
+    reported = [dict(pairwise(words)) for words in (stage.command, stage.beside)]
     first, second = (
-        {flag: value for flag, value in one.items() if flag.startswith("--")} for one in told
+        {flag: value for flag, value in one.items() if flag.startswith("--")} for one in reported
     )
     assert first.keys() == second.keys()
     differing = {flag for flag in first if first[flag] != second[flag]}

@@ -21,7 +21,7 @@ LOGS = ROOT / "sample_logs" / "amr_tuesday"
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> Settings:
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     to = Settings((str(LOGS),), tmp_path_factory.mktemp("demo"))
     for command in (
         ["ingest", str(LOGS), "--store", str(to.store)],
@@ -34,12 +34,12 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Settings:
     return to
 
 
-def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(told: Settings) -> None:
+def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(reported: Settings) -> None:
     """The plan of the panel was printed, as if it had been drawn."""
-    head, *lines, legend, note = story.shelves(told.run)
-    strata = {stratum.name: stratum for stratum in Panel.open(told.panel).strata}
-    fed = {row["stratum"]: row for row in fed_shares(Run.open(told.run))}
-    drawn_rows = Run.open(told.run).table("strata").to_pylist()
+    head, *lines, legend, note = story.shelves(reported.run)
+    strata = {stratum.name: stratum for stratum in Panel.open(reported.panel).strata}
+    fed = {row["stratum"]: row for row in fed_shares(Run.open(reported.run))}
+    drawn_rows = Run.open(reported.run).table("strata").to_pylist()
     whole = sum(row["drawn_rows"] for row in drawn_rows)
     assert [line.split()[0] for line in lines] == list(strata)
     for line in lines:
@@ -55,8 +55,8 @@ def test_a_stratum_is_shown_by_what_the_critic_was_fed_of_it(told: Settings) -> 
     assert max(map(len, [head, legend, note])) <= 90
 
 
-def test_a_rare_event_is_followed_from_its_message_to_an_update(told: Settings) -> None:
-    lines = story.rare_event(told)
+def test_a_rare_event_is_followed_from_its_message_to_an_update(reported: Settings) -> None:
+    lines = story.rare_event(reported)
     links = [line.split()[0] for line in lines if not line.startswith(" ")]
     assert links == ["recording", *["message"] * 2, "row", "stratum", "update", "All"]
     assert str(LOGS) in lines[0]

@@ -15,7 +15,7 @@ from restock.errors import ConfigError
 from restock.imports import import_extra, install_command
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
+def reported(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
     code = main(["doctor", *arguments, "--json"])
     found = json.loads(capsys.readouterr().out)["findings"]
     return code, {one["name"]: one for one in found}
@@ -24,7 +24,7 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict
 def test_a_machine_on_which_the_tests_run_is_well(
     store_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, found = told(capsys, str(store_path))
+    code, found = reported(capsys, str(store_path))
     assert code == 0
     assert found["duckdb"]["what"] == metadata.version("duckdb")
     assert found["torch"]["state"] == "ok"
@@ -40,7 +40,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
         "of-another-machine>=1; platform_machine == 'pdp11'",
     ]
     monkeypatch.setattr(doctor, "requires", lambda _: wanted)
-    code, found = told(capsys)
+    code, found = reported(capsys)
     assert code == 2
     assert found["duckdb"]["state"] == "wrong"
     assert ">=99 is needed" in found["duckdb"]["what"]
@@ -74,7 +74,7 @@ def test_an_extra_is_added_to_the_restock_that_is_installed(
 def test_a_store_that_is_not_there_is_wrong(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, found = told(capsys, str(tmp_path / "none"))
+    code, found = reported(capsys, str(tmp_path / "none"))
     assert code == 2
     assert "restock ingest" in found["rows"]["remedy"]
 
@@ -83,6 +83,6 @@ def test_a_machine_that_cannot_draw_still_does_the_rest(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doctor, "DRAWS", "raise SystemExit('no EGL here')")
-    code, found = told(capsys)
+    code, found = reported(capsys)
     assert code == 0
     assert (found["pictures"]["state"], found["pictures"]["what"]) == ("missing", "no EGL here")

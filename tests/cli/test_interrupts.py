@@ -34,21 +34,21 @@ WAITS = [sys.executable, "-c", "import time; print(flush=True); time.sleep(600)"
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_kill_does_what_ctrl_c_does_at_that_moment(number: int) -> None:
-    asked: list[int] = []
+    requested: list[int] = []
     usual = signal.signal(number, signal.SIG_DFL)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with kill_as_interrupt():
             with pytest.raises(KeyboardInterrupt):
                 os.kill(os.getpid(), number)
-            signal.signal(signal.SIGINT, lambda *_: asked.append(1))
+            signal.signal(signal.SIGINT, lambda *_: requested.append(1))
             os.kill(os.getpid(), number)
-        assert asked == [1]
+        assert requested == [1]
         assert signal.getsignal(number) == signal.SIG_DFL
         signal.signal(number, signal.SIG_IGN)
         with kill_as_interrupt():
             os.kill(os.getpid(), number)
-        assert asked == [1]
+        assert requested == [1]
     finally:
         signal.signal(number, usual)
         signal.signal(signal.SIGINT, before)

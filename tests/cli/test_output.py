@@ -191,7 +191,7 @@ def test_what_an_option_says_is_one_paragraph(
     assert cli.main(["ingest", "--help"]) == 0
     text = capsys.readouterr().out
     lines = text[text.index("--repeated") : text.index("--tag KEY")].splitlines()
-    paragraph = [told for line in lines if (told := line.strip("│ "))]
+    paragraph = [reported for line in lines if (reported := line.strip("│ "))]
     assert len(paragraph) > 2
     assert all(len(line) > 70 for line in paragraph[1:-1]), paragraph
     assert cli.main(["eval", "--help"]) == 0
@@ -206,11 +206,11 @@ def test_a_long_recording_shows_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """On stderr, if that is a terminal: what is read of a recording, and of how much."""
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
     original = output.Advance.part
 
     def part(self: output.Advance, *how_far: Any) -> None:
-        told.append(how_far)
+        reported.append(how_far)
         original(self, *how_far)
 
     monkeypatch.setattr(output.Advance, "part", part)
@@ -220,7 +220,7 @@ def test_a_long_recording_shows_how_far_it_is(
     out = capsys.readouterr().out
     assert json.loads(out)["recordings"][0]["status"] == "dry run"
     by_stage = {}
-    for doing, done, whole in told:
+    for doing, done, whole in reported:
         by_stage.setdefault(doing, []).append((done, whole))
     assert by_stage.keys() == {
         "checking content, bytes",

@@ -305,21 +305,23 @@ def test_its_charts_are_drawn_again_by_vega_with_what_the_pointer_asks(html: str
         for spec in specs
         if '"environment steps"' in json.dumps(spec) and '"kept"' in json.dumps(spec["datasets"])
     )
-    told = learnt["layer"][-1]["encoding"]["tooltip"]
-    assert [one["title"] for one in told] == ["environment steps", "success"]
+    reported = learnt["layer"][-1]["encoding"]["tooltip"]
+    assert [one["title"] for one in reported] == ["environment steps", "success"]
     success = next(spec for spec in specs if "facet" in spec and '"low"' in json.dumps(spec))
     (bars, _) = success["spec"]["layer"]
     assert bars["params"][0]["bind"] == "legend"
-    told = bars["encoding"]["tooltip"]
-    assert [one["title"] for one in told][-3:] == ["success", "95 %, low", "95 %, high"]
-    assert told[-1]["format"] == ".1~%"
+    reported = bars["encoding"]["tooltip"]
+    assert [one["title"] for one in reported][-3:] == ["success", "95 %, low", "95 %, high"]
+    assert reported[-1]["format"] == ".1~%"
     assert "alert(1)" in text  # a hostile name is text there, too
 
 
 def test_a_policy_has_one_colour_in_all_charts(html: str) -> None:
     scales = re.findall(r'"scale":({"domain":\[[^]]*\],"range":\[[^]]*\]})', html)
-    told = [dict(zip(one["domain"], one["range"], strict=True)) for one in map(json.loads, scales)]
-    planner = [colours["planner"] for colours in told if "planner" in colours]
+    reported = [
+        dict(zip(one["domain"], one["range"], strict=True)) for one in map(json.loads, scales)
+    ]
+    planner = [colours["planner"] for colours in reported if "planner" in colours]
     assert len(planner) >= 4  # success and behaviour, each at several widths
     assert set(planner) == {POLICY_COLOURS["planner"]}
 

@@ -242,17 +242,17 @@ def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: 
         for name in ("shelves", "weeks")
         for figure in sections[name].figures
     )
-    told: dict[str, set[str]] = {}
+    reported: dict[str, set[str]] = {}
     for one in re.findall(r'"scale": ({"domain": \[[^]]*\], "range": \[[^]]*\]})', text):
         scale = json.loads(one)
         for name, colour in zip(scale["domain"], scale["range"], strict=True):
-            told.setdefault(name, set()).add(colour)
+            reported.setdefault(name, set()).add(colour)
     swatches = r'background:(#\w+)"></span>([^<]*)<'
     for colour, name in re.findall(swatches, str(sections["map"].figures[1].caption)):
-        told[name].add(colour)
-    assert len(told) >= 4
-    assert all(len(colours) == 1 for colours in told.values())
-    assert len(set.union(*told.values())) == len(told)  # and nobody else's
+        reported[name].add(colour)
+    assert len(reported) >= 4
+    assert all(len(colours) == 1 for colours in reported.values())
+    assert len(set.union(*reported.values())) == len(reported)  # and nobody else's
 
 
 @pytest.mark.parametrize("unit", ["missions", "hours"])

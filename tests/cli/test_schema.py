@@ -46,10 +46,12 @@ def kind_of(path: str, document: dict[str, Any]) -> str | None:
 
 
 def shipped() -> list[tuple[str, str]]:
-    told = subprocess.run(
+    reported = subprocess.run(
         ["git", "ls-files", "*.toml"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.split()
-    files = told or [str(p.relative_to(ROOT)) for p in (ROOT / "replay").rglob("mixtures/*.toml")]
+    files = reported or [
+        str(p.relative_to(ROOT)) for p in (ROOT / "replay").rglob("mixtures/*.toml")
+    ]
     found = [(path, kind_of(path, tomllib.loads((ROOT / path).read_text()))) for path in files]
     return [(path, kind) for path, kind in found if kind is not None]
 

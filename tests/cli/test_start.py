@@ -326,8 +326,8 @@ def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
         | {"estimator": name, "value": value, "refused": None if value else few}
         for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None), ("wdr", None))
     ]
-    told, refused = outcomes.on_logs({"results": rows, "notes": []})
-    assert told.startswith(
+    reported, refused = outcomes.on_logs({"results": rows, "notes": []})
+    assert reported.startswith(
         "return of 1 held-out episode: as the logs were driven -1.05 (no interval), "
     )
     assert refused.startswith(f"refused: {few}. So it is not known whether the policy is better")
@@ -338,9 +338,9 @@ def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> Non
     profile = tmp_path / "profile.toml"
     robot = '[robot]\ndrive = "differential"\ntrack_m = 0.4\n[robot.origin]\ntrack_m = "urdf"\n'
     profile.write_text(f"{WAREHOUSE}\n{robot}")
-    told = robot_line(profile)
-    assert "track 0.4 m (from urdf)" in told
-    assert "wheel radius, mass guessed from its outline" in told
+    reported = robot_line(profile)
+    assert "track 0.4 m (from urdf)" in reported
+    assert "wheel radius, mass guessed from its outline" in reported
 
 
 def test_several_topics_of_commands_are_for_a_person_to_choose_from(

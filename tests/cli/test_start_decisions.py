@@ -105,12 +105,12 @@ def test_a_profile_that_the_node_refuses_is_told_with_the_policy(tmp_path: Path)
     ):
         file.write_text(text)
         profile = load_profile(str(file))
-        told = node_refuses(file)
+        reported = node_refuses(file)
         if not needs:
-            assert told is None
+            assert reported is None
             LiveObserver(profile)
             continue
-        assert told is not None
-        assert all(each in told for each in needs)
+        assert reported is not None
+        assert all(each in reported for each in needs)
         with pytest.raises(ConfigError):
             LiveObserver(profile)

@@ -109,9 +109,9 @@ def test_verify_lists_what_is_damaged(store: Path, capsys: pytest.CaptureFixture
     flip(file, 1000)
     gone.unlink()
     assert cli.main(["store", "verify", str(store), "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["files"] == 2
-    assert [one["file"] for one in told["damaged"]] == [
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["files"] == 2
+    assert [one["file"] for one in reported["damaged"]] == [
         str(one.relative_to(store)) for one in (file, gone)
     ]
 
@@ -128,9 +128,9 @@ def test_a_file_is_read_once_while_its_size_and_time_are_the_same(store: Path) -
         assert opened.unverified() == 2
         opened.verify()
         assert opened.unverified() == 0
-        told = file.stat()
+        reported = file.stat()
         flip(file, 1000)
-        os.utime(file, ns=(told.st_atime_ns, told.st_mtime_ns))
+        os.utime(file, ns=(reported.st_atime_ns, reported.st_mtime_ns))
         opened.verify()  # remembered, as the file seems unchanged
         assert len(verify_store(store).damaged) == 1  # which reads every file
         assert opened.unverified() == 1

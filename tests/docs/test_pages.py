@@ -42,7 +42,12 @@ PARTS = {  # (page, number of its folder) -> the blocks that run there, one afte
 }
 PARTS_RUN = [p for p in PARTS if p[0] not in NOTEBOOKS and any(b.is_run for b in PARTS[p])]
 PARTS_SLOW = [part for part in PARTS if any("slow" in block.marks for block in PARTS[part])]
-TOML = [b for told in ALL.values() for b in told if b.language == "toml" and "file" not in b.marks]
+TOML = [
+    b
+    for reported in ALL.values()
+    for b in reported
+    if b.language == "toml" and "file" not in b.marks
+]
 
 
 def name(page: Path) -> str:
@@ -120,12 +125,14 @@ def test_blocks_are_fenced_and_name_their_language(page: Path) -> None:
 
 def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
     """Each needs what no test has. A new one is counted here, so that it is seen in review."""
-    told = [block for page in PAGES for block in blocks(page) if block.language in RUN]
-    left_out = {block.place: block.marks["not run"] for block in told if "not run" in block.marks}
+    reported = [block for page in PAGES for block in blocks(page) if block.language in RUN]
+    left_out = {
+        block.place: block.marks["not run"] for block in reported if "not run" in block.marks
+    }
     print("\n".join(f"{place}: {reason}" for place, reason in left_out.items()))  # noqa: T201
     assert all(len(reason.split()) >= 2 for reason in left_out.values()), left_out
     assert len(left_out) <= 30
-    assert len(told) > 5 * len(left_out)
+    assert len(reported) > 5 * len(left_out)
 
 
 def check_mixture(block: Block, folder: Path) -> None:

@@ -148,7 +148,7 @@ def test_only_a_scan_can_be_upside_down() -> None:
         (', angle_max_rad = "angle_max", angle_increment_rad = "b"', "angle_max_rad beside"),
     ],
 )
-def test_a_scan_has_an_increment_or_a_last_angle(last: str, told: str) -> None:
+def test_a_scan_has_an_increment_or_a_last_angle(last: str, reported: str) -> None:
     text = WAREHOUSE.replace(', angle_increment_rad = "angle_increment"', last)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=reported):
         parse_profile(text, where="p")

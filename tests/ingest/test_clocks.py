@@ -71,9 +71,9 @@ def test_counts_are_those_of_python(stamps, offset):
     logs = [stamp + offset for stamp in stamps]
     found = topic_clock("/t", topic(stamps, logs), 1.0)
     assert found.backsteps == sum(b < a for a, b in itertools.pairwise(stamps))
-    told = [stamp for stamp in stamps if stamp]
-    assert found.duplicates == len(told) - len(set(told))
-    assert found.zero_stamps == len(stamps) - len(told)
+    reported = [stamp for stamp in stamps if stamp]
+    assert found.duplicates == len(reported) - len(set(reported))
+    assert found.zero_stamps == len(stamps) - len(reported)
 
 
 class Odd(Drive):

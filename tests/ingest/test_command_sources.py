@@ -164,11 +164,11 @@ def smoothed(limit: float = 1.0, *, mux: bool = True) -> dict[str, tuple[str, To
     """
     topics = taken_over()
     chosen = topics.pop(OUT)[1]
-    told = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
+    reported = np.stack([chosen.fields["linear.x"], chosen.fields["angular.z"]], axis=1)
     told_s = (chosen.log_time_ns - START_NS) * 1e-9
     out_s, now, out = np.arange(0.1, 12, 0.05) + 0.013, np.zeros(2), []
     for at in out_s:
-        target = told[np.searchsorted(told_s, at, "right") - 1]
+        target = reported[np.searchsorted(told_s, at, "right") - 1]
         now = now + np.clip(target - now, -STEP, STEP)
         out.append(now * (limit if 9 < at < 10 else 1.0))
     topics[OUT] = (TWIST, twists(out_s, *np.transpose(out)))

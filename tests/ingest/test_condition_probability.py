@@ -148,8 +148,10 @@ def test_rows_from_before_there_were_probabilities_get_them_when_labelled_again(
     relabel_store(StoreWriter(tmp_path / "s"), lambda name: conditions)
     with Store(tmp_path / "s") as store:
         assert store.sql(query).fetchall() == [(len(rows), len(rows), len(rows))]
-        ((told,),) = store.sql("SELECT map_keys(probabilities) FROM transitions LIMIT 1").fetchall()
-        assert set(told) <= set(shipped())
+        ((reported,),) = store.sql(
+            "SELECT map_keys(probabilities) FROM transitions LIMIT 1"
+        ).fetchall()
+        assert set(reported) <= set(shipped())
 
 
 OWN = '''

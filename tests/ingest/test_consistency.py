@@ -56,14 +56,14 @@ def poses(time_s: Any) -> tuple[Any, Any, Any]:
 def winding() -> Topics:
     """What it records, all clocks right."""
     fast, tenth = np.arange(0, DURATION_S, 0.05), np.arange(0, DURATION_S, 0.1)
-    (speed, rate), (asked, turned) = motion(fast), motion(tenth)
+    (speed, rate), (requested, turned) = motion(fast), motion(tenth)
     x, y, yaw = poses(fast)
     odom = {"pose.pose.position.x": x, "pose.pose.position.y": y}
     odom |= {"pose.pose.orientation.z": np.sin(yaw / 2), "pose.pose.orientation.w": np.cos(yaw / 2)}
     odom |= {"twist.twist.linear.x": speed, "twist.twist.angular.z": rate}
     imu = {"angular_velocity.z": rate, "linear_acceleration.x": np.gradient(speed, fast)}
     return {
-        "/cmd_vel": columns(tenth, {"twist.linear.x": asked, "twist.angular.z": turned}),
+        "/cmd_vel": columns(tenth, {"twist.linear.x": requested, "twist.angular.z": turned}),
         "/odom": columns(fast, odom),
         "/imu": columns(fast, imu),
         "/scan": columns(tenth, scans(np.full((len(tenth), BEAMS), FREE_M)) | _ranges(len(tenth))),
@@ -168,10 +168,10 @@ def test_a_topic_of_another_clock_counts_from_its_reception(profile, tmp_path, t
     assert f"{abs(ahead_s):.2f} s {'ahead of' if ahead_s > 0 else 'behind'}" in str(found[0])
     # The command of each step is the one in force where its pose was measured.
     time_s = _times(steps)
-    asked, turned = motion(np.floor(time_s / 0.1 + 1e-3) * 0.1)
+    requested, turned = motion(np.floor(time_s / 0.1 + 1e-3) * 0.1)
     known = np.abs(steps["command_speed_mps"]) > 0
     assert known.mean() > 0.95
-    off = np.abs(steps["command_speed_mps"] - asked) + np.abs(
+    off = np.abs(steps["command_speed_mps"] - requested) + np.abs(
         steps["command_yaw_rate_radps"] - turned
     )
     assert np.percentile(off[known], 95) < 0.08  # a step of .1 s changes them by less
@@ -332,11 +332,11 @@ def test_a_clock_that_is_repaired_does_not_hide_the_localisers_noise(tmp_path):
     path = "pose.pose.position.x"
     x = np.asarray(pose.fields[path])
     noisy["/odom"] = replace(pose, fields=pose.fields | {path: x + rng.normal(0, 0.04, len(x))})
-    told = []
+    reported = []
     for number, topics in enumerate((noisy, shifted(noisy, "/cmd_vel", 0.4))):
         bag = written(topics, tmp_path / str(number))
         with open_recording(bag) as recording:
             proposal = propose_profile(recording, "r", hindsight_goals=True)
-        told.append([line for line in proposal.toml.splitlines() if "localiser_m" in line])
+        reported.append([line for line in proposal.toml.splitlines() if "localiser_m" in line])
         assert [one.repaired for one in proposal.findings] == [True] * number
-    assert told[0] == told[1] != []
+    assert reported[0] == reported[1] != []

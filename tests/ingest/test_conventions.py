@@ -63,11 +63,11 @@ def test_an_imu_without_a_gyro_is_no_gyro(tmp_path: Path) -> None:
     steps = steps_in(drive(angular_velocity=slice(None)), tmp_path)
     assert steps.signals["gyro_yaw_rate_radps"] == pytest.approx(TURN_RADPS)
     assert steps.signals["accel_x_mps2"] == pytest.approx(0.3)
-    told = (
+    reported = (
         "imu: 300 of 300 messages of /imu have no estimate of angular_velocity "
         "(angular_velocity_covariance[0] is -1): gyro yaw rate taken from the wheels"
     )
-    assert told in steps.notes
+    assert reported in steps.notes
     assert set(steps.problem) == {""}
     result = ingest(tmp_path / "bag", load_profile("warehouse_amr"), store=None)
     stand_ins = {item["input"]: item["instead"] for item in result.manifest["stand_ins"]}
@@ -190,8 +190,8 @@ def test_a_scan_of_a_wall_that_is_too_close_is_near(tmp_path: Path) -> None:
     assert near == pytest.approx(expected)
     assert (near == 0).sum() == pytest.approx(10, abs=1)
     assert reported.problem.count("scan: no beam has a valid range") == 1
-    told = "scan: 21 of 60 messages of /scan have beams of -inf, too close to be measured"
-    assert any(note.startswith(told) for note in reported.notes)
+    expected_note = "scan: 21 of 60 messages of /scan have beams of -inf, too close to be measured"
+    assert any(note.startswith(expected_note) for note in reported.notes)
     assert not any("-inf" in note for note in measured.notes)
 
 
@@ -235,8 +235,8 @@ def test_a_proposal_takes_no_gyro_that_measures_nothing(
     out = tmp_path / "p.toml"
     assert main(["profile", "new", str(bag), "--out", str(out)]) == 0
     said = capsys.readouterr().err
-    told = "all 300 messages of /imu have no estimate of angular_velocity"
-    assert told in said
+    reported = "all 300 messages of /imu have no estimate of angular_velocity"
+    assert reported in said
     text = out.read_text()
-    assert told in text
+    assert reported in text
     assert parse_profile(text, where="p").inputs.imu is None

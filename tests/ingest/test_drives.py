@@ -46,8 +46,8 @@ class Told(Drive):
         found = super().topics()
         ticks = np.arange(0, self.duration_s, self.every_s)
         turned = np.zeros(len(ticks))
-        told = {"linear.x": np.full(len(ticks), self.speed_mps), "angular.z": turned}
-        found["/cmd_vel"] = columns(ticks + 0.005, told, stamped=False)
+        reported = {"linear.x": np.full(len(ticks), self.speed_mps), "angular.z": turned}
+        found["/cmd_vel"] = columns(ticks + 0.005, reported, stamped=False)
         tenth = np.arange(0, self.duration_s, 0.1)
         found["/scan"] = columns(tenth, scans(np.full((len(tenth), self.beams), FREE_M)))
         for topic in ("/goal_pose", "/plan", "/bumper"):
@@ -102,9 +102,9 @@ def test_one_recording_is_proposed_as_before(tmp_path, capsys):
     assert texts[0].replace('name = "one"', 'name = "bags"') == texts[1]
 
 
-def traits(**told) -> RobotTraits:
+def traits(**reported) -> RobotTraits:
     empty = RobotTraits("", "", None, "", "", frozenset(), frozenset())
-    return replace(empty, **told)
+    return replace(empty, **reported)
 
 
 LIDAR = Lidar("laser", 360, 12.0, simulated=False)
@@ -142,11 +142,11 @@ def test_every_recording_is_of_a_kind_and_the_largest_of_one_are_read(tmp_path: 
     its rows were mixed with the others'."""
     mine = traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR)
     other = replace(mine, lidar=replace(LIDAR, beams=720))
-    told = [*(mine for _ in range(14)), other, replace(mine, command="")]
-    paths = [tmp_path / f"{number}.mcap" for number in range(len(told))]
+    reported = [*(mine for _ in range(14)), other, replace(mine, command="")]
+    paths = [tmp_path / f"{number}.mcap" for number in range(len(reported))]
     for number, path in enumerate(paths):
         path.write_bytes(bytes(100 + number))
-    found = drives_by_kind(paths, told)
+    found = drives_by_kind(paths, reported)
     assert [len(kind.recordings) for kind in found.robots] == [15, 1]
     assert found.others == [(paths[14], other)]
     # The smallest two are not read, nor is the largest, which has no command.
@@ -175,8 +175,8 @@ def test_what_was_read_and_what_not_is_told(tmp_path, capsys, monkeypatch):
         [bags["a"], bags["b"], bags["c"]],
         [bags["other"]],
     ]
-    told = "read the 2 largest of 3 recordings of that kind of robot; not read: bags/b\n"
-    assert told in printed.err
+    reported = "read the 2 largest of 3 recordings of that kind of robot; not read: bags/b\n"
+    assert reported in printed.err
     header = file.read_text()
     assert "# For the 2 largest of 3 drives of one kind of robot" in header
     assert "# NOT READ, of that kind: bags/b\n" in header
@@ -206,8 +206,8 @@ def test_a_drive_that_gives_no_rows_is_no_base(tmp_path, capsys):
     # Ticks are .2 s apart; the goal's radius is reached a little before its place.
     assert 79 + 74 - 4 <= said["transitions"] <= 79 + 74
     assert "#   bags/idle: 0  (no transition" in file.read_text()
-    told = "1 of 3 recordings give no transition: bags/idle; "
-    assert any(told in each["text"] for each in said["advice"])
+    reported = "1 of 3 recordings give no transition: bags/idle; "
+    assert any(reported in each["text"] for each in said["advice"])
     # And the whole way goes on with the others.
     assert main(["start", *words, str(out), "--accept", *up_to_the_panel(tmp_path)]) != 0
     printed = capsys.readouterr()

@@ -81,8 +81,8 @@ def test_a_car_is_read_by_its_steering_angle(tmp_path, capsys):
             {"/vesc/high_level/ackermann_cmd": ["drive.speed", "drive.steering_angle"]}
         )["/vesc/high_level/ackermann_cmd"]
     steps = steps_of(profile, topics)
-    told = zip(raw.fields["drive.speed"], raw.fields["drive.steering_angle"], strict=True)
-    rates = {round(float(v) * math.tan(d) / command.wheelbase_m, 4) for v, d in told}
+    reported = zip(raw.fields["drive.speed"], raw.fields["drive.steering_angle"], strict=True)
+    rates = {round(float(v) * math.tan(d) / command.wheelbase_m, 4) for v, d in reported}
     found = set(np.round(steps.signals["command_yaw_rate_radps"], 4).tolist())
     assert found <= rates | {0.0}
     assert len(found) > 2

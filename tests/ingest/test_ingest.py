@@ -132,10 +132,10 @@ def test_a_recording_that_the_store_cannot_take_is_named(bag, tmp_path, run, mon
 
     monkeypatch.setattr(StoreWriter, "transact", full)
     code, said, err = run(bag, "--store", tmp_path / "s")
-    told = f"{bag}: was not added: {tmp_path / 's'}: cannot be written: there is no space left"
+    reported = f"{bag}: was not added: {tmp_path / 's'}: cannot be written: there is no space left"
     assert code == 2
-    assert told in err
-    assert told in said["recordings"][0]["error"]
+    assert reported in err
+    assert reported in said["recordings"][0]["error"]
 
 
 def test_two_workers_make_the_same_store_as_one(tmp_path, run):
@@ -299,7 +299,7 @@ def test_the_sample_log_is_labelled_about_as_well_as_the_page_says(run):
     for name, score in scores.items():
         found = re.search(rf"^\| `{name}` \| default \| ([.\d]+) / ([.\d]+) \|", page, re.M)
         assert found, name
-        told = [float(value) for value in found.groups()]
-        assert told == pytest.approx([score["precision"], score["recall"]], abs=0.1), (
+        reported = [float(value) for value in found.groups()]
+        assert reported == pytest.approx([score["precision"], score["recall"]], abs=0.1), (
             f"docs/ingest.md should say {score}"
         )

@@ -428,7 +428,7 @@ def test_one_lidar_beside_the_middle_has_its_place(
         (two_lidars().replace(f"= {REAR[2]}", "= -135.0"), "lidar_yaw_rad"),
     ],
 )
-def test_lidars_that_do_not_go_together_are_refused(text: str, told: str) -> None:
+def test_lidars_that_do_not_go_together_are_refused(text: str, reported: str) -> None:
     with pytest.raises(ConfigError) as refused:
         parse_profile(text, where="p")
-    assert told in str(refused.value)
+    assert reported in str(refused.value)

@@ -51,8 +51,8 @@ def drive(pace: float, seed: int = 0) -> tuple[Ints, Ints, Ints]:
 
 @pytest.mark.parametrize("pace", [0.3, 0.8, 0.97, 1.1])
 def test_a_drifting_clock_is_followed_as_ingest_maps_it(pace: float) -> None:
-    log, stamp, asked = drive(pace)
-    apart = of_live(log, stamp, asked) - of_ingest(log, stamp, asked)
+    log, stamp, requested = drive(pace)
+    apart = of_live(log, stamp, requested) - of_ingest(log, stamp, requested)
     # Until the drift has become as much as ingest tolerates, a median is taken.
     assert np.abs(apart).max() < 100_000_000
     assert abs(np.median(apart)) < 10_000_000
@@ -61,16 +61,16 @@ def test_a_drifting_clock_is_followed_as_ingest_maps_it(pace: float) -> None:
 def test_a_constant_offset_is_that_of_ingest() -> None:
     log, stamp, _ = drive(1.0)
     log, stamp = log[:200], stamp[:200]  # as many as the median is of
-    asked = log[-1:] + 1000
-    np.testing.assert_array_equal(of_live(log, stamp, asked), of_ingest(log, stamp, asked))
+    requested = log[-1:] + 1000
+    np.testing.assert_array_equal(of_live(log, stamp, requested), of_ingest(log, stamp, requested))
 
 
 @pytest.mark.parametrize("pace", [0.8, 1.0])
 def test_single_bad_stamps_move_nothing_and_those_off_the_clock_are_refused(pace: float) -> None:
-    log, stamp, asked = drive(pace)
+    log, stamp, requested = drive(pace)
     bad = stamp.copy()
     bad[100::50] += 700_000_000  # less than a jump
-    apart = of_live(log, bad, asked) - of_live(log, stamp, asked)
+    apart = of_live(log, bad, requested) - of_live(log, stamp, requested)
     assert np.abs(apart).max() < 20_000_000
     clock = LiveClock(NS)
     for one_log, one_stamp in zip(log.tolist(), stamp.tolist(), strict=True):
@@ -105,7 +105,7 @@ def test_a_slow_simulation_of_strangers_is_followed() -> None:
     log = np.array([at for at, _ in rows], np.int64)
     read = [types.deserialize_cdr(data, "nav_msgs/msg/Odometry").header.stamp for _, data in rows]
     stamp = np.array([s.sec * NS + s.nanosec for s in read], np.int64)
-    asked = np.arange(log[0] + WARM_UP_NS, log[-1], NS // 5)
-    apart = np.abs(of_live(log, stamp, asked) - of_ingest(log, stamp, asked))
+    requested = np.arange(log[0] + WARM_UP_NS, log[-1], NS // 5)
+    apart = np.abs(of_live(log, stamp, requested) - of_ingest(log, stamp, requested))
     assert np.percentile(apart, 95) < 100_000_000  # half a control period, which ingest tolerates
     assert apart.max() < 200_000_000

@@ -183,8 +183,8 @@ def test_a_summary_is_made_some_episodes_at_a_time(
     steps: Steps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table, _ = recording_table(PROFILE, steps, split(PROFILE.task, steps), PROVENANCE)
-    told = manifest(table, task=PROFILE.task)
-    whole = summary.summarised(told, table)
+    reported = manifest(table, task=PROFILE.task)
+    whole = summary.summarised(reported, table)
     looked_at: list[int] = []
 
     def seen(rows: pa.Table) -> pa.Table:
@@ -194,10 +194,10 @@ def test_a_summary_is_made_some_episodes_at_a_time(
     unchunked = summary._unchunked
     monkeypatch.setattr(summary, "_unchunked", seen)
     monkeypatch.setattr(summary, "STRETCH_ROWS", 40)
-    assert summary.summarised(told, table).equals(whole)
+    assert summary.summarised(reported, table).equals(whole)
     assert len(looked_at) > 2
     assert sum(looked_at) == len(table)
     looked_at.clear()
     apart = table.take(np.argsort(table["step_index"].to_numpy(), kind="stable"))
-    summary.summarised(told, apart)
+    summary.summarised(reported, apart)
     assert looked_at == [len(table)]  # rows of an episode that do not lie together stay in one

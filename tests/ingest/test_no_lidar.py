@@ -28,7 +28,7 @@ from restock.ingest.store.commits import delta_columns, recording_columns
 from restock.ingest.store.location import RECORDINGS, TRANSITIONS
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import shipped
-from restock.ingest.task.conditions import told, unseen
+from restock.ingest.task.conditions import reported, unseen
 from restock.ingest.task.limiter import NONE, SPEED, Limits, limit
 from restock.ingest.task.schema import transition_schema
 from restock.ingest.task.signals import LIDAR_SIGNALS, STORED_SIGNALS
@@ -176,14 +176,14 @@ def test_nothing_is_counted_of_what_no_row_tells(blind):
         held = dict(store.sql("SELECT condition, rows_held FROM coverage_by_condition").fetchall())
         cells = store.sql("SELECT condition, action, rows_held FROM coverage").fetchall()
         missing = store.sql("SELECT DISTINCT condition FROM missing_cells").fetchall()
-        met = dict(store.sql("SELECT exposure, rows FROM coverage_by_exposure").fetchall())
+        observed = dict(store.sql("SELECT exposure, rows FROM coverage_by_exposure").fetchall())
         findings = run_audits(store.connection, shipped_audits(), load_thresholds())
     outcomes = {"blocked_aisle", "near_collision", "recovery"}
     assert {name for name, rows in held.items() if rows is None} == outcomes
     assert {line for line in cells if line[2] is None} == {(one, None, None) for one in outcomes}
     assert ("wheel_slip",) in missing
     assert not {(name,) for name in outcomes} & set(missing)
-    assert {name for name, rows in met.items() if rows is None} == set(NEEDS_ONE) - outcomes
+    assert {name for name, rows in observed.items() if rows is None} == set(NEEDS_ONE) - outcomes
     found = {finding.audit.name: finding for finding in findings}
     assert found["unknown_conditions"].status == "warn"
     assert {line["condition"] for line in found["unknown_conditions"].sample} <= set(NEEDS_ONE)
@@ -244,8 +244,8 @@ def test_labels_made_again_stay_unknown(drives, tmp_path):
 def test_every_shipped_condition_that_names_a_lidar_signal_is_found():
     every = [*shipped().values(), *shipped(kind="exposure").values()]
     assert sorted(unseen(every)) == NEEDS_ONE
-    assert [one.name for one in told(every, lidar=False)] == ["wheel_slip", "slippery_floor"]
-    assert told(every, lidar=True) == every
+    assert [one.name for one in reported(every, lidar=False)] == ["wheel_slip", "slippery_floor"]
+    assert reported(every, lidar=True) == every
 
 
 def test_the_limiter_of_a_robot_that_sees_nothing_keeps_its_speed_alone():

@@ -47,11 +47,11 @@ def arm() -> dict[str, tuple[str, TopicColumns]]:
 def servoed(**speeds: object) -> dict[str, tuple[str, TopicColumns]]:
     """As MoveIt Servo drives an arm: twists of its tool, which is located in the base's frame."""
     at = pose("pose", 0.4 + 0.1 * np.sin(SECONDS), 0.1) | {"pose.position.z": 0.5 + 0 * SECONDS}
-    told = {"twist.linear.x": 0.1 * np.sin(SECONDS)}
-    told |= {f"twist.{path}": value + 0 * SECONDS for path, value in speeds.items()}
+    reported = {"twist.linear.x": 0.1 * np.sin(SECONDS)}
+    reported |= {f"twist.{path}": value + 0 * SECONDS for path, value in speeds.items()}
     return {
         "/joint_states": ("sensor_msgs/msg/JointState", columns(SECONDS, {})),
-        "/servo/twists": ("geometry_msgs/msg/TwistStamped", columns(SECONDS, told)),
+        "/servo/twists": ("geometry_msgs/msg/TwistStamped", columns(SECONDS, reported)),
         "/tool_pose": ("geometry_msgs/msg/PoseStamped", columns(SECONDS, at)),
     }
 
@@ -115,8 +115,8 @@ def test_the_base_below_an_arm_is_what_drives(tmp_path, capsys):
     """Its commands are far fewer than the arm's, and their topic's name tells nothing."""
     topics = servoed(**{"linear.z": 0.05, "angular.y": 0.1})
     seldom = SECONDS[::4]
-    told = {"twist.linear.x": 0.1 * np.sin(seldom), "twist.angular.z": 0.2 * np.cos(seldom)}
-    topics["/wheels/speeds"] = ("geometry_msgs/msg/TwistStamped", columns(seldom, told))
+    reported = {"twist.linear.x": 0.1 * np.sin(seldom), "twist.angular.z": 0.2 * np.cos(seldom)}
+    topics["/wheels/speeds"] = ("geometry_msgs/msg/TwistStamped", columns(seldom, reported))
     bag = write_topics(topics, tmp_path / "bag")
     assert main(["profile", "new", str(bag), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)

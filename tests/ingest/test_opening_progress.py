@@ -26,12 +26,12 @@ def test_messages_without_statistics_are_counted_before_the_eyes(tmp_path: Path)
     for number in range(200):
         writer.add_message(channel, number, b"\x00\x01\x00\x00\x01", number)
     writer.finish()
-    told: list[tuple[str, int, int]] = []
-    with open_recording(path, watch=lambda *how: told.append(how)) as recording:
+    reported: list[tuple[str, int, int]] = []
+    with open_recording(path, watch=lambda *how: reported.append(how)) as recording:
         assert recording.topics["/bumper"].expected == 200
-    counting = [(done, whole) for doing, done, whole in told if doing.startswith("counting")]
+    counting = [(done, whole) for doing, done, whole in reported if doing.startswith("counting")]
     assert len(counting) > 3
     assert counting == [(done, len(counting)) for done in range(len(counting))]
     assert ("looking through the file, bytes", path.stat().st_size) in {
-        (doing, whole) for doing, _, whole in told
+        (doing, whole) for doing, _, whole in reported
     }

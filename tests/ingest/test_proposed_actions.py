@@ -39,8 +39,8 @@ class Shuttle(Drive):
         found = super().topics()
         for topic in ("/goal_pose", "/plan"):
             del found[topic]
-        told = {"linear.x": speed_at(ticks), "angular.z": 0 * ticks}
-        found["/cmd_vel"] = columns(ticks + 0.005, told, stamped=False)
+        reported = {"linear.x": speed_at(ticks), "angular.z": 0 * ticks}
+        found["/cmd_vel"] = columns(ticks + 0.005, reported, stamped=False)
         moved = {"twist.twist.linear.x": speed_at(fast - 0.005), "twist.twist.angular.z": 0 * fast}
         found["/odom"] = columns(fast, moved)
         x_m = 1.0 + np.cumsum(speed_at(fast)) * 0.02
@@ -53,7 +53,7 @@ def reverse(actions: Any) -> list[tuple[float, float]]:
     return [(speed, turn) for speed, turn in actions if speed < 0]
 
 
-def told(speeds: Any, turns: Any = 0.0) -> Commands:
+def reported(speeds: Any, turns: Any = 0.0) -> Commands:
     speeds = np.asarray(speeds, np.float64)
     return Commands().fastest(speeds, np.broadcast_to(turns, speeds.shape))
 
@@ -74,19 +74,19 @@ def test_a_robot_backs_up_as_fast_as_its_logs(ahead_mps, back_mps, tmp_path):
 
 
 def test_without_reverse_commands_there_is_no_reverse_action():
-    assert reverse(actions_of(told([0.0, 0.2, 0.5]), RobotProposal())) == []
+    assert reverse(actions_of(reported([0.0, 0.2, 0.5]), RobotProposal())) == []
 
 
 def test_an_outlier_is_no_reverse_speed():
     """Neither faster than all usual commands, nor by one of hundreds."""
     once = [*[0.5] * 400, *[-0.2] * 200, -0.5]
-    assert reverse(actions_of(told(once), RobotProposal())) == [(-0.2, 0.0)]
+    assert reverse(actions_of(reported(once), RobotProposal())) == [(-0.2, 0.0)]
     beyond = [*[0.5] * 400, -3.0]
-    assert reverse(actions_of(told(beyond), RobotProposal())) == [(-0.5, 0.0)]
+    assert reverse(actions_of(reported(beyond), RobotProposal())) == [(-0.5, 0.0)]
 
 
 def test_what_the_robot_did_not_reach_is_no_reverse_speed_either():
-    limited = told([*[0.5] * 9, *[-0.5] * 9]).limited(0.3, None)
+    limited = reported([*[0.5] * 9, *[-0.5] * 9]).limited(0.3, None)
     assert reverse(actions_of(limited, RobotProposal())) == [(-0.3, 0.0)]
 
 
@@ -95,18 +95,18 @@ def test_what_the_robot_did_not_reach_is_no_reverse_speed_either():
 def test_reverse_at_many_speeds_is_near_an_action(slowest, fastest):
     back = np.linspace(min(slowest, fastest), fastest, 200)
     speeds = np.concatenate([np.ones(300), -back])
-    actions = actions_of(told(speeds), RobotProposal())
+    actions = actions_of(reported(speeds), RobotProposal())
     task = Task(body=Body(0.6, 0.5), actions=tuple(actions))
     assert nearest_action(task, speeds, 0 * speeds)[1].max() <= FAR
 
 
 def test_a_car_backs_up_and_turns_as_fast_as_its_logs():
     car = RobotProposal(values={"drive": "ackermann", "wheelbase_m": 0.4, "max_steering_rad": 0.5})
-    commands = told([*[1.0] * 50, *[-0.8] * 50], 0.5)
+    commands = reported([*[1.0] * 50, *[-0.8] * 50], 0.5)
     backs = reverse(actions_of(commands, car))
     assert {speed for speed, _ in backs} == {-0.8}
     assert sorted(np.sign(turn) for _, turn in backs) == [-1, 0, 1]
-    assert reverse(actions_of(told([1.0, 0.5], 0.5), car)) == []
+    assert reverse(actions_of(reported([1.0, 0.5], 0.5), car)) == []
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/bags is absent")

@@ -99,12 +99,12 @@ def test_a_hold_is_read_from_how_long_the_robot_drives_on(tmp_path, capsys):
     assert said["outcome"]["transitions"] == promised > 3 * before
 
 
-def driven(until_s: float, told: list[tuple[float, float]]) -> CommandHold:
+def driven(until_s: float, reported: list[tuple[float, float]]) -> CommandHold:
     """What is read of commands (time, speed) to a robot that goes .5 m/s until then, and stands."""
     at = np.arange(0, 30, 0.05)
     x = 0.5 * np.minimum(at, until_s)
     poses = PoseSeries((at * NS).astype(np.int64), x, np.zeros(len(at)), np.zeros(len(at)))
-    times, speeds = (np.array(column) for column in zip(*told, strict=True))
+    times, speeds = (np.array(column) for column in zip(*reported, strict=True))
     return command_hold(times, speeds, np.zeros(len(times)), poses)
 
 
@@ -125,9 +125,9 @@ def test_a_robot_that_is_moved_later_by_hand_did_not_drive_on():
 
 
 def test_a_command_to_stop_holds_if_the_robot_stands():
-    told = [(0.1 * i, 0.5) for i in range(101)] + [(10.1, 0.0)]
-    assert driven(10.2, told).stops_hold
-    assert not driven(25.0, told).stops_hold  # somebody else drives it
+    reported = [(0.1 * i, 0.5) for i in range(101)] + [(10.1, 0.0)]
+    assert driven(10.2, reported).stops_hold
+    assert not driven(25.0, reported).stops_hold  # somebody else drives it
 
 
 def test_an_outline_that_the_lidar_contradicts_is_said(tmp_path, capsys):

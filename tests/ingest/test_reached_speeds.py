@@ -14,25 +14,25 @@ TICKS_S = np.arange(0, 20, 0.1)
 TOLD = np.where(TICKS_S % 5 < 3, 0.5, 0.1)  # 3 s fast, 2 s slowly
 
 
-def late(told: np.ndarray, at_s: np.ndarray, most: float) -> np.ndarray:
+def late(reported: np.ndarray, at_s: np.ndarray, most: float) -> np.ndarray:
     """A base that follows after .3 s, as fast as it can."""
     index = np.searchsorted(TICKS_S, at_s - 0.3, "right") - 1
-    return np.clip(told[np.maximum(index, 0)], -most, most)
+    return np.clip(reported[np.maximum(index, 0)], -most, most)
 
 
 @pytest.mark.parametrize("way", [1, -1])
 def test_a_base_that_cuts_off_shows_its_limit(way):
     at_s = np.arange(0, 20, 0.05)
-    told = way * TOLD
+    reported = way * TOLD
     for most, limit in ((0.3, 0.3), (0.2, 0.2), (0.45, None), (1.0, None)):
-        settled = settled_speeds(TICKS_S, told, at_s, late(told, at_s, most), 0.5)
+        settled = settled_speeds(TICKS_S, reported, at_s, late(reported, at_s, most), 0.5)
         assert limit_of(settled, 0.5) == limit
 
 
 def test_what_has_not_settled_says_nothing():
     at_s = np.arange(0, 20, 0.05)
-    told = np.where(TICKS_S % 1.6 < 0.8, 0.5, -0.5)  # another way before it could follow
-    settled = settled_speeds(TICKS_S, told, at_s, late(told, at_s, 0.3), 0.5)
+    reported = np.where(TICKS_S % 1.6 < 0.8, 0.5, -0.5)  # another way before it could follow
+    settled = settled_speeds(TICKS_S, reported, at_s, late(reported, at_s, 0.3), 0.5)
     assert len(settled) == 0
     assert limit_of(settled, 0.5) is None
 
@@ -42,8 +42,8 @@ class Hurried(Drive):
 
     def topics(self):
         ticks = np.arange(0, self.duration_s, 0.2)
-        told = {"linear.x": np.full(len(ticks), 3 * SPEED_MPS), "angular.z": 0 * ticks}
-        return super().topics() | {"/cmd_vel": columns(ticks + 0.005, told, stamped=False)}
+        reported = {"linear.x": np.full(len(ticks), 3 * SPEED_MPS), "angular.z": 0 * ticks}
+        return super().topics() | {"/cmd_vel": columns(ticks + 0.005, reported, stamped=False)}
 
 
 def test_a_proposal_has_the_limit_in_its_actions_and_in_the_twin(tmp_path):

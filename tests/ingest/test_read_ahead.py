@@ -45,9 +45,9 @@ def content(path: Path, *, salvage: bool = False) -> tuple[list[object], list[ob
         (channel, [bytes(one) for one in batch.payloads()], batch.log_time_ns.tolist())
         for channel, batch in file.batches(file.channels)
     ]
-    told = [(one.what, one.messages) for one in file.damage]
+    reported = [(one.what, one.messages) for one in file.damage]
     file.close()
-    return messages, [told, file.notes, file.integrity]
+    return messages, [reported, file.notes, file.integrity]
 
 
 def inflating() -> list[str]:
@@ -83,9 +83,9 @@ def test_the_messages_are_the_same_in_the_same_order(
 ) -> None:
     ahead, plain = both(recording, monkeypatch)
     assert ahead == plain
-    messages, told = ahead  # type: ignore[misc]
+    messages, reported = ahead  # type: ignore[misc]
     assert sum(len(times) for _, _, times in messages) == MESSAGES
-    assert told == [[], [], "verified"]
+    assert reported == [[], [], "verified"]
     assert inflating() == []
 
 

@@ -191,10 +191,10 @@ def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkey
 
     monkeypatch.setattr(DeltaTable, "create_write_transaction", denied)
     assert main(["remove", str(tmp_path / "s"), name_of(1)]) == 2
-    told = capsys.readouterr().err
-    assert "cannot be written: " in told
-    assert "Permission denied" in told
-    assert "read" not in told
+    reported = capsys.readouterr().err
+    assert "cannot be written: " in reported
+    assert "Permission denied" in reported
+    assert "read" not in reported
     assert len(shown(tmp_path / "s")) == 3
 
 

@@ -137,11 +137,11 @@ def test_other_drives_are_not_repeats(tmp_path: Path) -> None:
 
 def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Or a thousand recordings would read each other's a thousand times."""
-    writer, asked = StoreWriter(tmp_path / "s"), []
+    writer, requested = StoreWriter(tmp_path / "s"), []
     manifests = StoreWriter.manifests
 
     def counted(self: StoreWriter, ingests: list[Any], *args: Any, **more: Any) -> pa.Table:
-        asked.append(len(ingests))
+        requested.append(len(ingests))
         return manifests(self, ingests, *args, **more)
 
     monkeypatch.setattr(StoreWriter, "manifests", counted)
@@ -150,7 +150,7 @@ def test_sketches_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         staged = writer.stage(manifest(rows), rows)
         writer.write(manifest(rows), rows)
         assert StoreWriter(tmp_path / "s").repeated(staged, 0.1) is None
-    assert asked == [0, 1, 1]
+    assert requested == [0, 1, 1]
 
 
 def test_hashes_see_a_thousandth_and_no_less() -> None:

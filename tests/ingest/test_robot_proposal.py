@@ -354,8 +354,8 @@ def test_of_two_robots_in_a_recording_each_has_its_own_outline_and_description(
     with open_recording(write_topics(topics, tmp_path / "bag")) as recording:
         assert (robots := robots_in(recording)) == ["/robot2", "/robot1"]
         # Of one name and other topics, the audit stale_labels would take the two for versions.
-        assert "for /robot1," in (told := in_one_recording(robots))
-        assert "another name" in told
+        assert "for /robot1," in (reported := in_one_recording(robots))
+        assert "another name" in reported
         found, notes = footprint_of(recording)
         own = propose_robot(recording, None, None)
     assert notes == []

@@ -106,8 +106,8 @@ def test_a_bag_that_was_cut_short_is_read_up_to_the_cut(bag: Path) -> None:
     with pytest.raises(RecordingError, match="index") as refused:
         open_recording(bag)
     assert "--salvage" in (refused.value.remedy or "")
-    told: list[str] = []
-    with open_recording(bag, salvage=True, watch=lambda *how: told.append(how[0])) as recording:
+    reported: list[str] = []
+    with open_recording(bag, salvage=True, watch=lambda *how: reported.append(how[0])) as recording:
         columns = recording.read({"/number": ["data"], "/flag": []})
         assert recording.integrity == "damaged"
         assert recording.topics["/number"].expected == len(columns["/number"])
@@ -116,7 +116,7 @@ def test_a_bag_that_was_cut_short_is_read_up_to_the_cut(bag: Path) -> None:
     assert 0.5 * ROWS < len(part) < ROWS
     assert np.array_equal(part, values[: len(part)])
     assert abs(len(columns["/flag"]) - len(part)) <= 1
-    assert "looking through the file, bytes" in told
+    assert "looking through the file, bytes" in reported
 
 
 @pytest.mark.parametrize("keep", [0, 10, 13, 4117])

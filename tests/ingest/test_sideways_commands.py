@@ -26,8 +26,8 @@ def test_a_speed_sideways_stands_beside_the_one_ahead(field: str, aside: str) ->
 
 
 def test_commands_with_a_speed_sideways_are_counted() -> None:
-    asked = {"linear.y": np.array([0.0, 0.3, -0.45, 0.0])}
-    notes = sideways_notes(command("linear.x"), asked)
+    requested = {"linear.y": np.array([0.0, 0.3, -0.45, 0.0])}
+    notes = sideways_notes(command("linear.x"), requested)
     assert len(notes) == 1
     assert "2 of 4 messages of /cmd_vel contain a sideways speed, up to 0.45 m/s" in notes[0]
     assert sideways_notes(command("linear.x"), {"linear.y": np.zeros(4)}) == []

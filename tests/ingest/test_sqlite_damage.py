@@ -194,12 +194,12 @@ def test_a_message_that_is_lost_is_counted_once_however_often_it_is_read(
     file = tmp_path / "run.db3"
     file.write_bytes(DAMAGE["a text goes on elsewhere"](bytearray(whole.read_bytes())))
     with open_recording(file, salvage=True) as recording:
-        told = []
+        reported = []
         for topics in (["/long"], ["/long"], ["/odom", "/long"]):
             recording.read({topic: [] for topic in topics})
-            told.append(recording.lost_messages)
-    assert any(one.topic == "/long" and one.messages for one in told[0])
-    assert told[1] == told[2] == told[0]
+            reported.append(recording.lost_messages)
+    assert any(one.topic == "/long" and one.messages for one in reported[0])
+    assert reported[1] == reported[2] == reported[0]
 
 
 def test_exit_codes_of_a_damaged_file(

@@ -44,7 +44,7 @@ def car() -> str:
     return f"<robot name='car'>{base}{''.join(parts)}</robot>"
 
 
-def told() -> tuple[Any, Any]:
+def reported() -> tuple[Any, Any]:
     """Speeds (N,) and turns (N,) of the commands at `TIME_S`."""
     return np.full(len(TIME_S), SPEED_MPS), 0.3 * np.sin(TIME_S)
 
@@ -57,7 +57,7 @@ def driven(yaw_rate_radps: Any) -> tuple[Any, Any, Any]:
 
 def turns(kind: str) -> Any:
     """How a car turns by the commands, if their turn is this."""
-    speed, turn = told()
+    speed, turn = reported()
     late = np.interp(TIME_S - 0.15, TIME_S, turn)
     angle = speed * np.tan(late) / WHEELBASE_M
     return {"rate": late, "angle": angle, "straight": 0 * turn, "mirrored": -late}[kind]
@@ -66,7 +66,7 @@ def turns(kind: str) -> Any:
 def reading(kind: str) -> TurnReading:
     stamp_ns = (TIME_S * 1e9).astype(np.int64)
     return turn_reading(
-        TIME_S, *told(), PoseSeries(stamp_ns, *driven(turns(kind))), WHEELBASE_M, MAX_RAD
+        TIME_S, *reported(), PoseSeries(stamp_ns, *driven(turns(kind))), WHEELBASE_M, MAX_RAD
     )
 
 
@@ -92,12 +92,12 @@ def odometry(kind: str) -> Any:
     x, y, yaw = driven(turns(kind))
     at = {"pose.pose.position.x": x, "pose.pose.position.y": y}
     at |= {"pose.pose.orientation.z": np.sin(yaw / 2), "pose.pose.orientation.w": np.cos(yaw / 2)}
-    at |= {"twist.twist.linear.x": told()[0], "twist.twist.angular.z": turns(kind)}
+    at |= {"twist.twist.linear.x": reported()[0], "twist.twist.angular.z": turns(kind)}
     return columns(TIME_S, at)
 
 
 def bag(folder: Path, kind: str) -> Path:
-    speed, turn = told()
+    speed, turn = reported()
     command = {"linear.x": speed, "angular.z": turn}
     command["angular.z"][:3] = 9.0  # tighter than any car
     return write_topics(
@@ -114,7 +114,7 @@ def test_the_wheelbase_of_steering_angles_is_the_one_by_which_it_turned(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Guessed from an outline that is guessed, yaw rates of cars were three times what they are."""
-    speed, turn = told()
+    speed, turn = reported()
     command = columns(TIME_S, {"speed": speed, "steering_angle": turn}, stamped=False)
     topics = {
         "/odom": ("nav_msgs/msg/Odometry", odometry(kind)),

@@ -52,17 +52,17 @@ def commands(seed: int, *, spot: bool) -> Any:
 def shown(name: str, seed: int, *, spot: bool) -> DriveEvidence:
     """What such a drive of the twin's robot shows, by a localiser's poses."""
     robot, body = ROBOTS[name]
-    told = commands(seed, spot=spot)
+    reported = commands(seed, spot=spot)
     still = (
         *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps"),
         *("localised_speed_mps", "localised_lateral_mps"),
     )
-    start = OpenLoopStart(np.zeros((1, 3)), dict.fromkeys(still, np.zeros(1)), told[None])
+    start = OpenLoopStart(np.zeros((1, 3)), dict.fromkeys(still, np.zeros(1)), reported[None])
     task = Task(body=body, actions=((0.0, 0.0), (0.4, 0.0)))
     driven = drive_open_loop(task, start, [Perturbation()], robot=robot_model(robot, body))
     poses = driven.pose[0, 0] + np.random.default_rng(seed).normal(0, 0.005, (STEPS + 1, 3))
     at_ns = (np.arange(STEPS + 1) * PERIOD_S * 1e9).astype(np.int64)
-    return drive_evidence(np.arange(STEPS) * PERIOD_S, *told.T, PoseSeries(at_ns, *poses.T))
+    return drive_evidence(np.arange(STEPS) * PERIOD_S, *reported.T, PoseSeries(at_ns, *poses.T))
 
 
 @pytest.mark.parametrize("seed", one_in(2, range(2)))
@@ -89,7 +89,7 @@ def test_a_robot_that_was_never_asked_to_turn_on_the_spot_is_no_car(name: str, s
 def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
     """One message that was logged before the clock was set; 0.1 s at a time it is a long way."""
     at_s, years_s = np.arange(0, 60, PERIOD_S), 50 * 365 * 86_400.0
-    told, turn_radps = at_s[:-1], np.where(at_s[:-1] % 20 < 10, 0.5, 0.0)
+    reported, turn_radps = at_s[:-1], np.where(at_s[:-1] % 20 < 10, 0.5, 0.0)
     yaw = np.concatenate([[0.0], np.cumsum(turn_radps * PERIOD_S)])
 
     def evidence(stray: bool) -> DriveEvidence:
@@ -97,7 +97,7 @@ def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
         stamps = np.concatenate([[0] * stray, ((at_s + shift_s) * 1e9)]).astype(np.int64)
         still = np.zeros(len(stamps))
         poses = PoseSeries(stamps, still, still, np.concatenate([[0.0] * stray, yaw]))
-        return drive_evidence(told + shift_s, np.zeros(len(told)), turn_radps, poses)
+        return drive_evidence(reported + shift_s, np.zeros(len(reported)), turn_radps, poses)
 
     assert evidence(stray=False).pivots
     for field, value in dataclasses.asdict(evidence(stray=True)).items():

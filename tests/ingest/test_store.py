@@ -309,8 +309,8 @@ def test_nothing_is_written_into_a_panel_or_a_run(tmp_path, capsys, file, said):
     # Said once, before a recording is read.
     recordings = [str(ROOT / "sample_logs" / name) for name in ("amr_monday.mcap", "amr_tuesday")]
     assert main(["ingest", *recordings, "--store", str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert (told.count(said), "was not added" in told) == (1, False)
+    reported = capsys.readouterr().err
+    assert (reported.count(said), "was not added" in reported) == (1, False)
     assert [path.name for path in tmp_path.iterdir()] == [file]
 
 

@@ -118,9 +118,9 @@ def test_hostile_metadata_is_bounded_and_counted(tmp_path):
     assert r"key \xff\xfe\xfd07" in rest[2]
     left_out = 1 + 5_000 - (MAX_ENTRIES - 1)
     assert notes[0].startswith(f"{left_out:,} entries of its metadata: not text, longer than")
-    told = resolve_tags(TagRules(), path, [large, rest], {}, {})
-    assert len(told.tags) == MAX_TAGS
-    assert f"{MAX_ENTRIES - MAX_TAGS:,} names in its metadata cannot be tags" in told.notes[0]
+    reported = resolve_tags(TagRules(), path, [large, rest], {}, {})
+    assert len(reported.tags) == MAX_TAGS
+    assert f"{MAX_ENTRIES - MAX_TAGS:,} names in its metadata cannot be tags" in reported.notes[0]
 
 
 @pytest.mark.parametrize(
@@ -207,9 +207,9 @@ RULES = TagRules(from_path="{site}/{robot}/*")
 
 def test_sources_that_agree_or_add_to_each_other():
     own = [("a", "", {"robot": "amr-07", "line": "B"}), ("b", "", {"robot": "amr-07"})]
-    told = resolve_tags(RULES, PLACE, own, {"shift": "night"}, {})
-    assert told.tags == {"robot": "amr-07", "line": "B", "site": "oslo", "shift": "night"}
-    assert told.notes == []
+    reported = resolve_tags(RULES, PLACE, own, {"shift": "night"}, {})
+    assert reported.tags == {"robot": "amr-07", "line": "B", "site": "oslo", "shift": "night"}
+    assert reported.notes == []
 
 
 @pytest.mark.parametrize(
@@ -227,16 +227,16 @@ def test_sources_that_contradict_each_other(name, own, says):
         resolve_tags(RULES, PLACE, said, {}, {})
     assert f"its tag {name!r} is {says}" in refused.value.what
     assert f"choose one: --tag {name}=x or --tag {name}=" in str(refused.value.remedy)
-    told = resolve_tags(RULES, PLACE, said, {name: "decided"}, {})
-    assert told.tags[name] == "decided"
+    reported = resolve_tags(RULES, PLACE, said, {name: "decided"}, {})
+    assert reported.tags[name] == "decided"
 
 
 def test_records_that_mean_two_things_by_a_name():
     """Left out and said, until the profile says which is meant."""
     own = [("l", "left", {"serial": "1"}), ("r", "right", {"serial": "2"})]
-    told = resolve_tags(TagRules(), PLACE, own, {}, {})
-    assert told.tags == {}
-    assert "1 names in its metadata cannot be tags ('serial')" in told.notes[0]
+    reported = resolve_tags(TagRules(), PLACE, own, {}, {})
+    assert reported.tags == {}
+    assert "1 names in its metadata cannot be tags ('serial')" in reported.notes[0]
     rules = TagRules(from_metadata={"lidar": "left.serial", "site": "nowhere"})
     assert resolve_tags(rules, PLACE, own, {}, {}).tags == {"lidar": "1", "serial": "2"}
 

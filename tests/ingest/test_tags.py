@@ -32,7 +32,7 @@ def ingest(bag: Path, store: Path, *options: str) -> int:
     return main(["ingest", str(bag), "--store", str(store), "--profile", profile, *options])
 
 
-def asked(store: Path, query: str) -> list[tuple[Any, ...]]:
+def requested(store: Path, query: str) -> list[tuple[Any, ...]]:
     with Store(store) as opened:
         return opened.sql(query).fetchall()
 
@@ -45,7 +45,7 @@ def test_tags_of_the_command_line_are_on_every_view(bag, tmp_path, capsys):
     assert (row["status"], row["tags"]) == ("written", tags)
     for view in ("recordings", "transitions", "episodes"):
         query = f"SELECT DISTINCT robot, site, firmware, map, shift, tags FROM {view}"
-        assert asked(store, query) == [("amr-07", None, None, None, None, tags)]
+        assert requested(store, query) == [("amr-07", None, None, None, None, tags)]
 
 
 def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
@@ -59,8 +59,8 @@ def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
     with Store(store) as opened:
         for view, names in pairs.items():
             for name in names:
-                told = f"SELECT epoch_us({name}_time) - {name}_ns // 1000, typeof({name}_time)"
-                found = opened.sql(f"{told} FROM {view} GROUP BY ALL").fetchall()
+                reported = f"SELECT epoch_us({name}_time) - {name}_ns // 1000, typeof({name}_time)"
+                found = opened.sql(f"{reported} FROM {view} GROUP BY ALL").fetchall()
                 assert found == [(0, "TIMESTAMP")]
         logged = opened.sql("SELECT min(logged_time), max(logged_time) FROM transitions")
         episode = opened.sql("SELECT logged_start_time, logged_end_time FROM episodes")
@@ -70,7 +70,7 @@ def test_times_are_the_nanoseconds_beside_them(bag, tmp_path):
 def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     store, others = tmp_path / "store", "FROM (SELECT * EXCLUDE (ingest_id, tags, robot, site)"
     assert ingest(bag, store, "--tag", "site=oslo") == 0
-    rows = asked(store, f"{others} FROM transitions) ORDER BY transition_id")
+    rows = requested(store, f"{others} FROM transitions) ORDER BY transition_id")
     capsys.readouterr()
     assert ingest(bag, store, "--tag", "robot=amr-07", "--json") == 0
     (row,) = json.loads(capsys.readouterr().out)["recordings"]
@@ -79,15 +79,15 @@ def test_new_tags_alone_change_no_row(bag, tmp_path, capsys):
     assert row["notes"] == [
         "tags kept from the earlier ingest: site=oslo (--tag NAME= removes one)"
     ]
-    assert asked(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
-    assert asked(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
+    assert requested(store, f"{others} FROM transitions) ORDER BY transition_id") == rows
+    assert requested(store, "SELECT DISTINCT robot, site FROM transitions") == [("amr-07", "oslo")]
     capsys.readouterr()
     assert ingest(bag, store) == 0  # who says nothing changes nothing
     assert "unchanged" in capsys.readouterr().out
     assert ingest(bag, store, "--force") == 0
-    assert asked(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
+    assert requested(store, "SELECT DISTINCT robot, site FROM recordings") == [("amr-07", "oslo")]
     assert ingest(bag, store, "--tag", "site=") == 0
-    assert asked(store, "SELECT robot, site, tags FROM recordings") == [
+    assert requested(store, "SELECT robot, site, tags FROM recordings") == [
         ("amr-07", None, {"robot": "amr-07"})
     ]
 
@@ -98,7 +98,7 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
     assert main(["label", str(store), "--profile", str(other)]) == 0
-    assert asked(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
+    assert requested(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_a_store_from_before_there_were_tags(tmp_path):
         write_deltalake(str(path / "recordings"), without_tags(rows), mode="append")
         write_deltalake(str(path / "transitions"), rows, mode="append")
     for view in ("recordings", "transitions", "episodes"):
-        assert asked(path, f"SELECT DISTINCT robot, tags FROM {view}") == [(None, None)]
+        assert requested(path, f"SELECT DISTINCT robot, tags FROM {view}") == [(None, None)]
     newer = without_tags(recording_transitions(3))
     entry = pa.array([{"robot": "amr-07"}], pa.map_(pa.string(), pa.string()))
     write_deltalake(
@@ -148,7 +148,7 @@ def test_a_store_from_before_there_were_tags(tmp_path):
         schema_mode="merge",
     )
     write_deltalake(str(path / "transitions"), recording_transitions(3), mode="append")
-    assert sorted(asked(path, "SELECT DISTINCT robot FROM episodes"), key=str) == [
+    assert sorted(requested(path, "SELECT DISTINCT robot FROM episodes"), key=str) == [
         ("amr-07",),
         (None,),
     ]

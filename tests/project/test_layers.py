@@ -238,9 +238,9 @@ def test_a_folder_has_one_purpose_and_room_for_it(folder: str) -> None:
 
 @pytest.mark.parametrize("room", ["ingest", "replay", "train", "train/twin"])
 def test_the_map_for_contributors_names_every_folder(room: str) -> None:
-    told = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    reported = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     folders = [path.parent.name for path in (ROOT / room).glob("*/__init__.py")]
-    assert [folder for folder in folders if f" {folder}/" not in told] == []
+    assert [folder for folder in folders if f" {folder}/" not in reported] == []
 
 
 def test_there_are_no_cycles() -> None:

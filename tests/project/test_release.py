@@ -98,11 +98,14 @@ def test_inputs_reach_the_shell_by_the_environment_only() -> None:
 
 def test_the_container_file_runs_the_demo() -> None:
     lines = (ROOT / "Containerfile").read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
-    told = dict(line.split(" ", 1) for line in lines if line and not line.startswith("#"))
-    minor = re.search(r"python:3\.(\d+)", told["FROM"])
+    reported = dict(line.split(" ", 1) for line in lines if line and not line.startswith("#"))
+    minor = re.search(r"python:3\.(\d+)", reported["FROM"])
     assert minor is not None
     assert f"Programming Language :: Python :: 3.{minor[1]}" in PROJECT["classifiers"]
-    entry, command = told["ENTRYPOINT"].strip('[]" '), told["CMD"].strip("[] ").replace(",", " ")
+    entry, command = (
+        reported["ENTRYPOINT"].strip('[]" '),
+        reported["CMD"].strip("[] ").replace(",", " "),
+    )
     verb, *options = shlex.split(command)
     assert entry in PROJECT["scripts"]
     assert {option for option in options if option.startswith("--")} <= set(

@@ -250,5 +250,5 @@ def test_power_is_how_often_the_test_finds_it() -> None:
     assert paired_t_power(9.0, 0.1, 2) == 0.0  # of two, `paired_t` says nothing
     # Pilots' spread of .06 between the seeds of an arm.
     sd = 0.06 * 2**0.5
-    told = [paired_t_power(effect, sd, n) for n, effect in ((5, 0.12), (20, 0.05), (30, 0.05))]
-    assert told == pytest.approx([0.663, 0.706, 0.877], abs=2e-3)
+    reported = [paired_t_power(effect, sd, n) for n, effect in ((5, 0.12), (20, 0.05), (30, 0.05))]
+    assert reported == pytest.approx([0.663, 0.706, 0.877], abs=2e-3)

@@ -68,8 +68,8 @@ def test_every_file_of_the_front_door_is_in_the_wheel(wheel: zipfile.ZipFile) ->
 )
 def test_the_wheel_has_the_compiled_update_for_every_python(wheel: zipfile.ZipFile) -> None:
     assert "restock/_native.abi3.so" in wheel.namelist()
-    (told,) = (name for name in wheel.namelist() if name.endswith(".dist-info/WHEEL"))
-    assert b"Tag: cp311-abi3-" in wheel.read(told)
+    (reported,) = (name for name in wheel.namelist() if name.endswith(".dist-info/WHEEL"))
+    assert b"Tag: cp311-abi3-" in wheel.read(reported)
 
 
 def test_every_file_that_is_compiled_is_declared() -> None:
@@ -115,13 +115,13 @@ def installed_with(name: str) -> set[str]:
     found: set[tuple[str, frozenset[str]]] = set()
     waiting = [Requirement(name)]
     while waiting:
-        asked = waiting.pop()
-        key = canonicalize_name(asked.name), frozenset(asked.extras)
+        requested = waiting.pop()
+        key = canonicalize_name(requested.name), frozenset(requested.extras)
         if key in found:
             continue
         found.add(key)
-        for needed in map(Requirement, requires(asked.name) or ()):
-            markers = [{"extra": extra} for extra in ("", *asked.extras)]
+        for needed in map(Requirement, requires(requested.name) or ()):
+            markers = [{"extra": extra} for extra in ("", *requested.extras)]
             if needed.marker is None or any(map(needed.marker.evaluate, markers)):
                 waiting.append(needed)
     return {name for name, _ in found}

@@ -57,9 +57,9 @@ def store_of(rows: pa.Table, path: Path) -> Path:
 
 
 def planned(store: Path, mixture: str) -> PanelPlan:
-    asked = parse_mixture(mixture)
-    with Store(store) as opened, open_source(opened, asked) as source:
-        return plan_panel(source.connection, asked, source.conditions)
+    requested = parse_mixture(mixture)
+    with Store(store) as opened, open_source(opened, requested) as source:
+        return plan_panel(source.connection, requested, source.conditions)
 
 
 def success_in(plan: PanelPlan, stratum: str, rows: pa.Table) -> float:

@@ -29,14 +29,14 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return Store(write_store(path, tables, tags=TAGS))
 
 
-def asked(store: Store, query: str) -> list[dict[str, Any]]:
+def requested(store: Store, query: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = store.sql(query).to_arrow_table().to_pylist()
     return rows
 
 
 def test_every_condition_stands_in_every_week_that_a_robot_drove(fleet):
-    rows = asked(fleet, "FROM coverage_by_week")
-    conditions = {row["condition"] for row in asked(fleet, "FROM conditions")}
+    rows = requested(fleet, "FROM coverage_by_week")
+    conditions = {row["condition"] for row in requested(fleet, "FROM conditions")}
     cells = {(row["robot"], str(row["week"]), row["condition"]) for row in rows}
     driven = {("a", "2023-11-13"), ("a", "2023-12-04"), ("b", "2023-11-13"), (None, "2023-11-20")}
     assert cells == {(*one, condition) for one in driven for condition in conditions}
@@ -56,7 +56,7 @@ def test_counts_of_weeks_are_those_of_rows_and_events(fleet):
     ).fetchall()
     seen = {row[:3]: row[3:] for row in rows}
     happened = {row[:3]: row[3:] for row in events}
-    for row in asked(fleet, "FROM coverage_by_week"):
+    for row in requested(fleet, "FROM coverage_by_week"):
         cell = row["robot"], row["week"], row["condition"]
         driven = sum(once for other, (_, _, once) in seen.items() if other[:2] == cell[:2])
         count, episodes, once = seen.get(cell, (0, 0, 0))
@@ -96,16 +96,16 @@ def test_weeks_add_up_to_robots(fleet):
         assert robot[-1] == total[-1]
     assert {robot: weeks for robot, *_, weeks, _ in robots} == {"a": 2, "b": 1, None: 1}
     totals = "SELECT sum(primary_share) AS share, any_value(hours) AS hours FROM coverage_by_robot"
-    shares = asked(fleet, f"{totals} GROUP BY robot")
+    shares = requested(fleet, f"{totals} GROUP BY robot")
     assert [row["share"] for row in shares] == pytest.approx([1.0, 1.0, 1.0])
     assert sum(row["hours"] for row in shares) == pytest.approx(
-        asked(fleet, "SELECT count(*) * 0.2 / 3600 AS hours FROM transitions")[0]["hours"]
+        requested(fleet, "SELECT count(*) * 0.2 / 3600 AS hours FROM transitions")[0]["hours"]
     )
 
 
 def test_successes_are_of_episodes_in_which_the_condition_was_seen(fleet):
-    for row in asked(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
-        (found,) = asked(
+    for row in requested(fleet, "FROM coverage_by_robot WHERE robot = 'a'"):
+        (found,) = requested(
             fleet,
             "SELECT count(*) AS episodes, count(*) FILTER (success) AS successes FROM episodes"
             " SEMI JOIN (FROM held_conditions WHERE robot = 'a'"

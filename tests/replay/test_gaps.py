@@ -109,8 +109,10 @@ def test_audits_and_cells_ask_too_and_what_was_never_seen_has_only_a_bound(store
                 "SELECT condition, rows_held FROM coverage_by_condition WHERE rows_held < 60"
             ).fetchall()
         )
-    asked = {gap.cell["condition"]: gap.there for gap in gaps if gap.asked_by.endswith("condition")}
-    assert asked == rare
+    requested = {
+        gap.cell["condition"]: gap.there for gap in gaps if gap.asked_by.endswith("condition")
+    }
+    assert requested == rare
     found = shopping_list(yields, gaps)
     for one in found.gaps:
         assert (one.best is None) == (one.gap.found.sum() == 0)

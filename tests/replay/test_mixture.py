@@ -532,8 +532,8 @@ def test_the_verb_says_what_replays_are_counted_over(
     # Few rows: at the default training budget they bear less.
     assert "warning: at the default training budget (51,500 updates of 128 rows)" in text
     (tmp_path / "m.toml").write_text("[planned]\nupdates = 100\n[sources]\nlogs = 1\n" + EVERY)
-    asked = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
-    assert cli.main(asked) == 0
+    requested = ["mix", str(store_path), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
+    assert cli.main(requested) == 0
     text = capsys.readouterr().out
     assert "these numbers are for 100 updates of 128 rows" in text
     assert "max_replays_per_row" not in text

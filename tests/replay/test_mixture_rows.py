@@ -74,9 +74,9 @@ def test_a_stratum_of_episodes_has_all_rows_of_those_that_met_it(
     for episode in transitions["episode_id"].unique().to_pylist():
         own = transitions.filter(pc.equal(transitions["episode_id"], episode))
         held = own["conditions"].to_pylist()
-        met = [c.name for c in order if sum(c.name in row for row in held) >= min_steps]
+        observed = [c.name for c in order if sum(c.name in row for row in held) >= min_steps]
         of_rows = {stratum[row] for row in own["transition_id"].to_pylist()}
-        assert of_rows == {met[0] if met else "nominal"}
+        assert of_rows == {observed[0] if observed else "nominal"}
     assert {line.correction for line in plan.strata} == {"none"}
 
 

@@ -30,13 +30,13 @@ def profiles(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path
     folder = tmp_path_factory.mktemp("odometry")
     write_bag(Drive(), folder / "commanded")
     write_bag(Drive(duration_s=9.0), folder / "measured")
-    told, seen = folder / "told.toml", folder / "seen.toml"
-    assert main(["profile", "new", str(folder / "commanded"), "--out", str(told)]) == 0
-    text = told.read_text()
+    reported, seen = folder / "told.toml", folder / "seen.toml"
+    assert main(["profile", "new", str(folder / "commanded"), "--out", str(reported)]) == 0
+    text = reported.read_text()
     assert TWIST in text
     swapped = text.replace(TWIST, MEASURED).replace('name = "told"', 'name = "seen"')
     seen.write_text(swapped.replace('steps = "command"', 'steps = "rate"'))
-    return folder, told, seen
+    return folder, reported, seen
 
 
 def ingested(folder: Path, recording: str, profile: Path, store: Path, capsys) -> dict:
@@ -54,10 +54,10 @@ def mixed(folder: Path, store: Path, capsys, more: str = "") -> tuple[int, str, 
 
 
 def test_panels_leave_measured_actions_out_and_count_them(profiles, tmp_path, capsys):
-    folder, told, seen = profiles
+    folder, reported, seen = profiles
     store = tmp_path / "store"
     capsys.readouterr()
-    first = ingested(folder, "commanded", told, store, capsys)
+    first = ingested(folder, "commanded", reported, store, capsys)
     assert {"input": "command", "instead": INSTEAD} not in first["stand_ins"]
     second = ingested(folder, "measured", seen, store, capsys)
     assert {"input": "command", "instead": INSTEAD} in second["stand_ins"]

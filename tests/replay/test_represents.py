@@ -123,15 +123,15 @@ def test_the_main_store_may_be_the_archive(folder):
 )
 def test_archives_are_told_by_their_odds(mine, theirs, refused, warned):
     said = {"logs": None, "incidents": None}
-    met = {"near_collision": [theirs, mine]}
+    observed = {"near_collision": [theirs, mine]}
     if refused:
         with pytest.raises(MixtureError, match="looks like an archive"):
-            look_for_archives(said, met, ["near_collision"])
+            look_for_archives(said, observed, ["near_collision"])
     # What is no stratum has no rate to be given; the rows are a selection all the same.
-    warnings = look_for_archives(said, met, ["all"] if refused else ["near_collision"])
+    warnings = look_for_archives(said, observed, ["all"] if refused else ["near_collision"])
     assert bool(warnings) == warned
     assert all("'incidents' may be an archive" in text for text in warnings)
-    assert look_for_archives(said | {"incidents": "archive"}, met, ["all"]) == ()
+    assert look_for_archives(said | {"incidents": "archive"}, observed, ["all"]) == ()
 
 
 def test_odds_are_those_of_a_two_by_two_table():
@@ -156,8 +156,8 @@ def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, capsys):
     (tmp_path / "m.toml").write_text(
         TWO.format(archive="", main="", rule="none").replace('path = "incidents"', 'path = "bags"')
     )
-    asked = ["mix", str(tmp_path / "main"), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
-    assert cli.main([*asked, "--json"]) == 0
+    requested = ["mix", str(tmp_path / "main"), "--mixture", str(tmp_path / "m.toml"), "--dry-run"]
+    assert cli.main([*requested, "--json"]) == 0
     said = capsys.readouterr()
     assert "warning: the source 'incidents' may be an archive: 26 of its 30" in said.err
     assert len(json.loads(said.out)["warnings"]) == 1
@@ -166,8 +166,10 @@ def test_a_source_that_may_be_an_archive_is_warned_of(tmp_path, capsys):
 def test_an_archive_stands_for_the_main_stores_rates_or_for_given_ones(folder):
     own = natural(planned(folder, 'represents = "natural"'))
     assert own["incidents/near_collision"] > 0.7 > 0.05 > own["near_collision"]
-    told = natural(planned(folder, 'represents = "archive"'))
-    assert told["incidents/near_collision"] == told["near_collision"] == own["near_collision"]
+    reported = natural(planned(folder, 'represents = "archive"'))
+    assert (
+        reported["incidents/near_collision"] == reported["near_collision"] == own["near_collision"]
+    )
     given_ = natural(planned(folder, "represents = { near_collision = 0.004 }"))
     assert given_["incidents/near_collision"] == pytest.approx(0.004)
     assert given_["incidents/nominal"] == pytest.approx(0.996)

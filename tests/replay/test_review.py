@@ -155,9 +155,9 @@ def test_a_list_without_events_is_a_header_and_says_so(
     for more in ([], ["--json"]):
         assert main(["label", str(store), "--review", "3", "--out", str(file), *more]) == 0
         shown = capsys.readouterr()
-        told = " ".join((shown.err if more else shown.out).split())
-        assert "no uncertain event is left to review" in told
-        assert f"{file} has only a header" in told
+        reported = " ".join((shown.err if more else shown.out).split())
+        assert "no uncertain event is left to review" in reported
+        assert f"{file} has only a header" in reported
         assert not more or json.loads(shown.out) == []
         # As with verdicts that are all empty, there is nothing to take from it.
         assert main(["label", str(store), "--corrections", str(file)]) == 0

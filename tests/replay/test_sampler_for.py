@@ -114,7 +114,7 @@ def by_batches(panel: Panel) -> Iterator[Drawn]:
         batches.learnt(batch, torch.from_numpy(td))
 
 
-def by_library(told: bool) -> Way:
+def by_library(reported: bool) -> Way:
     def draw(panel: Panel) -> Iterator[Drawn]:
         feed = MixedFeed(
             "any",
@@ -132,7 +132,7 @@ def by_library(told: bool) -> Way:
         for _ in range(10**9):
             batch = feed.draw_logs(BATCH)
             yield Drawn(batch.rows, batch.strata)
-            td = learn(None, batch.rows, batch.strata) if told else None
+            td = learn(None, batch.rows, batch.strata) if reported else None
             feed.drawn(panel.rows[batch.rows], batch, np.empty(0, np.int64), td=td)
 
     return draw

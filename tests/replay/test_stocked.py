@@ -104,24 +104,24 @@ def strata_of_episodes(count: int) -> list[ResolvedStratum]:
 def test_every_condition_that_can_have_an_episode_of_its_own_has_one(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 5), label="strata")
     sets = st.frozensets(st.integers(0, count - 1))
-    met = data.draw(st.lists(sets, min_size=1, max_size=30), label="met")
-    size = np.array([data.draw(st.integers(1, 9)) for _ in met])
-    episode = np.repeat(np.arange(len(met)), size)
-    member = np.array([[*(s in one for s in range(count)), True] for one in met])[episode]
+    observed = data.draw(st.lists(sets, min_size=1, max_size=30), label="met")
+    size = np.array([data.draw(st.integers(1, 9)) for _ in observed])
+    episode = np.repeat(np.arange(len(observed)), size)
+    member = np.array([[*(s in one for s in range(count)), True] for one in observed])[episode]
     strata = strata_of_episodes(count)
     code = assign(member, strata)
     got = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
-    assert len(got) == len(met)
-    for one, stratum in zip(met, got.tolist(), strict=True):
+    assert len(got) == len(observed)
+    for one, stratum in zip(observed, got.tolist(), strict=True):
         assert stratum in one if one else stratum == NO_STRATUM
     rows = np.array([size[got == s].sum() for s in range(count)])
     for s in range(count):
-        could = [i for i, one in enumerate(met) if s in one]
-        alone = [i for i in could if len(met[i]) == 1]
+        could = [i for i, one in enumerate(observed) if s in one]
+        alone = [i for i in could if len(observed[i]) == 1]
         assert set(alone) <= set(np.flatnonzero(got == s).tolist())
         # It is empty only where its episodes are fewer than the strata that want them.
         if could and not rows[s]:
-            rivals = set().union(*(met[i] for i in could)) - {s}
+            rivals = set().union(*(observed[i] for i in could)) - {s}
             assert rivals
             assert len(could) <= sum(len([i for i in could if got[i] == r]) for r in rivals)
     again = deal_episodes(code, member, episode, strata, np.ones(len(episode), np.bool_))
@@ -130,9 +130,9 @@ def test_every_condition_that_can_have_an_episode_of_its_own_has_one(data: st.Da
 
 def test_an_episode_counts_for_the_rarest_of_its_conditions() -> None:
     # Two episodes met both; the second condition was met in eight more.
-    met = [{0, 1}, {0, 1}, *({1} for _ in range(8)), set()]
-    episode = np.repeat(np.arange(len(met)), 10)
-    member = np.array([[0 in one, 1 in one, True] for one in met])[episode]
+    observed = [{0, 1}, {0, 1}, *({1} for _ in range(8)), set()]
+    episode = np.repeat(np.arange(len(observed)), 10)
+    member = np.array([[0 in one, 1 in one, True] for one in observed])[episode]
     for by_priority in ([1, 0], [0, 1]):  # whichever comes first by priority
         strata = strata_of_episodes(2)
         strata = [

@@ -45,25 +45,25 @@ def test_each_reads_what_was(
     store, then = str(path), str(first)
     rows = one(1)[1]
 
-    def asked(*args: str) -> object:
+    def requested(*args: str) -> object:
         assert main([*args, "--version", then, "--json"]) in (0, 1)
         return json.loads(capsys.readouterr().out)
 
-    assert asked("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
-    plan = asked("mix", store, "--mixture", "uniform", "--dry-run")
+    assert requested("sql", store, "SELECT count(*) AS n FROM transitions") == [{"n": len(rows)}]
+    plan = requested("mix", store, "--mixture", "uniform", "--dry-run")
     assert isinstance(plan, dict)
     assert plan["store_version"] == first
-    gaps = asked("gaps", store, "--mixture", "uniform")
+    gaps = requested("gaps", store, "--mixture", "uniform")
     assert isinstance(gaps, dict)
     assert (gaps["store_version"], gaps["episodes"]) == (first, 12)
     out = tmp_path / "rows.parquet"
-    asked("export", store, "--to", "parquet", "--out", str(out))
+    requested("export", store, "--to", "parquet", "--out", str(out))
     assert pq.read_metadata(out).num_rows <= len(rows)
     identity = rows["transition_id"][0].as_py()
-    found = asked("trace", store, str(identity))
+    found = requested("trace", store, str(identity))
     assert isinstance(found, dict)
     assert found["store"]["version"] == first
-    labelled = asked("label", store, "--dry-run")
+    labelled = requested("label", store, "--dry-run")
     assert isinstance(labelled, dict)
     assert len(labelled["recordings"]) == 1
     with restock.open(store, version=first) as opened:

@@ -98,8 +98,8 @@ def drive(duration_s: float = 20.0) -> list[Message]:
         moving = {**of, "frame_id": "odom", "child_frame_id": "base_link", **speeds}
         messages.append((time_s, "/odom", "foxglove.Odometry", moving))
     for time_s in np.arange(0, duration_s, 0.1).tolist():
-        told = {"linear": vector(SPEED_MPS), "angular": vector(z=YAW_RATE_RADPS)}
-        messages.append((time_s + 0.01, "/cmd_vel", "ros.geometry_msgs.Twist", told))
+        reported = {"linear": vector(SPEED_MPS), "angular": vector(z=YAW_RATE_RADPS)}
+        messages.append((time_s + 0.01, "/cmd_vel", "ros.geometry_msgs.Twist", reported))
         scan = {
             **{"timestamp": time_s, "frame_id": "laser", "pose": pose()},
             **{"start_angle": -FIELD_RAD / 2, "end_angle": FIELD_RAD / 2},

@@ -79,7 +79,7 @@ class Reader:
 
     def run(self, blocks: list[Block], where: Path) -> str:
         """Run a page's blocks in a folder: "", or what went wrong, with the place."""
-        asked = {
+        requested = {
             "blocks": [
                 [b.place, b.language, b.shell, b.exit_codes, b.marks.get("before", "")]
                 for b in blocks
@@ -89,7 +89,9 @@ class Reader:
         }
         with socket.socket(socket.AF_UNIX) as client, (where / ".log").open("w+") as log:
             client.connect(str(self.folder / "socket"))
-            socket.send_fds(client, [json.dumps(asked).encode()], [0, log.fileno(), log.fileno()])
+            socket.send_fds(
+                client, [json.dumps(requested).encode()], [0, log.fileno(), log.fileno()]
+            )
             client.shutdown(socket.SHUT_WR)
             code = client.recv(16)
             log.seek(0)
@@ -140,13 +142,13 @@ def _answer(connection: socket.socket) -> None:
         received, descriptors, _, _ = socket.recv_fds(connection, 1 << 20, 3)
         while more := connection.recv(1 << 20):
             received += more
-        asked = json.loads(received)
+        requested = json.loads(received)
         for number, descriptor in enumerate(descriptors):
             os.dup2(descriptor, number)
-        os.chdir(asked["folder"])
+        os.chdir(requested["folder"])
         os.environ.clear()
-        os.environ.update(asked["environment"])
-        code = _command(asked["argv"]) if "argv" in asked else _page(asked["blocks"])
+        os.environ.update(requested["environment"])
+        code = _command(requested["argv"]) if "argv" in requested else _page(requested["blocks"])
         sys.stdout.flush()
         sys.stderr.flush()
     except BaseException:  # noqa: BLE001  (a fork must never return into the server's loop)

@@ -30,12 +30,12 @@ class QoS:
     reliability: Reliability = Reliability.RELIABLE
     durability: Durability = Durability.VOLATILE
 
-    def offers(self, asked: QoS) -> bool:
+    def offers(self, requested: QoS) -> bool:
         """Whether a subscription that asks for this gets anything of a publisher with mine."""
         reliable = self.reliability is Reliability.RELIABLE
         latched = self.durability is Durability.TRANSIENT_LOCAL
-        return (reliable or asked.reliability is Reliability.BEST_EFFORT) and (
-            latched or asked.durability is Durability.VOLATILE
+        return (reliable or requested.reliability is Reliability.BEST_EFFORT) and (
+            latched or requested.durability is Durability.VOLATILE
         )
 
 
@@ -55,8 +55,8 @@ class Graph:
 
     def send(self, topic: str, message: Any, offered: QoS = VOLATILE) -> None:
         self.sent.append((self.now_ns, topic, message))
-        for asked, callback in list(self.heard.get(topic, ())):
-            if offered.offers(asked):
+        for requested, callback in list(self.heard.get(topic, ())):
+            if offered.offers(requested):
                 callback(message)
 
     def of(self, topic: str) -> list[Any]:

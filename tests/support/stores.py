@@ -182,8 +182,8 @@ def write_store(
     tags: Sequence[Mapping[str, str]] = (),
 ) -> Path:
     """A store of these recordings and their tags, one commit each, the manifest row first."""
-    for transitions, told in zip_longest(recordings, tags):
-        row = manifest(transitions, task=task, tags=told)
+    for transitions, reported in zip_longest(recordings, tags):
+        row = manifest(transitions, task=task, tags=reported)
         write_deltalake(str(path / "recordings"), row, mode="append")
         write_deltalake(str(path / "transitions"), transitions, mode="append")
     return path

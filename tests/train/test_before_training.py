@@ -329,8 +329,8 @@ def gap() -> TwinGap:
             position_p90=ends, reward_ratio=ConfidenceInterval(0.1, 0.1, 0.1),
         )  # fmt: skip
 
-    told = (verdict("nominal", 0.1), verdict("wheel_slip", 0.4), verdict("recovery", 0.0))
-    return TwinGap({}, [], [], [], told, ())
+    reported = (verdict("nominal", 0.1), verdict("wheel_slip", 0.4), verdict("recovery", 0.0))
+    return TwinGap({}, [], [], [], reported, ())
 
 
 def test_a_measured_gap_is_evidence_and_no_verdict(tmp_path: Path, gap: TwinGap) -> None:

@@ -63,16 +63,16 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
 def test_a_clone_acts_as_the_drivers_did_and_says_how_well(panel: Panel, tmp_path: Path) -> None:
     run = Run.open(kept_run(tmp_path / "run", panel=panel))
     policy = load_cloned(run, "cloned", seed=3)
-    told = policy.quality
-    assert told.drivers == ["planner", "teleop"]
-    assert told.rows == len(panel)
-    assert told.held_out_rows > 20
-    assert told.agreement is not None
-    assert told.agreement > 0.8
-    assert told.repeating is not None
-    assert told.repeating < 0.3
-    assert told.poor is None
-    assert "held-out rows it finds" in told.text
+    reported = policy.quality
+    assert reported.drivers == ["planner", "teleop"]
+    assert reported.rows == len(panel)
+    assert reported.held_out_rows > 20
+    assert reported.agreement is not None
+    assert reported.agreement > 0.8
+    assert reported.repeating is not None
+    assert reported.repeating < 0.3
+    assert reported.poor is None
+    assert "held-out rows it finds" in reported.text
     observation = np.array(panel.rows[:200, : panel.observation_size])
     action, probability = policy.act(None, observation)
     of_each = cloned_probabilities(policy.network, observation)
@@ -111,14 +111,14 @@ def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
         tables.append(table.set_column(place, field, pa.array(chance.astype(np.int16))))
     store = write_store(tmp_path / "store", tables, task=TASK)
     panel = panel_of(store, MIXTURE, tmp_path / "panel")
-    told = load_cloned(Run.open(kept_run(tmp_path / "run", panel=panel)), "cloned").quality
-    assert told.poor is not None
-    assert "a poor clone" in told.text
+    reported = load_cloned(Run.open(kept_run(tmp_path / "run", panel=panel)), "cloned").quality
+    assert reported.poor is not None
+    assert "a poor clone" in reported.text
     everything = panel_of(store, MIXTURE.replace("0.3", "0.0"), tmp_path / "all")
-    told = load_cloned(Run.open(kept_run(tmp_path / "b", panel=everything)), "cloned").quality
-    assert told.held_out_rows == 0
-    assert told.agreement is None
-    assert "the quality of the clone is not known" in told.text
+    reported = load_cloned(Run.open(kept_run(tmp_path / "b", panel=everything)), "cloned").quality
+    assert reported.held_out_rows == 0
+    assert reported.agreement is None
+    assert "the quality of the clone is not known" in reported.text
 
 
 def test_eval_drives_the_clone_beside_the_agent_and_compares_with_it(

@@ -107,9 +107,9 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
 
 
 def test_a_run_says_what_it_clones_and_how_often(panel: Panel, tmp_path: Path) -> None:
-    asked = prepare_new(tmp_path / "run", panel.path, None).config.teacher
-    assert asked.source == "operator"
-    assert asked.successes is False
+    requested = prepare_new(tmp_path / "run", panel.path, None).config.teacher
+    assert requested.source == "operator"
+    assert requested.successes is False
     logged = ["teacher.source=logs"]
     prepared = prepare_new(tmp_path / "run", panel.path, None, logged)
     teacher = prepared.config.teacher

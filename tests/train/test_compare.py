@@ -268,8 +268,8 @@ def test_what_the_treatment_allows_to_differ_is_shown_as_that(tmp_path, capsys) 
     assert code == 0
     assert (decides["updates"], decides["mix"]) == (True, False)
     page = tmp_path / "page.html"
-    asked = ["compare", *first, *second, "--treatment", "mixture"]
-    assert main([*asked, "--page", str(page)]) == 0
+    requested = ["compare", *first, *second, "--treatment", "mixture"]
+    assert main([*requested, "--page", str(page)]) == 0
     shown = capsys.readouterr()
     assert "COMPARABLE" in shown.err
     for text in (shown.out, page.read_text(encoding="utf-8")):
@@ -279,8 +279,8 @@ def test_what_the_treatment_allows_to_differ_is_shown_as_that(tmp_path, capsys) 
         assert "inconclusive\n" not in text
     # Refused for its length: the page names that, not the feed, which may differ.
     short = [str(make_run(tmp_path / "s", document(1), updates=UPDATES // 2, slip_share=0.15))]
-    asked = ["compare", *first, *short, "--treatment", "mixture", "--page", str(page)]
-    assert main(asked) == 1
+    requested = ["compare", *first, *short, "--treatment", "mixture", "--page", str(page)]
+    assert main(requested) == 1
     assert "fed differently (updates)" in page.read_text(encoding="utf-8")
 
 

@@ -56,8 +56,8 @@ def curve(path: Path, seed: int, success: dict[int, float], *, full: bool = True
 def _append(run: Run, step: int, cell: tuple[str, str], number: int, success: bool) -> None:
     row = dict.fromkeys(run.table("evaluations").schema.names)
     clocks = {"env_steps": step, "gradient_steps": step + 5}
-    told = {"condition": cell[0], "block": cell[1], "episode_seed": number, "success": success}
-    run.append("evaluations", [{**row, **clocks, **told}])
+    reported = {"condition": cell[0], "block": cell[1], "episode_seed": number, "success": success}
+    run.append("evaluations", [{**row, **clocks, **reported}])
 
 
 @given(st.lists(st.floats(0, 1), min_size=2, max_size=9), st.floats(0, 1))

@@ -102,8 +102,8 @@ def test_a_kind_of_episode_that_is_named_twice_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = kept_run(tmp_path / "a")
-    asked = ["--episodes", "nominal=2, wheel_slip=1,nominal=3", "--dry-run"]
-    assert main(["eval", str(run), *asked]) == 2
+    requested = ["--episodes", "nominal=2, wheel_slip=1,nominal=3", "--dry-run"]
+    assert main(["eval", str(run), *requested]) == 2
     assert "--episodes: names 'nominal' twice" in capsys.readouterr().err
 
 

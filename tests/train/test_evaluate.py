@@ -103,8 +103,8 @@ def test_the_summary_tells_partial_and_full_blocks_apart() -> None:
         return EpisodeResult(condition, block, 0, success, 1, 3.0, 2.0, 0.0, 0.0, None)
 
     episodes = [result("full", True), result("partial", False), result("none", True)]
-    told = {"policy": "agent", "time_lost_s": None}
-    rows = summary_rows({**one.row, **told} for one in [*episodes, result("partial", True)])
+    reported = {"policy": "agent", "time_lost_s": None}
+    rows = summary_rows({**one.row, **reported} for one in [*episodes, result("partial", True)])
     assert [row["condition"] for row in rows] == [
         "nominal",
         "blocked_aisle (full)",

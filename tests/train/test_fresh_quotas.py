@@ -161,10 +161,10 @@ def test_a_run_that_fills_quotas_resumes_bit_for_bit(
     panel: Panel, tmp_path: Path, stop_after: int
 ) -> None:
     whole = run_to_end(tmp_path / "whole", SETTINGS, logs=fed_by(panel))
-    asked = iter(range(stop_after))
+    requested = iter(range(stop_after))
     live = session(tmp_path / "cut", SETTINGS, logs=fed_by(panel))
     with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(asked, None) is None)
+        train(live, stop=lambda: next(requested, None) is None)
     live.close()
     again = session(tmp_path / "cut", SETTINGS, logs=fed_by(panel), resume=True)
     train(again)

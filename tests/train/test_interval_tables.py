@@ -47,7 +47,7 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
     rng = np.random.default_rng(seed)
     row = rng.integers(20, size=rows)
     stratum, condition, action = row % 2, row // 2 % 2, row // 4 % 2  # "unmet" and "stop": never
-    asked = slice(rows // 2)
+    requested = slice(rows // 2)
     return SourceRows(
         name="logs",
         rows={
@@ -71,7 +71,7 @@ def source(rows: int, seed: int, *, greedy: bool) -> SourceRows:
         policy=np.zeros(rows, np.int64),
         policies=["operator"],
         ages={},
-        greedy=GreedyRows(stratum[asked], condition[asked], np.full(rows, 2)[asked])
+        greedy=GreedyRows(stratum[requested], condition[requested], np.full(rows, 2)[requested])
         if greedy
         else None,
     )
@@ -100,8 +100,8 @@ def test_sums_by_stratum_condition_and_action(rows: int, seed: int, greedy: bool
         ):
             assert strata[name][code] == pytest.approx(values[mine].mean(), abs=1e-6)
     conditions = interval_tables.conditions(of)
-    met = Counter(CONDITIONS[code] for code in of.condition.tolist())
-    assert dict(zip(conditions["condition"], conditions["drawn_rows"], strict=True)) == met
+    observed = Counter(CONDITIONS[code] for code in of.condition.tolist())
+    assert dict(zip(conditions["condition"], conditions["drawn_rows"], strict=True)) == observed
 
 
 @settings(max_examples=20)
@@ -127,9 +127,9 @@ def test_every_action_of_what_was_met_has_a_row_the_never_drawn_too(
     of = source(rows, seed, greedy=greedy)
     columns = interval_tables.actions(of, ACTIONS)
     cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))
-    met = {(int(s), int(c)) for s, c in zip(of.stratum, of.condition, strict=True)}
+    observed = {(int(s), int(c)) for s, c in zip(of.stratum, of.condition, strict=True)}
     assert cells == [
-        (STRATA[s], CONDITIONS[c], action) for s, c in sorted(met) for action in ACTIONS
+        (STRATA[s], CONDITIONS[c], action) for s, c in sorted(observed) for action in ACTIONS
     ]
     for place, (stratum, condition, action) in enumerate(cells):
         pair = of.stratum == STRATA.index(stratum)
@@ -139,9 +139,9 @@ def test_every_action_of_what_was_met_has_a_row_the_never_drawn_too(
         assert columns["drawn_share"][place] == mine.sum() / pair.sum()
         assert columns["unique_rows"][place] == len(set(of.row[mine].tolist()))
         if greedy:
-            asked = pair[: rows // 2].sum()
-            assert columns["audited_rows"][place] == asked
-            assert columns["greedy_rows"][place] == (asked if action == "stop" else 0)
-            assert columns["greedy_share"][place] == ((action == "stop") if asked else None)
+            requested = pair[: rows // 2].sum()
+            assert columns["audited_rows"][place] == requested
+            assert columns["greedy_rows"][place] == (requested if action == "stop" else 0)
+            assert columns["greedy_share"][place] == ((action == "stop") if requested else None)
     if not greedy:
         assert columns["greedy_rows"] is None

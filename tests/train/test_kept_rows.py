@@ -62,13 +62,15 @@ def test_compiled_code_keeps_what_numpy_does(
             keep_rows(**one, **to)
             if place == cleared_after:
                 taken = [(rows, dict(rows.columns)) for rows in sources]
-                before = [{name: of.copy() for name, of in told.items()} for _, told in taken]
+                before = [
+                    {name: of.copy() for name, of in reported.items()} for _, reported in taken
+                ]
                 for rows, _ in taken:
                     rows.clear()
                 keep_rows(**one, **to)
-                for (_, told), held in zip(taken, before, strict=True):
+                for (_, reported), held in zip(taken, before, strict=True):
                     for name, of in held.items():
-                        assert np.array_equal(told[name], of)
+                        assert np.array_equal(reported[name], of)
     for of_compiled, of_numpy in zip(*both, strict=True):
         assert len(of_compiled) == len(of_numpy)
         for name, column in of_compiled.columns.items():

@@ -74,7 +74,7 @@ def test_without_logs_there_is_nothing_to_learn_from(
     argv = ["train", "--out", str(tmp_path / "run")]
     assert main([*argv, *flags("env.twin=false")]) == 2
     assert "there is no panel" in capsys.readouterr().err
-    asked = flags("env.twin=false", "teacher.source=operator")
-    assert main([*argv, "--panel", str(panel), *asked]) == 2
+    requested = flags("env.twin=false", "teacher.source=operator")
+    assert main([*argv, "--panel", str(panel), *requested]) == 2
     assert "needs the twin" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

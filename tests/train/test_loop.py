@@ -118,11 +118,11 @@ def test_simulating_on_another_thread_changes_nothing(undisturbed: Session, tmp_
 def test_interrupted_and_resumed_is_bit_exact(
     undisturbed: Session, tmp_path: Path, calls: int
 ) -> None:
-    asked = iter(range(calls))
+    requested = iter(range(calls))
     path = tmp_path / "a"
     live = session(path, config())
     with pytest.raises(TrainingInterrupted, match="restock train --resume"):
-        train(live, stop=lambda: next(asked, None) is None)
+        train(live, stop=lambda: next(requested, None) is None)
     live.close()
 
     again = session(path, config(), resume=True)

@@ -197,9 +197,9 @@ main(["--version"])
 """
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    path, _, told = done.stdout.splitlines()
+    path, _, reported = done.stdout.splitlines()
     assert path == "autograd"
-    assert told.startswith("native code not in use: ")
+    assert reported.startswith("native code not in use: ")
 
 
 @compiled

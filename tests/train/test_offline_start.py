@@ -208,23 +208,27 @@ def test_what_needs_held_out_logs_says_so_where_there_are_none(tmp_path: Path) -
         panel_of(rows, mixture, tmp_path / name, task=TASK)
         for name, mixture in (("whole", EVERY + NO_SPLIT), ("held", MIXTURE))
     )
-    asked = ["offline_start.choose=true", "evaluation.off_policy=true"]
+    requested = ["offline_start.choose=true", "evaluation.off_policy=true"]
     cloning = [
         *("teacher.policies=['planner']", "teacher.successes=true", "teacher.logs_share=0.5"),
         "teacher.offline_updates=7",
     ]
     no_panel = "has no effect: there is no panel"
     for panel, settings, said in (
-        (None, cloning + asked, [f"{name.split('=')[0]} {no_panel}" for name in cloning + asked]),
+        (
+            None,
+            cloning + requested,
+            [f"{name.split('=')[0]} {no_panel}" for name in cloning + requested],
+        ),
         (None, ["teacher.hidden=[8]"], []),
-        (whole, asked[:1], ["offline_start.choose has no effect: the panel holds out no rows"]),
+        (whole, requested[:1], ["offline_start.choose has no effect: the panel holds out no rows"]),
         (whole, [], []),
-        (held, asked, []),
+        (held, requested, []),
     ):
         path = None if panel is None else panel.path
         lines = describe_run(prepare_new(tmp_path / "run", path, None, settings)).splitlines()
-        told = [line.split(" (")[0] for line in lines if "has no effect" in line]
-        assert told == said
+        reported = [line.split(" (")[0] for line in lines if "has no effect" in line]
+        assert reported == said
 
 
 @pytest.mark.long
@@ -253,12 +257,12 @@ def test_a_choice_is_abandoned_and_made_by_the_resumed_run(
     train(whole)
     whole.close()
     cut = prepare_new(tmp_path / "cut", panel.path, None, settings).open()
-    asked = iter(range(2))
+    requested = iter(range(2))
 
     def stop() -> bool:
         begun = cut.learner.gradient_steps == 3
         evaluated = bool(cut.run.table("off_policy").num_rows)
-        return begun and evaluated == (during == "offline_start") and next(asked, None) is None
+        return begun and evaluated == (during == "offline_start") and next(requested, None) is None
 
     with pytest.raises(TrainingInterrupted):
         train(cut, stop=stop)

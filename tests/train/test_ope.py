@@ -190,12 +190,12 @@ def test_the_verb_evaluates_and_says_why_it_refuses(
     argv = ["eval", str(run), "--on-logs", "own"]
     assert main([*argv, "--dry-run"]) == 0  # fits nothing: it is asked what would be done
     assert not (run / "eval").exists()
-    asked = json.loads(capsys.readouterr().out)
-    assert (asked["episodes"], asked["measures"]) == (9, ["return", "success"])
-    assert "results" not in asked
+    requested = json.loads(capsys.readouterr().out)
+    assert (requested["episodes"], requested["measures"]) == (9, ["return", "success"])
+    assert "results" not in requested
     assert main(argv) == 0
     said = capsys.readouterr()
-    assert f"on 9 episodes ({asked['rows']} rows): {asked['updates']} updates" in said.err
+    assert f"on 9 episodes ({requested['rows']} rows): {requested['updates']} updates" in said.err
     assert "refused" in said.out
     assert "episodes, less than" in " ".join(said.err.split())
     assert "are estimated (cloned) for" in " ".join(said.err.split())

@@ -87,9 +87,9 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     labels = pq.read_table(folder / "run" / "episodes.parquet")["conditions"].to_pylist()
     assert {name for names in labels for name in names} >= {"creeping"}
     assert "sagging" not in {name for names in labels for name in names}
-    met = pq.read_table(folder / "run" / "conditions.parquet").to_pylist()
-    assert "sagging" in {row["condition"] for row in met if row["source"] == "logs"}
-    assert "sagging" not in {row["condition"] for row in met if row["source"] == "fresh"}
+    observed = pq.read_table(folder / "run" / "conditions.parquet").to_pylist()
+    assert "sagging" in {row["condition"] for row in observed if row["source"] == "logs"}
+    assert "sagging" not in {row["condition"] for row in observed if row["source"] == "fresh"}
 
     few = ["--episodes", "nominal=1", "--policies", "agent", "--perturbations", "none"]
     assert main(["eval", str(folder / "run"), *few]) == 0

@@ -166,15 +166,15 @@ def test_old_episodes_fade_by_their_half_life() -> None:
 
 
 def test_shares_move_at_interval_ends_and_by_no_more_than_the_limit() -> None:
-    told: list[list[float]] = []
+    reported: list[list[float]] = []
     settings = PracticeConfig(rule="success", every_env_steps=100, max_change=0.02)
-    found = Practice(settings, ARMS, told.append)
+    found = Practice(settings, ARMS, reported.append)
     found.note(ended("nominal", True, 30))
     assert found.advance(at(99)) == []
     found.advance(at(100))
     found.advance(at(250))
-    assert len(told) == 3  # at first, and twice after
-    steps = np.abs(np.diff(told, axis=0)).max(axis=1)
+    assert len(reported) == 3  # at first, and twice after
+    steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
     np.testing.assert_allclose(steps, 0.02)
 
 

@@ -315,11 +315,11 @@ def test_a_run_on_everything_at_once_resumes_bit_for_bit(
     whole: tuple[Session, Panel], tmp_path: Path
 ) -> None:
     undisturbed, built = whole
-    asked = iter(range(150))
+    requested = iter(range(150))
     path = tmp_path / "cut"
     live = session(path, SETTINGS, logs=toy_logs(built))
     with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(asked, None) is None)
+        train(live, stop=lambda: next(requested, None) is None)
     live.close()
     again = session(path, SETTINGS, logs=toy_logs(built), resume=True)
     train(again)

@@ -163,15 +163,15 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
     own = [Difference(f"library.arguments.{n}", "algorithm", None, 1) for n in ("gamma", "tau")]
 
     def compared(first, second, *, treatment):
-        asked.append((first[0].name, second[0].name, treatment))
+        requested.append((first[0].name, second[0].name, treatment))
         if treatment == "algorithm":
             return Comparison(treatment, "incomparable", [dueling], [dueling], [], [], None, [])
         return Comparison(treatment, "comparable", [dueling, *own], [], [], [], "evaluation", [])
 
-    asked: list[tuple[str, str, str]] = []
+    requested: list[tuple[str, str, str]] = []
     monkeypatch.setattr(study_run, "compare", compared)
     assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
-    assert asked == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
+    assert requested == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
     first, second = json.loads(capsys.readouterr().out)["comparisons"]
     assert (first["arm"], first["baseline"], first["treatment"]) == (
         "dueling",

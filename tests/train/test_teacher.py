@@ -209,9 +209,9 @@ def test_interrupted_and_resumed_is_bit_exact(taught: Any, tmp_path: Path) -> No
     settings = config(teacher={**TAUGHT["teacher"], "ratio": loosened})
     whole = run_to_end(tmp_path / "whole", settings, teacher=Walker())
     live = session(tmp_path / "cut", settings, teacher=Walker())
-    asked = iter(range(300))
+    requested = iter(range(300))
     with pytest.raises(TrainingInterrupted):
-        train(live, stop=lambda: next(asked, None) is None)
+        train(live, stop=lambda: next(requested, None) is None)
     assert 0 < live.progress.env_steps < 1600
     live.close()
     again = session(tmp_path / "cut", settings, teacher=Walker(), resume=True)
@@ -352,10 +352,10 @@ def test_what_a_teacher_does_to_its_observations_stays_with_it() -> None:
         observation[:] = 0
         return np.ones(len(observation), np.int64)
 
-    asked = open_teacher(TeacherConfig(source=GIVEN), TASK, seed=0, given=answer)
-    assert asked is not None
+    requested = open_teacher(TeacherConfig(source=GIVEN), TASK, seed=0, given=answer)
+    assert requested is not None
     observation = np.ones((4, 3), np.float32)
-    assert asked.ask(None, observation).tolist() == [1, 1, 1, 1]
+    assert requested.ask(None, observation).tolist() == [1, 1, 1, 1]
     assert observation.all()
 
 
@@ -442,15 +442,15 @@ def test_a_run_whose_teacher_fails_on_the_way_can_be_resumed(overlap: bool, tmp_
 
 @pytest.mark.parametrize("answer", [UNKNOWN, FORWARD])
 def test_whoever_watches_is_told_of_a_teacher_without_opinions(answer: int, tmp_path: Path) -> None:
-    told: list[tuple[str, int]] = []
+    reported: list[tuple[str, int]] = []
     live = session(
         tmp_path / "a",
         config(**TAUGHT),
         teacher=lambda env, observation: np.full(len(observation), answer),
     )
-    train(live, notify=lambda event, values: told.append((event, values.get("asked", 0))))
+    train(live, notify=lambda event, values: reported.append((event, values.get("asked", 0))))
     live.close()
-    notes = [asked for event, asked in told if event == "teacher"]
+    notes = [requested for event, requested in reported if event == "teacher"]
     if answer == FORWARD:
         assert notes == []
     else:  # once early, and once at the end

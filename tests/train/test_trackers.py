@@ -36,10 +36,10 @@ class Broken:
 
     def __init__(self, fails_after: int = 0) -> None:
         self.taken: list[int] = []
-        self.asked, self.fails_after = 0, fails_after
+        self.requested, self.fails_after = 0, fails_after
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        self.asked += 1
+        self.requested += 1
         if len(self.taken) >= self.fails_after:
             raise ConnectionError("the server is gone")
         self.taken.append(step)
@@ -78,7 +78,7 @@ def test_a_sink_that_fails_is_counted_and_said_and_left_alone(tmp_path: Path) ->
         events.scalars(step, "train", {"loss": 1.0})
     events.close()
     assert broken.taken == [0, 1]
-    assert broken.asked == 2 + GIVE_UP_AFTER
+    assert broken.requested == 2 + GIVE_UP_AFTER
     assert tracked(tmp_path)["failures"] == {
         "mlflow": {"failed": GIVE_UP_AFTER, "first": "ConnectionError: the server is gone"}
     }
@@ -123,9 +123,9 @@ def test_a_tracker_that_is_not_installed_is_refused_before_anything_is_written(
     monkeypatch.setattr(importlib.util, "find_spec", absent)
     words = ["train", "--out", str(tmp_path / "run"), "--set", 'record.trackers=["wandb"]']
     assert cli.main(words) == 2
-    told = capsys.readouterr().err
-    assert "wandb is not installed" in told
-    assert install_command("track") in told
+    reported = capsys.readouterr().err
+    assert "wandb is not installed" in reported
+    assert install_command("track") in reported
     assert not (tmp_path / "run").exists()
 
 

@@ -46,8 +46,8 @@ def plan_of(folder: Path, text: str = TEXT) -> SearchPlan:
 
 def episodes(**successes: tuple[int, int]) -> pa.Table:
     rows = [
-        {"condition": condition, "success": index < met}
-        for condition, (met, count) in successes.items()
+        {"condition": condition, "success": index < observed}
+        for condition, (observed, count) in successes.items()
         for index in range(count)
     ]
     return pa.Table.from_pylist(rows)
@@ -57,10 +57,10 @@ def episodes(**successes: tuple[int, int]) -> pa.Table:
 def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """Runs that cost nothing: the larger the step size, the better in the one rare condition."""
     pytest.importorskip("optuna", reason="optuna is not installed: restock[tune]")
-    asked: list[tuple[str, ...]] = []
+    requested: list[tuple[str, ...]] = []
 
     def train(path: Path, settings: list[str], *_: Any) -> bool:
-        asked.append(tuple(settings))
+        requested.append(tuple(settings))
         path.mkdir(parents=True)
         (path / "settings").write_text("\n".join(settings))
         return True
@@ -73,7 +73,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     monkeypatch.setattr(tuning, "restock_verb", lambda words, log: None)
     monkeypatch.setattr(tuning.Run, "open", lambda path: path)
     monkeypatch.setattr(tuning, "agent_episodes", evaluated)
-    return asked
+    return requested
 
 
 def test_the_objective_is_the_worst_conditions_lower_bound_over_all_seeds() -> None:
@@ -196,18 +196,18 @@ def test_a_trial_is_told_of_the_evaluations_of_its_training(tmp_path: Path) -> N
         def should_prune(self) -> bool:
             return self.reports[-1][0] < 0.2
 
-    trial, told = Trial(), set[int]()
-    assert not tuning._falls_behind(trial, tmp_path, told, 0)  # nothing is evaluated yet
+    trial, reported = Trial(), set[int]()
+    assert not tuning._falls_behind(trial, tmp_path, reported, 0)  # nothing is evaluated yet
     rows = [
-        {"env_steps": steps, "condition": "nominal", "success": index < met}
-        for steps, met in ((0, 9), (200, 2))
+        {"env_steps": steps, "condition": "nominal", "success": index < observed}
+        for steps, observed in ((0, 9), (200, 2))
         for index in range(10)
     ]
     pq.write_table(pa.Table.from_pylist(rows[:10]), tmp_path / "evaluations.parquet")
-    assert not tuning._falls_behind(trial, tmp_path, told, 0)
-    assert not tuning._falls_behind(trial, tmp_path, told, 0)
+    assert not tuning._falls_behind(trial, tmp_path, reported, 0)
+    assert not tuning._falls_behind(trial, tmp_path, reported, 0)
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "evaluations.parquet")
-    assert tuning._falls_behind(trial, tmp_path, told, 0)
+    assert tuning._falls_behind(trial, tmp_path, reported, 0)
     assert trial.reports == [(wilson(9, 10)[0], 0), (wilson(2, 10)[0], 200)]
 
 

@@ -265,8 +265,8 @@ def test_an_episode_of_the_evaluation_stands_beside_it(event: Event, tmp_path: P
     assert sum(reward.data for reward in of("reward")) == pytest.approx(recorded["return"], 1e-4)
     assert len(of("critic/td_error")) == len(of("pose"))
     assert of("racks")[0].markers
-    told = json.loads(of("moment")[0].data)
-    assert (told["condition"], told["success"]) == ("wheel_slip", recorded["success"])
+    reported = json.loads(of("moment")[0].data)
+    assert (reported["condition"], reported["success"]) == ("wheel_slip", recorded["success"])
     assert len(decoded["/restock/pose"]) == len(event.steps)  # the logged one, as without it
     layout = json.loads(layout_of(path).read_text())["configById"]
     assert layout["3D!evaluation"]["fixedFrame"] == "evaluation_map"

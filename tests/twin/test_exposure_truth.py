@@ -38,18 +38,18 @@ def test_what_is_true_of_a_small_robot_follows_its_size() -> None:
         (usual, [True, True], [True, True]),
     ):
         truth = Truth(task, 2)
-        told = truth.condition(no, no, np.array([0.05, 0.1]))
-        assert [text == "near_collision" for text in told] == near
+        reported = truth.condition(no, no, np.array([0.05, 0.1]))
+        assert [text == "near_collision" for text in reported] == near
         truth.condition(no, no, np.full(2, 0.16))  # .16 m is room again for the small one alone
-        told = truth.condition(no, no, np.full(2, 0.16))
-        assert [text == "recovery" for text in told] == room
+        reported = truth.condition(no, no, np.full(2, 0.16))
+        assert [text == "recovery" for text in reported] == room
     assert (small.slip_limit_mps, usual.slip_limit_mps) == (0.03, 0.15)
 
 
 @pytest.mark.long
 def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episodes() -> None:
     """Truth comes from what is there; exposures are told by what the robot senses."""
-    told: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
+    reported: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     true: dict[str, set[tuple[str, int]]] = {name: set() for name in EXPOSURES}
     for kind in KINDS:
         made = WarehouseVectorEnv(12)
@@ -74,14 +74,14 @@ def test_the_true_exposure_shows_where_its_cause_is_and_the_rules_find_its_episo
         ).filter(pa.array(np.stack(number, axis=1).ravel() >= 0))
         for name, held in label(table, list(shipped(kind="exposure").values())).items():
             episodes = table["episode_index"].to_numpy()[held]
-            told[name] |= {(kind, int(episode)) for episode in np.unique(episodes)}
+            reported[name] |= {(kind, int(episode)) for episode in np.unique(episodes)}
     causes = {"closing_traffic": "near_collision", "plan_blocked": "blocked_aisle",
               "slippery_floor": "wheel_slip"}  # fmt: skip
     for name, cause in causes.items():
         assert {kind for kind, _ in true[name]} == {cause}
         assert len(true[name]) >= 8
-        assert len(told[name] & true[name]) >= 0.8 * len(true[name])
+        assert len(reported[name] & true[name]) >= 0.8 * len(true[name])
     for name in ("closing_traffic", "slippery_floor"):
-        assert len(told[name] & true[name]) >= 0.8 * len(told[name])
+        assert len(reported[name] & true[name]) >= 0.8 * len(reported[name])
     # Who stands on the plan cannot be told from a pallet.
-    assert {kind for kind, _ in told["plan_blocked"]} <= {"blocked_aisle", "near_collision"}
+    assert {kind for kind, _ in reported["plan_blocked"]} <= {"blocked_aisle", "near_collision"}

@@ -87,10 +87,10 @@ def test_rounds_drive_on_until_enough_met_their_kind_and_never_without_end() -> 
         for number, mission in enumerate(one_round):
             driven.append(mission)
             # Every second slip is met, a near collision never.
-            missions.note(mission, met=mission.order == 0 and number % 2 == 0)
+            missions.note(mission, observed=mission.order == 0 and number % 2 == 0)
     kinds = [mission.spec.condition for mission in driven]
     assert kinds.count("near_collision") == MAX_DRIVEN * 2
-    assert missions.met[0] == 4 or kinds.count("wheel_slip") == MAX_DRIVEN * 4
+    assert missions.observed[0] == 4 or kinds.count("wheel_slip") == MAX_DRIVEN * 4
     assert len({mission.spec.seed for mission in driven}) == len(driven)
     assert not missions.owed()
 
@@ -163,8 +163,8 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
         found: dict[str, object] = json.loads(capsys.readouterr().out)
         return found
 
-    store, asked = str(tmp_path / "store"), tmp_path / "asked.toml"
-    asked.write_text(
+    store, requested = str(tmp_path / "store"), tmp_path / "asked.toml"
+    requested.write_text(
         'max_replays_per_row = 20\nplanned = {updates = 1000, batch_size = 64}\n'
         '[[strata]]\nname = "nominal"\nunit = "episode"\nshare = 0.5\n'
         '[[strata]]\nname = "wheel_slip"\nunit = "episode"\nshare = 0.5\n'
@@ -174,7 +174,7 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
     run("record", "--out", str(tmp_path / "first.mcap"), *first)
     assert main(["ingest", str(tmp_path / "first.mcap"), "--store", store]) == 0
     capsys.readouterr()
-    gaps = ["gaps", store, "--mixture", str(asked), "--no-audits"]
+    gaps = ["gaps", store, "--mixture", str(requested), "--no-audits"]
     before = run(*gaps, "--missions-out", str(tmp_path / "next.toml"), "--confidence", "0.9")
     missing = {gap["cell"]: gap for gap in before["gaps"]}  # type: ignore[attr-defined]
     assert "wheel_slip" in missing

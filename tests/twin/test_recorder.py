@@ -56,8 +56,10 @@ def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
         )
         with Store(store) as opened:
             tables.append(opened.sql(query).to_arrow_table())
-            told = "SELECT DISTINCT robot, tags, date_trunc('hour', logged_time) FROM transitions"
-            assert opened.sql(told).fetchall() == [("amr-07", tags, datetime(2026, 10, 5, 8))]
+            reported = (
+                "SELECT DISTINCT robot, tags, date_trunc('hour', logged_time) FROM transitions"
+            )
+            assert opened.sql(reported).fetchall() == [("amr-07", tags, datetime(2026, 10, 5, 8))]
     assert len(tables[0]) > 20
     assert tables[0].equals(tables[1])
 

@@ -128,8 +128,8 @@ class Window:
             return [] if symptom.replay_share else ["is not in replay"]
         if symptom.supply >= limits.supply:
             return []
-        share, met = symptom.replay_share, symptom.met_share
-        return [f"is {share:.2%} of replay and {met:.1%} of the steps when driving"]
+        share, observed = symptom.replay_share, symptom.met_share
+        return [f"is {share:.2%} of replay and {observed:.1%} of the steps when driving"]
 
     def _rows(self, symptom: Symptom, least: float, limits: DiagnosisLimits) -> list[str]:
         reasons = []
@@ -281,8 +281,8 @@ def _window(rows: list[dict[str, Any]], bound: float) -> Window:
     weight = sum(row["evaluation_rows"] for row in known_well)
     # Less than nothing counts as nothing: where robots stand, targets hardly vary, and a share of
     # that is of any size.
-    told = [row["explained"] for row in judged or known_well if row["explained"] is not None]
-    known = [max(share, 0.0) for share in told]
+    reported = [row["explained"] for row in judged or known_well if row["explained"] is not None]
+    known = [max(share, 0.0) for share in reported]
 
     def mean(name: str) -> float:
         return float(sum(row[name] * row["evaluation_rows"] for row in known_well) / weight)

@@ -196,22 +196,22 @@ def refuse_unknown(
             _perturb(name)
 
 
-def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
+def episodes_of_kind(requested: int | str | Mapping[str, int]) -> dict[str, int]:
     """Episodes by kind: so many of each, or those that are named, as text `kind=N,kind=N`.
 
     Raises:
         ConfigError: no such kind, or not a number of at least 1.
     """
     where = "--episodes"
-    if isinstance(asked, str):
-        parts = [part.partition("=") for part in asked.split(",") if part.strip()]
+    if isinstance(requested, str):
+        parts = [part.partition("=") for part in requested.split(",") if part.strip()]
         named = any(sign for _, sign, _ in parts)
         try:
             found = {kind.strip(): int(count) for kind, _, count in parts} if named else None
-            asked = int(asked) if found is None else found
+            requested = int(requested) if found is None else found
         except ValueError:
             raise ConfigError(
-                f"{asked!r} is neither a number nor kind=number,…",
+                f"{requested!r} is neither a number nor kind=number,…",
                 where=where,
                 remedy="write 20, or nominal=1000,wheel_slip=300",
             ) from None
@@ -219,15 +219,15 @@ def episodes_of_kind(asked: int | str | Mapping[str, int]) -> dict[str, int]:
             kinds = [kind.strip() for kind, _, _ in parts]
             twice = next(kind for kind in kinds if kinds.count(kind) > 1)
             raise ConfigError(f"names {twice!r} twice", where=where, remedy="name each kind once")
-    if isinstance(asked, int):
-        asked = dict.fromkeys(KINDS, asked)
-    if unknown := [kind for kind in asked if kind not in KINDS]:
+    if isinstance(requested, int):
+        requested = dict.fromkeys(KINDS, requested)
+    if unknown := [kind for kind in requested if kind not in KINDS]:
         remedy = f"choose from {', '.join(KINDS)}"
         raise ConfigError(f"there is no kind {unknown[0]!r}", where=where, remedy=remedy)
-    least = min(asked.values(), default=0)
+    least = min(requested.values(), default=0)
     if least < 1:
         raise ConfigError(f"must be at least 1, got {least}", where=where)
-    return dict(asked)
+    return dict(requested)
 
 
 def _is_path(what: str, name: str) -> bool:

@@ -34,17 +34,20 @@ class FreshStrata:
         self, mixture: Mixture, names: Sequence[str], conditions: Sequence[Condition]
     ) -> None:
         self.names = tuple(names)
-        told = {condition.name: condition for condition in conditions}
+        reported = {condition.name: condition for condition in conditions}
         rules = rules_of(mixture, names)
         self.known: Bools = np.array(
-            [rule.where is None and (rule.name == NOMINAL or rule.name in told) for rule in rules]
+            [
+                rule.where is None and (rule.name == NOMINAL or rule.name in reported)
+                for rule in rules
+            ]
         )
         self.exposures = [c for c in of_kind(conditions, "exposure") if c.name in self.names]
         self._by_rarity = mixture.prefer == "rarest"
         self._outcomes = [condition.name for condition in of_kind(conditions, "outcome")]
         self._strata = []
         for rule in rules:
-            own = told[rule.name].priority if rule.name in told else NOMINAL_PRIORITY
+            own = reported[rule.name].priority if rule.name in reported else NOMINAL_PRIORITY
             priority = own if rule.priority is None else rule.priority
             self._strata.append(ResolvedStratum(rule, "", None, priority, "pre", "none"))
 
@@ -77,8 +80,8 @@ class FreshStrata:
             member[:, index] = holds
         code = assign(member, self._strata)
         if self._by_rarity:
-            met = [i for i, s in enumerate(self._strata) if s.dealt and steps and member[0, i]]
-            if met:
-                fewest = min(met, key=lambda i: (rows[i], self._strata[i].priority))
-                code[np.isin(code, met)] = fewest
+            observed = [i for i, s in enumerate(self._strata) if s.dealt and steps and member[0, i]]
+            if observed:
+                fewest = min(observed, key=lambda i: (rows[i], self._strata[i].priority))
+                code[np.isin(code, observed)] = fewest
         return code

@@ -195,17 +195,17 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
     q = learner.network(states)
     chosen = q.masked_fill(~plausible, -torch.inf).argmax(dim=1)
     answer = torch.from_numpy(action).to(learner.device)
-    asked = answer != UNKNOWN
+    requested = answer != UNKNOWN
     teachers = answer.clamp_min(0)
 
     def share(of: torch.Tensor) -> float | None:
-        return float(of[asked].float().mean()) if bool(asked.any()) else None
+        return float(of[requested].float().mean()) if bool(requested.any()) else None
 
     return {
         "ratio": learner.behaviour.in_force,
         "rows": len(action),
-        "asked_rows": int(asked.sum()),
-        "loss": float(imitation_loss(logits, answer)) if bool(asked.any()) else None,
+        "asked_rows": int(requested.sum()),
+        "loss": float(imitation_loss(logits, answer)) if bool(requested.any()) else None,
         "agreement": share(logits.argmax(dim=1) == teachers),
         "plausible_actions": float(plausible.sum(dim=1).float().mean()),
         "teacher_plausible": share(plausible.gather(1, teachers.unsqueeze(1)).squeeze(1)),

@@ -186,15 +186,15 @@ def conditions(source: SourceRows) -> Columns:
     """Of `conditions`."""
     drawn = source.drawn.sum(axis=(0, 2))
     weight, td, q = (source.sums[name].sum(axis=0) for name in ("weight", "td_abs", "q"))
-    met = np.flatnonzero(drawn)
+    observed = np.flatnonzero(drawn)
     return {
         "source": source.name,
-        "condition": np.array(source.conditions, object)[met],
-        "drawn_rows": drawn[met],
-        "drawn_share": drawn[met] / len(source.condition),
-        "effective_share": weight[met] / max(weight.sum(), 1e-12),
-        "td_abs_mean": td[met] / drawn[met],
-        "q_mean": q[met] / drawn[met],
+        "condition": np.array(source.conditions, object)[observed],
+        "drawn_rows": drawn[observed],
+        "drawn_share": drawn[observed] / len(source.condition),
+        "effective_share": weight[observed] / max(weight.sum(), 1e-12),
+        "td_abs_mean": td[observed] / drawn[observed],
+        "q_mean": q[observed] / drawn[observed],
     }
 
 
@@ -242,12 +242,12 @@ def ages(unit: str, age: F64) -> Columns:
     """Of `ages`, without the source."""
     # 2**bucket <= age < 2**(bucket + 1); -1 below 1
     rows = np.bincount(np.frexp(np.maximum(age, 0.5))[1])
-    met = np.flatnonzero(rows)
+    observed = np.flatnonzero(rows)
     quantiles = np.quantile(age, [0.5, 0.9, 0.99]).tolist()
     return {
         "unit": unit,
-        "bucket": met - 1,
-        "count": rows[met],
+        "bucket": observed - 1,
+        "count": rows[observed],
         **dict(zip(("p50", "p90", "p99"), quantiles, strict=True)),
     }
 
@@ -268,11 +268,11 @@ def sampled_episodes(source: SourceRows) -> Columns:
 def policies(source: SourceRows) -> Columns:
     """Of `policies`."""
     counts = np.bincount(source.policy, minlength=len(source.policies))
-    met = np.flatnonzero(counts)
+    observed = np.flatnonzero(counts)
     return {
         "source": source.name,
-        "behaviour_policy": np.array(source.policies, object)[met],
-        "rows": counts[met],
+        "behaviour_policy": np.array(source.policies, object)[observed],
+        "rows": counts[observed],
     }
 
 

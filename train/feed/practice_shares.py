@@ -69,17 +69,17 @@ def logged_shares(condition: Coded, episode: Coded, kinds: Sequence[str]) -> dic
     """
     codes = {name: code for code, name in enumerate(condition.names)}
     everyone = np.unique(episode.codes)
-    met: dict[str, int] = {}
+    observed: dict[str, int] = {}
     rare = np.zeros(0, np.int64)
     for kind in kinds:
         if kind == "nominal" or kind not in codes:
             continue
         of_kind = np.unique(episode.codes[condition.codes == codes[kind]])
-        met[kind], rare = len(of_kind), np.union1d(rare, of_kind)
+        observed[kind], rare = len(of_kind), np.union1d(rare, of_kind)
     if "nominal" in kinds:
-        met = {"nominal": len(everyone) - len(rare), **met}
-    total = sum(met.values())
-    return {kind: count / total for kind, count in met.items()} if total else {}
+        observed = {"nominal": len(everyone) - len(rare), **observed}
+    total = sum(observed.values())
+    return {kind: count / total for kind, count in observed.items()} if total else {}
 
 
 __all__ = ["logged_shares", "moved", "unordered", "with_floors"]

@@ -91,7 +91,7 @@ class AskedTeacher(Stateful):
 
     def __init__(self, teacher: Teacher, task: Task, name: str) -> None:
         self._teacher, self._actions, self._name = teacher, task.action_names, name
-        self.asked = self.answered = 0  # states since this process began
+        self.requested = self.answered = 0  # states since this process began
 
     def ask(self, env: Any, observation: F32) -> Label:
         """What it would do, (N,); UNKNOWN where it has no opinion.
@@ -120,7 +120,7 @@ class AskedTeacher(Stateful):
                 f"returned action {int(label[env_index])} for environment {env_index}: the task's"
                 f" are 0 to {len(self._actions) - 1}"
             )
-        self.asked += count
+        self.requested += count
         self.answered += int((label != UNKNOWN).sum())
         return label.astype(np.int16)
 

@@ -92,10 +92,10 @@ def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
     """
     table = read_evaluations(run)
     every = table.num_rows
-    asked = pa.array(
+    requested = pa.array(
         [str(on).endswith(WAYS) == ways for on in table["layouts"].to_pylist()], pa.bool_()
     )
-    some = table.filter(asked)
+    some = table.filter(requested)
     if some.num_rows or ways:
         table = some
     if not table.num_rows:

@@ -88,12 +88,12 @@ def _bumps_per_km(episodes: Sequence[Row]) -> ConfidenceInterval:
 
     Where nothing was touched resamples do not vary: the upper end is then that of a Poisson rate.
     """
-    told = [row for row in episodes if row["distance_m"] is not None]
-    km = np.array([row["distance_m"] / 1000 for row in told])
-    bumps = np.array([row["bumps"] for row in told])
+    reported = [row for row in episodes if row["distance_m"] is not None]
+    km = np.array([row["distance_m"] / 1000 for row in reported])
+    bumps = np.array([row["bumps"] for row in reported])
     if not bumps.any() and km.sum():
         return ConfidenceInterval(0.0, 0.0, -math.log(0.025) / float(km.sum()))
-    return clustered_ratio(bumps, km, np.arange(len(told)), rng=np.random.default_rng(0))
+    return clustered_ratio(bumps, km, np.arange(len(reported)), rng=np.random.default_rng(0))
 
 
 def _mean(name: str, values: Iterable[float]) -> dict[str, float | None]:

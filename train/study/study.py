@@ -337,15 +337,15 @@ def check_jobs(plan: StudyPlan) -> None:
                 )
             continue
         made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
-        asked = json.loads(plan.fingerprint(job))
-        if made.get("panel") and asked["panel"]:  # an earlier Restock wrote the whole path
-            parts = Path(asked["panel"]).parts
+        requested = json.loads(plan.fingerprint(job))
+        if made.get("panel") and requested["panel"]:  # an earlier Restock wrote the whole path
+            parts = Path(requested["panel"]).parts
             if Path(made["panel"]).parts[-len(parts) :] == parts:
-                made["panel"] = asked["panel"]
-        if made != asked:
+                made["panel"] = requested["panel"]
+        if made != requested:
             raise RunError(
                 "was made otherwise than the study now asks: then "
-                f"{_only(made, asked)}, now {_only(asked, made)}",
+                f"{_only(made, requested)}, now {_only(requested, made)}",
                 where=str(job.path),
                 remedy="remove it, or give the study another --out",
             )
@@ -353,13 +353,13 @@ def check_jobs(plan: StudyPlan) -> None:
 
 def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """What one request says and the other does not."""
-    told = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
-    told += [
+    reported = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
+    reported += [
         f"{key} = {json.dumps(value)}"
         for key, value in one.items()
         if key != "settings" and other.get(key) != value
     ]
-    return ", ".join(told) or "the default"
+    return ", ".join(reported) or "the default"
 
 
 __all__ = [

@@ -239,16 +239,16 @@ def episodes_flags(evaluation: StudyEvaluation) -> list[str]:
 def _drive_references(plan: StudyPlan, say: Say) -> None:
     """The planner and the operator on the episodes of the runs, once; kept by the first run."""
     evaluation, path = plan.study.evaluation, plan.jobs[0].path
-    done, asked = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
+    done, requested = path / "references.json", msgspec.json.encode(evaluation).decode() + "\n"
     if not evaluation.references:
         return
-    if done.exists() and done.read_text(encoding="utf-8") == asked:
+    if done.exists() and done.read_text(encoding="utf-8") == requested:
         return
     say(f"driving {', '.join(evaluation.references)}")
     policies = ",".join(evaluation.references)
     arguments = ["eval", str(path), "--policies", policies, "--perturbations", "none"]
     restock_verb([*arguments, *episodes_flags(evaluation)], plan.out / "logs" / "references.log")
-    write_text(done, asked)
+    write_text(done, requested)
 
 
 def _train_library(plan: StudyPlan, job: StudyJob, library: Library, log: Path, say: Say) -> None:

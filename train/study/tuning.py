@@ -67,10 +67,10 @@ class SearchPlan:
     @property
     def fingerprint(self) -> str:
         """What the trials of a search have in common, as JSON."""
-        asked = msgspec.to_builtins(self.search)
+        requested = msgspec.to_builtins(self.search)
         for free in ("doc", "trials"):
-            asked.pop(free)
-        return json.dumps(asked, indent=1, sort_keys=True) + "\n"
+            requested.pop(free)
+        return json.dumps(requested, indent=1, sort_keys=True) + "\n"
 
 
 def require_optuna() -> Any:
@@ -91,15 +91,15 @@ def run_search(plan: SearchPlan, *, say: Say = lambda line: None) -> dict[str, A
     """
     optuna = require_optuna()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    asked = plan.out / SEARCH
-    if asked.exists() and asked.read_text(encoding="utf-8") != plan.fingerprint:
+    requested = plan.out / SEARCH
+    if requested.exists() and requested.read_text(encoding="utf-8") != plan.fingerprint:
         raise RunError(
             "is of another search: its space, settings, seeds or evaluation were different",
             where=str(plan.out),
             remedy="choose another --out; only `trials` and `doc` may change",
         )
     plan.out.mkdir(parents=True, exist_ok=True)
-    write_text(asked, plan.fingerprint)
+    write_text(requested, plan.fingerprint)
     backend = optuna.storages.journal.JournalFileBackend(str(plan.out / TRIALS))
     search = plan.search
     study = optuna.create_study(
@@ -170,7 +170,7 @@ def worst_condition(tables: Iterable[pa.Table]) -> tuple[float, str]:
             counts.setdefault(condition, []).append(success)
     if not counts:
         raise RunError("no episode was driven: there is nothing to compare", where="[space]")
-    bounds = {name: wilson(sum(met), len(met))[0] for name, met in counts.items()}
+    bounds = {name: wilson(sum(observed), len(observed))[0] for name, observed in counts.items()}
     condition = min(sorted(bounds), key=lambda name: bounds[name])
     return bounds[condition], condition
 
@@ -220,7 +220,7 @@ def _train(
     """Train a run, telling the trial of its evaluations; False where it was stopped by them."""
     words = train_words(path, settings, panel)
     log.parent.mkdir(parents=True, exist_ok=True)
-    told: set[int] = set()
+    reported: set[int] = set()
     stopped = False
     with kill_as_interrupt(), log.open("a", encoding="utf-8") as file:
         file.write(f"$ restock {' '.join(words)}\n")
@@ -236,7 +236,11 @@ def _train(
         with ended_with_us(process):
             while process.poll() is None:
                 time.sleep(_POLL_S)
-                if trial is not None and not stopped and _falls_behind(trial, path, told, index):
+                if (
+                    trial is not None
+                    and not stopped
+                    and _falls_behind(trial, path, reported, index)
+                ):
                     process.send_signal(signal.SIGINT)  # it checkpoints and ends
                     stopped = True
     if process.returncode == 130 and not stopped:
@@ -249,11 +253,11 @@ def _train(
             remedy="correct it and run the same command again: finished trials are kept",
         )
     if trial is not None and not stopped:  # what it evaluated since it was last looked at
-        _falls_behind(trial, path, told, index)
+        _falls_behind(trial, path, reported, index)
     return not stopped
 
 
-def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:
+def _falls_behind(trial: Any, path: Path, reported: set[int], index: int) -> bool:
     """Tell the trial of the run's new evaluations; whether it is to be stopped."""
     file = path / "evaluations.parquet"
     if not file.exists():
@@ -261,8 +265,8 @@ def _falls_behind(trial: Any, path: Path, told: set[int], index: int) -> bool:
     import pyarrow.compute as pc  # slow to import
 
     table = read_table(file, columns=["env_steps", "condition", "success"], error=RunError)
-    for steps in sorted(set(table["env_steps"].to_pylist()) - told):
-        told.add(steps)
+    for steps in sorted(set(table["env_steps"].to_pylist()) - reported):
+        reported.add(steps)
         bound, _ = worst_condition([table.filter(pc.equal(table["env_steps"], steps))])
         # Seeds follow each other: each has its own stretch of steps.
         trial.report(bound, index * 1_000_000_000 + steps)

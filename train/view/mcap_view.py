@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 from restock.ingest.decoding.messages import Channel
 from restock.replay.trace.moment import Moment
 from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.twin.recording.messages import build, serialise, stamp, typestore
 from restock.train.view.critic import Critic
-from restock.train.view.told import about, about_evaluated, numbers_of, texts_of
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside
@@ -122,7 +122,7 @@ def _schema(
     return known[kind, definition]
 
 
-def _shown(moment: Moment, critic: Critic | None, side: _Side, told: str) -> Iterator[_Shown]:
+def _shown(moment: Moment, critic: Critic | None, side: _Side, reported: str) -> Iterator[_Shown]:
     """Restock's messages of every step, then of every tick of the recording; `told` of the row."""
     sectors = moment.sector_scans()
     for index, (step, log_ns) in enumerate(zip(moment.steps, moment.log_ns, strict=True)):
@@ -172,7 +172,7 @@ def _shown(moment: Moment, critic: Critic | None, side: _Side, told: str) -> Ite
                 content = build("std_msgs/msg/Float64", data=number)
                 yield log_ns, f"{side.topics}/{name}", "std_msgs/msg/Float64", content
         if step["transition_id"] == moment.at["transition_id"]:
-            content = build("std_msgs/msg/String", data=told)
+            content = build("std_msgs/msg/String", data=reported)
             yield log_ns, f"{side.topics}/moment", "std_msgs/msg/String", content
     yield from _recorded(moment, side)
 
@@ -215,7 +215,7 @@ def _beside(beside: Beside) -> Iterator[_Shown]:
     """The episode of the evaluation: what the logged one has, and what only a twin knows."""
     evaluated, side = beside.evaluated, _EVALUATED
     moment = evaluated.moment
-    told = about_evaluated(evaluated, beside.critic)
+    reported = about_evaluated(evaluated, beside.critic)
     kind = "visualization_msgs/msg/MarkerArray"
     racks = [
         _marker(side, 0, number, _BOX, ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), (x1 - x0, y1 - y0, 1.0))
@@ -230,7 +230,7 @@ def _beside(beside: Beside) -> Iterator[_Shown]:
         gone = {"action": _DELETE_ALL, "header": {"frame_id": side.map}}
         content = build(kind, markers=[build("visualization_msgs/msg/Marker", **gone), *markers])
         yield log_ns, f"{side.topics}/others", kind, content
-    yield from _shown(moment, beside.critic, side, told)
+    yield from _shown(moment, beside.critic, side, reported)
 
 
 def _others(found: dict[str, Any]) -> Iterator[tuple[int, Any, tuple[float, float, float], Any]]:

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 from restock.arrays import F64
 from restock.imports import import_extra
 from restock.replay.trace.moment import Moment
 from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.view.critic import Critic
-from restock.train.view.told import about, about_evaluated, numbers_of, texts_of
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside, Evaluated
@@ -51,15 +51,15 @@ def write_rerun(
         log.below = "evaluation/"
         evaluated = beside.evaluated
         _floor(log, rr, evaluated)
-        told = about_evaluated(evaluated, beside.critic)
-        _steps(log, rr, evaluated.moment, beside.critic, told)
+        reported = about_evaluated(evaluated, beside.critic)
+        _steps(log, rr, evaluated.moment, beside.critic, reported)
     stream.flush()
     stream.disconnect()
     return dict(sorted(log.counts.items()))
 
 
-def _steps(log: _Log, rr: Any, moment: Moment, critic: Critic | None, told: str) -> None:
-    log.put("moment", rr.TextDocument(told), static=True)
+def _steps(log: _Log, rr: Any, moment: Moment, critic: Critic | None, reported: str) -> None:
+    log.put("moment", rr.TextDocument(reported), static=True)
     body = moment.task.body
     half = (body.length_m / 2, body.width_m / 2, 0.1)
     box = rr.Boxes3D(half_sizes=[half], centers=[(0, 0, 0.1)], colors=[(240, 130, 30)])
@@ -195,6 +195,6 @@ def _blueprint(critic: Critic | None, beside: Beside | None) -> Any:
     if beside is not None:
         floors.append(rrb.Spatial3DView(origin="/evaluation/map", name="evaluation"))
         shares.insert(0, 5)
-    told = rrb.TextDocumentView(origin="/moment", name="moment")
-    left = rrb.Vertical(*floors, told, row_shares=shares)
+    reported = rrb.TextDocumentView(origin="/moment", name="moment")
+    left = rrb.Vertical(*floors, reported, row_shares=shares)
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)

@@ -120,7 +120,7 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
     return CommandHold(age, holds, tuple(comments))
 
 
-def settled_speeds(told_s: F64, told: F64, at_s: F64, measured: F64, fastest: float) -> F64:
+def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
     """What was measured (K,) where the fastest commands had settled, positive along the command.
 
     Args:
@@ -128,17 +128,19 @@ def settled_speeds(told_s: F64, told: F64, at_s: F64, measured: F64, fastest: fl
         at_s, measured: of the odometry (M,), on the same clock.
         fastest: that was commanded now and then; above 0.
     """
-    if not len(told):
+    if not len(reported):
         return np.zeros(0)
-    fast = np.abs(told) >= NEARLY * fastest
+    fast = np.abs(reported) >= NEARLY * fastest
     # Since when the commands have been fast, one way, without a break.
-    begins = np.append(True, (fast[1:] != fast[:-1]) | (np.sign(told[1:]) != np.sign(told[:-1])))
-    since_s = told_s[np.maximum.accumulate(np.where(begins, np.arange(len(told)), 0))]
+    begins = np.append(
+        True, (fast[1:] != fast[:-1]) | (np.sign(reported[1:]) != np.sign(reported[:-1]))
+    )
+    since_s = told_s[np.maximum.accumulate(np.where(begins, np.arange(len(reported)), 0))]
     index = np.searchsorted(told_s, at_s, "right") - 1
     row = np.maximum(index, 0)
     settled = (index >= 0) & fast[row] & (at_s - since_s[row] >= SETTLED_S)
     settled &= at_s - told_s[row] < SETTLED_S  # the command is no old one
-    along = (measured * np.sign(told[row]))[settled]
+    along = (measured * np.sign(reported[row]))[settled]
     return np.asarray(along[np.isfinite(along)], np.float64)
 
 

@@ -68,9 +68,9 @@ class DriveEvidence:
     @property
     def _declined(self) -> bool:
         """Told to turn on the spot it did not, though it can move."""
-        told = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
+        reported = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         drove = self.driven_m >= MIN_DRIVEN_M
-        return told and drove and self.followed_rad < FOLLOWS * self.asked_rad
+        return reported and drove and self.followed_rad < FOLLOWS * self.asked_rad
 
     @property
     def turning_m(self) -> float | None:
@@ -83,17 +83,19 @@ class DriveEvidence:
         if self.pivots:
             turned = max(self.pivoted_rad, self.followed_rad)
             return f"it turned on the spot, by {turned:.1f} rad in all"
-        asked = f"commanded to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
-        asked += f" {max(self.followed_rad, 0.0):.1f}"
+        requested = (
+            f"commanded to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
+        )
+        requested += f" {max(self.followed_rad, 0.0):.1f}"
         if self._declined:
-            return f"{asked}, though it drove {self.driven_m:.1f} m"
+            return f"{requested}, though it drove {self.driven_m:.1f} m"
         if self.stops_at_m is not None:
             return (
                 f"commanded to turn tighter, it stayed on circles of {self.stops_at_m:.2g} m and "
                 "more"
             )
         if self.asked_rad:
-            return f"{asked}: too little to tell"
+            return f"{requested}: too little to tell"
         turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
         return f"in {turns} it never turned on the spot, and was never commanded to"
 
@@ -139,7 +141,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     spot = _spells_of(spot, round(max(MIN_PIVOT_S, window_s) / tick_s))
     sharp = float(np.percentile(np.abs(told_radps), 98))
     fast = float(np.percentile(np.abs(told_mps), 98))
-    asked, spells, followed = _on_the_spot(told_s, told_mps, told_radps, poses, sharp)
+    requested, spells, followed = _on_the_spot(told_s, told_mps, told_radps, poses, sharp)
     drives = (way >= max(0.05, 0.2 * fast)) & (np.abs(speed) >= 0.9 * way)
     moves = (way >= STANDS_MPS) & ~spot
     curves = drives & (np.abs(turn) >= TURNS_RADPS)
@@ -148,7 +150,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     return DriveEvidence(
         driven_m=float(way[moves].sum() * tick_s),
         pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
-        asked_rad=asked,
+        asked_rad=requested,
         spells=spells,
         followed_rad=followed,
         curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
@@ -189,16 +191,16 @@ def _on_the_spot(
     )
     hold = np.minimum(np.append(np.diff(told_s), SETTLED_S), SETTLED_S)
     begins = np.flatnonzero(np.append(True, np.diff(side) != 0))
-    asked, spells, followed = 0.0, 0, 0.0
+    requested, spells, followed = 0.0, 0, 0.0
     for first, behind in zip(begins, np.append(begins[1:], len(side)), strict=True):
         begin, end = told_s[first], told_s[behind - 1] + hold[behind - 1]
         if not side[first] or begin < at[0] or end > at[-1]:
             continue
         turned = np.diff(np.interp([begin, end + ANSWERED_S], at, heading))[0] * side[first]
-        asked += float((np.abs(told_radps) * hold)[first:behind].sum())
+        requested += float((np.abs(told_radps) * hold)[first:behind].sum())
         followed += float(turned)
         spells += 1
-    return asked, spells, followed
+    return requested, spells, followed
 
 
 def _stops_at(
@@ -244,19 +246,19 @@ def _answers(told_s: F64, turn: F64, poses: PoseSeries) -> Iterator[tuple[F64, F
     middle_s, speed, turned = ticks * 1e-9 - window_s / 2, motion.forward_mps, motion.yaw_rate_radps
     for delay_s in DELAYS_S:
         index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
-        told = turn[np.maximum(index, 0)]
+        reported = turn[np.maximum(index, 0)]
         used = (index >= 0) & (motion.problem == "") & (np.abs(speed) > 0.05)
-        used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(told) > 0.03)
+        used &= (middle_s - told_s[np.maximum(index, 0)] < SETTLED_S) & (np.abs(reported) > 0.03)
         if used.sum() >= MIN_TURNS and (turned[used] ** 2).sum() > 0:
-            yield told[used], speed[used], turned[used]
+            yield reported[used], speed[used], turned[used]
 
 
 def _as_angles(
-    told: F64, speed: F64, turned: F64, most_rad: float, wheelbase_m: float | None
+    reported: F64, speed: F64, turned: F64, most_rad: float, wheelbase_m: float | None
 ) -> tuple[float, float]:
     """The wheelbase by which steering angles (K,) explain best how it turned, where none is given;
     and the part of the squared yaw rates that they leave unexplained."""
-    by_angle = speed * np.tan(np.clip(told, -most_rad, most_rad))
+    by_angle = speed * np.tan(np.clip(reported, -most_rad, most_rad))
     base_m = wheelbase_m or float((by_angle**2).sum() / (turned @ by_angle))
     by_angle /= base_m if base_m > 0 else np.inf
     return base_m, float(((turned - by_angle) ** 2).sum() / (turned**2).sum())
@@ -301,11 +303,11 @@ def turn_reading(
     best, seen, fitted_m = [np.inf, np.inf], 0, wheelbase_m
     least_m = wheelbase_m / float(np.tan(most)) if wheelbase_m else least_m or SPOT_M
     tight = int((np.abs(turn) * least_m > np.abs(told_mps) * 1.01).sum())
-    for told, speed, turned in _answers(told_s, turn, poses):
-        seen = max(seen, len(told))
+    for reported, speed, turned in _answers(told_s, turn, poses):
+        seen = max(seen, len(reported))
         sharpest = np.abs(speed) / least_m
-        as_rate = np.clip(told, -sharpest, sharpest)
-        base_m, by_angle = _as_angles(told, speed, turned, most, wheelbase_m)
+        as_rate = np.clip(reported, -sharpest, sharpest)
+        base_m, by_angle = _as_angles(reported, speed, turned, most, wheelbase_m)
         by_rate = float(((turned - as_rate) ** 2).sum() / (turned**2).sum())
         fitted_m = base_m if by_angle < best[1] else fitted_m
         best = [min(best[0], by_rate), min(best[1], by_angle)]

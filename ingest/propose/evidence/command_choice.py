@@ -92,20 +92,20 @@ def choose_command(
     """The topics that may drive, what comes last first; and the sources of the first's commands."""
     if not fitting:
         return [], CommandChoice()
-    told = [one for one in (_read(recording, fit) for fit in fitting) if len(one.values)]
-    if not told:
+    reported = [one for one in (_read(recording, fit) for fit in fitting) if len(one.values)]
+    if not reported:
         return list(fitting), CommandChoice()
-    first = told[0]
-    for _ in told:  # down a chain of multiplexers
-        later = [one for one in told if one is not first and _feeds(first, one, MOSTLY)]
+    first = reported[0]
+    for _ in reported:  # down a chain of multiplexers
+        later = [one for one in reported if one is not first and _feeds(first, one, MOSTLY)]
         if not later:
             break
         first = max(later, key=first.passed_on)
-    through, first = _through(told, first)
+    through, first = _through(reported, first)
     by_whom = first if through is None else through
     chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
     sources: dict[str, _Told] = {}
-    inputs = [one for one in _inputs(told, by_whom) if one is not first]
+    inputs = [one for one in _inputs(reported, by_whom) if one is not first]
     for one in sorted(inputs, key=lambda one: -one.passed_on(by_whom)):
         sources.setdefault(_policy(one.fit[0].name), one)
     lines = [line for name, one in sources.items() for line in _lines(name, one, by_whom)]
@@ -128,24 +128,24 @@ def _read(recording: Recording, fit: Fit) -> _Told:
     return _Told(fit, columns.log_time_ns[order], values[order])
 
 
-def _inputs(told: Sequence[_Told], output: _Told) -> list[_Told]:
+def _inputs(reported: Sequence[_Told], output: _Told) -> list[_Told]:
     """Those whose commands it passes on."""
-    return [one for one in told if one is not output and _feeds(one, output, MIN_SHARE)]
+    return [one for one in reported if one is not output and _feeds(one, output, MIN_SHARE)]
 
 
-def _through(told: Sequence[_Told], first: _Told) -> tuple[_Told | None, _Told]:
+def _through(reported: Sequence[_Told], first: _Told) -> tuple[_Told | None, _Told]:
     """The multiplexer's output that the driving command follows, smoothed; and that command.
 
     None where the command is the multiplexer's own, or nothing shows what it follows.
     """
     muxed: _Told | None = None
-    if _inputs(told, first):  # it may be one in the middle of a chain
-        after = [one for one in told if one is not first and _follows(first, one)]
+    if _inputs(reported, first):  # it may be one in the middle of a chain
+        after = [one for one in reported if one is not first and _follows(first, one)]
         if after:
             muxed, first = first, max(after, key=lambda one: len(one.values))
     if muxed is None:
-        before = [one for one in told if one is not first and _follows(one, first)]
-        before = [one for one in before if _inputs([o for o in told if o is not first], one)]
+        before = [one for one in reported if one is not first and _follows(one, first)]
+        before = [one for one in before if _inputs([o for o in reported if o is not first], one)]
         muxed = max(before, key=lambda one: one.followed_by(first), default=None)
     if muxed is not None and muxed.passed_on(first) >= EXACTLY * first.changes:
         muxed = None

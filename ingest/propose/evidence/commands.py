@@ -148,18 +148,18 @@ def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[in
     if is_motion(topic.type) or not set(leaves) <= set(recording.leaves(topic.name)):
         return 0, 0
     fields = recording.read({topic.name: leaves})[topic.name].fields
-    asked = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
-    asked = asked[np.isfinite(asked).all(axis=1) & (asked > 0).any(axis=1)]
-    if not len(asked):
+    requested = np.abs(np.stack([np.asarray(fields[leaf], np.float64) for leaf in leaves], axis=1))
+    requested = requested[np.isfinite(requested).all(axis=1) & (requested > 0).any(axis=1)]
+    if not len(requested):
         return 0, 0
-    least = SLIGHT * float(np.percentile(asked.max(axis=1), MOSTLY))
-    return int((asked[:, [2, 3, 4]] > least).any(axis=1).sum()), len(asked)
+    least = SLIGHT * float(np.percentile(requested.max(axis=1), MOSTLY))
+    return int((requested[:, [2, 3, 4]] > least).any(axis=1).sum()), len(requested)
 
 
 def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
     """Whether most commands of a topic are for an arm or a drone."""
-    off, asked = off_the_floor(recording, fit)
-    return 2 * off > asked
+    off, requested = off_the_floor(recording, fit)
+    return 2 * off > requested
 
 
 def settled_at_most(
@@ -178,9 +178,9 @@ def settled_at_most(
     fastest = commands.speed_mps, commands.yaw_rate_radps
     found = [
         settled_speeds(
-            told_s, told[order], at_s, np.asarray(columns.fields[path], np.float64), most
+            told_s, reported[order], at_s, np.asarray(columns.fields[path], np.float64), most
         )
-        for told, path, most in zip((speed, turn), paths, fastest, strict=True)
+        for reported, path, most in zip((speed, turn), paths, fastest, strict=True)
     ]
     return found[0], found[1]
 
@@ -219,12 +219,12 @@ def read_turns(
         return None
     if poses is None or len(poses) < 2:
         return TurnReading()
-    told, most = _since(recording, roles, poses), robot.values.get("max_steering_rad")
+    reported, most = _since(recording, roles, poses), robot.values.get("max_steering_rad")
     wheelbase_m = robot.values["wheelbase_m"]
     if not robot.guessed_steering:
-        return turn_reading(*told, wheelbase_m, most)
+        return turn_reading(*reported, wheelbase_m, most)
     least_m = turned.turning_m or wheelbase_m / float(np.tan(most or USUAL_STEERING_RAD))
-    reading = turn_reading(*told, None, least_m=least_m)
+    reading = turn_reading(*reported, None, least_m=least_m)
     # That it steers is only a guess: that it is told in no known way is no reason to refuse it.
     return reading if not reading.problem else TurnReading(least_m=least_m)
 

@@ -146,8 +146,8 @@ def fix_noise_lines(
 def _usual_std_m(fixes: Fixes) -> float | None:
     """The median that they give; None where they do not say."""
     std_m = fixes.std_m()
-    told = std_m[np.isfinite(std_m)]
-    return float(np.median(told)) if len(told) else None
+    reported = std_m[np.isfinite(std_m)]
+    return float(np.median(reported)) if len(reported) else None
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:

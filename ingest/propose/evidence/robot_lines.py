@@ -112,13 +112,13 @@ class RobotProposal:
                 notes.append(f"{key} = {limit:g} is not its limit: {commanded:g} was commanded")
         own = {key: value for key, value in values.items() if "." not in key}
         lidar = {key[6:]: value for key, value in values.items() if key.startswith("lidar.")}
-        drive, told = own.pop("drive", None), self.described
+        drive, reported = own.pop("drive", None), self.described
         guess = self.wheelbase_from or "A GUESS from the outline: MEASURE IT"
-        guesses = {} if told else {"wheelbase_m": f"  # {guess}"}
+        guesses = {} if reported else {"wheelbase_m": f"  # {guess}"}
         lines = [
             "[robot]  # what the twin builds; missing values follow from the size of the outline",
             *(f"# {note}" for note in notes),
-            *([] if told else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
+            *([] if reported else [f"# {line}" for line in textwrap.wrap(self.drive_why, 98)]),
             f'drive = "{drive or "differential"}"',
             *(f"{key} = {toml_value(value)}{guesses.get(key, '')}" for key, value in own.items()),
         ]

@@ -139,17 +139,17 @@ def _dispatch(args: list[str]) -> int:
     from restock.cli.command_line import jobs_of, prepared, refuse_empty_paths
     from restock.cli.help import printed
 
-    asked = bool({"-h", "--help"} & set(args))
+    requested = bool({"-h", "--help"} & set(args))
     command, name, rest = command_of(verb), f"restock {verb}", args[1:]
     if rest and (job := jobs_of(command).get(rest[0])):  # as a job, tyro's hints leave the verb out
         command, name, rest = job, f"{name} {rest[0]}", rest[1:]
     try:
-        command = prepared(command, explained=asked)
-        with printed(help_asked=asked):
+        command = prepared(command, explained=requested)
+        with printed(help_asked=requested):
             parsed = tyro.cli(
                 command,
                 prog=name,
-                description=command.__doc__ if asked else None,
+                description=command.__doc__ if requested else None,
                 args=_without_ros(rest) if verb == "node" else rest,
                 use_underscores=False,
                 config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it

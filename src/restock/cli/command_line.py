@@ -64,9 +64,9 @@ def jobs_of(command: type[Any]) -> dict[str, type[Any]]:
     found = {}
     for hint in typing.get_type_hints(command, include_extras=True).values():
         for one in typing.get_args(_bare(hint)):
-            kind, *told = typing.get_args(one) or (one,)
+            kind, *reported = typing.get_args(one) or (one,)
             if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-                found[next(t.name for t in told if getattr(t, "name", None))] = kind
+                found[next(t.name for t in reported if getattr(t, "name", None))] = kind
     return found
 
 

@@ -157,7 +157,7 @@ def zsh() -> str:
 
     verbs = every_verb()
     twofold = "|".join(verb for verb, words in verbs.items() if words.jobs)
-    told = [
+    reported = [
         f"      '{verb}:{summary.replace(chr(39), chr(8217))}'" for verb, summary in VERBS.items()
     ]
     return "\n".join(
@@ -170,7 +170,7 @@ def zsh() -> str:
             "  local -i place=3",
             "  if ((CURRENT == 2)); then",
             "    local -a verbs=(",
-            *told,
+            *reported,
             "    )",
             "    _describe verb verbs",
             "    return",

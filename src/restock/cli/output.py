@@ -210,7 +210,7 @@ def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
     return sum(widths) > table_width()
 
 
-def told(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
+def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
     """The columns that any row has a value in, for tables whose columns often have none."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]

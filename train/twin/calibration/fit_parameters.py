@@ -172,12 +172,12 @@ def fit_scope(
                 "a guess from its outline"
             )
         if "wheel_radius_m" not in guessed or "track_m" not in guessed:
-            told = "wheel_radius_scale and track_scale are"
+            reported = "wheel_radius_scale and track_scale are"
             if robot.drive == "ackermann":
-                told = "wheel_radius_scale is"
+                reported = "wheel_radius_scale is"
             notes.append(
-                f"{told} relative to the profile's robot; its odometry still uses the profile's "
-                "values, as in the log"
+                f"{reported} relative to the profile's robot; its odometry still uses the "
+                "profile's values, as in the log"
             )
     elif (task.body.length_m, task.body.width_m) != (twin.length_m, twin.width_m):
         body = f"{task.body.length_m:g} x {task.body.width_m:g} m"

@@ -106,11 +106,11 @@ def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> 
 
     The action of a command that was held back is the nearest, as a log of it would have it.
     """
-    action, command, told = chosen
+    action, command, reported = chosen
     before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
     limited = limit(limits, command, now["sector_clearance_m"], before)
     held, command = limited.intervened, limited.command
     nearest, residual = nearest_action(task, *command.T)
     action = np.where(held, nearest, action)
-    residual = np.where(held, residual, told.get("action_residual", 0.0))
+    residual = np.where(held, residual, reported.get("action_residual", 0.0))
     return action, command, {"action": action, "action_residual": residual, "limiter": limited.rule}

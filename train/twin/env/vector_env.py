@@ -320,7 +320,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         chosen = self._actions.read(actions)
         if self.limits is not None:
             chosen = behind_limiter(self.limits, task, now, chosen)
-        action, command, told = chosen
+        action, command, reported = chosen
         everyone = np.arange(self.num_envs)
         self.truth.note_situation(sim, self.navigation.plans_m)
         sim.drive(command)
@@ -341,7 +341,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         truncated = ((self.steps >= task.time_limit_steps) & ~terminated) | invalid
         observed = _bounded(observe(task, after, now, action))
         truth = self.truth.condition(sim.slipped, sim.bumped, self.sensing.true_clearance_m)
-        info = info_after(self, after, progress, truth, terminated) | told
+        info = info_after(self, after, progress, truth, terminated) | reported
         if invalid.any():
             self.diverged += int(invalid.sum())
             earned = np.where(invalid, np.float32(0), earned)

@@ -93,7 +93,7 @@ class OrderedMissions:
         self._drivers = _deal(FLEET, self._rng)
         self._driver, self._version = driver, version
         self.driven: Counter[int] = Counter()  # by order
-        self.met: Counter[int] = Counter()
+        self.observed: Counter[int] = Counter()
 
     def rounds(self) -> Iterator[Iterator[Mission]]:
         """Drive each round to its end, and `note` its missions, before the next."""
@@ -106,16 +106,16 @@ class OrderedMissions:
         owed = {}
         for number, order in enumerate(self.orders.orders):
             wanted = order.missions or 0
-            left = min(wanted - self.met[number], MAX_DRIVEN * wanted - self.driven[number])
+            left = min(wanted - self.observed[number], MAX_DRIVEN * wanted - self.driven[number])
             if left > 0:
                 owed[number] = left
         return owed
 
-    def note(self, mission: Mission, *, met: bool) -> None:
+    def note(self, mission: Mission, *, observed: bool) -> None:
         """What became of a mission."""
         if mission.order is not None:
             self.driven[mission.order] += 1
-            self.met[mission.order] += met
+            self.observed[mission.order] += observed
 
     def _mission(self, number: int) -> Mission:
         rng, version = self._rng, self._version

@@ -264,7 +264,7 @@ class Robot:
         """
         command = np.concatenate([drive.command, np.zeros((1, 2))])
         thinking = self.rng.uniform(*THINKING_S, len(command))
-        told = {"condition": drive.true_condition, "exposure": drive.true_exposure}
+        reported = {"condition": drive.true_condition, "exposure": drive.true_exposure}
         proposed = np.stack(
             [drive.signals[f"nav_{key}"] for key in ("speed_mps", "yaw_rate_radps")]
         )
@@ -272,7 +272,7 @@ class Robot:
         return [
             *(
                 message
-                for name, truth in told.items()
+                for name, truth in reported.items()
                 for message in self._send(
                     f"/ground_truth/{name}",
                     drive.tick_s,

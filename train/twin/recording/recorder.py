@@ -192,7 +192,7 @@ class RecordingSummary:
     plan: RecordingPlan
     missions: Counter[str] = field(default_factory=Counter)  # by kind
     succeeded: Counter[str] = field(default_factory=Counter)
-    met: Counter[str] = field(default_factory=Counter)  # those that truly met their kind
+    observed: Counter[str] = field(default_factory=Counter)  # those that truly met their kind
     steps: Counter[str] = field(default_factory=Counter)  # by true condition
     policies: Counter[str] = field(default_factory=Counter)  # steps
     handovers: int = 0
@@ -213,7 +213,7 @@ class RecordingSummary:
             "minutes": round(self.minutes, 3),
             "missions": dict(self.missions),
             "succeeded": {kind: self.succeeded[kind] for kind in self.missions},
-            "met": {kind: self.met[kind] for kind in self.missions},
+            "met": {kind: self.observed[kind] for kind in self.missions},
             "ordered": dict(self.plan.kinds) if self.plan.orders() else None,
             "steps": dict(self.steps),
             "policy_steps": dict(self.policies),
@@ -297,7 +297,7 @@ def record(
             kind = driven.mission.spec.condition
             summary.missions[kind] += 1
             summary.succeeded[kind] += driven.success
-            summary.met[kind] += meets(kind, driven.drive.true_condition)
+            summary.observed[kind] += meets(kind, driven.drive.true_condition)
             summary.steps.update(map(primary_of, driven.drive.true_condition))
             who = [f"{name} {version}" for name, version, _ in driven.drive.policy]
             summary.policies.update(who)
@@ -332,7 +332,7 @@ def _drive(
     for one_round in missions.rounds():
         for driven in fleet.drive(one_round, drivers):
             kind = driven.mission.spec.condition
-            missions.note(driven.mission, met=meets(kind, driven.drive.true_condition))
+            missions.note(driven.mission, observed=meets(kind, driven.drive.true_condition))
             yield driven
 
 

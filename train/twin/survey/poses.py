@@ -184,9 +184,9 @@ def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) ->
     wanted: dict[str, list[str]] = {}
     for topic, fields in topics.items():
         leaves = set(recording.leaves(topic))
-        asked = _paths(fields)
-        if set(asked) <= leaves:
-            wanted[topic] = asked + [path for path in (STAMP, FRAME_ID) if path in leaves]
+        requested = _paths(fields)
+        if set(requested) <= leaves:
+            wanted[topic] = requested + [path for path in (STAMP, FRAME_ID) if path in leaves]
     found = []
     for topic, columns in recording.read(wanted).items():
         fields = topics[topic]

@@ -240,8 +240,8 @@ def _print(findings: list[Finding], shown: int) -> None:
     """What was found, each with its first rows and advice; then what found nothing, by name."""
     from restock.cli import output
 
-    told = [finding for finding in findings if finding.rows]
-    if told:
+    reported = [finding for finding in findings if finding.rows]
+    if reported:
         output.print_table(
             [
                 {
@@ -250,10 +250,10 @@ def _print(findings: list[Finding], shown: int) -> None:
                     "rows": finding.rows,
                     "what it looks for": finding.audit.doc,
                 }
-                for finding in told
+                for finding in reported
             ]
         )
-    for finding in told:
+    for finding in reported:
         output.stdout().print()
         more = finding.rows - min(shown, len(finding.sample))
         title = f"{finding.status}: {finding.audit.name}" + (f" ({more} more)" if more else "")
@@ -306,12 +306,12 @@ def _print_reward(reward: RewardAudit) -> None:
     ]
     if pairs:
         output.print_table(pairs, title="does more success earn more? [95 % intervals]")
-    told = Counter(row["verdict"] for row in reward.order)
+    reported = Counter(row["verdict"] for row in reward.order)
     for finding in reward.findings:
         if finding.rows:
             output.stdout().print(f"{finding.status}: {finding.audit.doc}", markup=False)
             output.stdout().print(f"  {finding.audit.advice}", markup=False)
-    counts = ", ".join(f"{told[name]} {name}" for name in VERDICTS if told[name])
+    counts = ", ".join(f"{reported[name]} {name}" for name in VERDICTS if reported[name])
     output.stdout().print(f"\n{counts or 'nothing to compare: undetermined'}")
 
 

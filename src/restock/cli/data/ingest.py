@@ -107,11 +107,11 @@ class IngestCommand:
             ):
                 advance(1, path.name)
                 if isinstance(result, RestockError):
-                    told = str(result)
+                    reported = str(result)
                     if isinstance(result, StoreError):  # which names the store alone
-                        told = f"{visible(str(path))}: was not added: {told}"
-                    failures.append({"path": str(path), "status": "failed", "error": told})
-                    sys.stderr.write(f"restock: {told}\n")
+                        reported = f"{visible(str(path))}: was not added: {reported}"
+                    failures.append({"path": str(path), "status": "failed", "error": reported})
+                    sys.stderr.write(f"restock: {reported}\n")
                     continue
                 lossy |= result.lossy
                 outcomes.append(as_json(result))
@@ -222,7 +222,7 @@ def show(outcome: IngestResult) -> None:
     clocks = {clock["topic"]: clock for clock in row["clocks"] or []}
     used = [{**topic, **output.clock_cells(clocks.get(topic["topic"]))} for topic in used]
     columns = ["topic", "type", "expected", "decoded", "skipped", *output.CLOCK_COLUMNS]
-    output.print_table(used, output.told(used, columns))
+    output.print_table(used, output.reported(used, columns))
     output.print_skipped({topic["topic"]: topic["reason"] for topic in used})
     if len(used) < len(row["topics"]):
         rest = [topic["expected"] for topic in row["topics"] if topic["reason"] == UNUSED]
@@ -279,13 +279,13 @@ def show(outcome: IngestResult) -> None:
         }
         for name, count in outcome.conditions.items()
     ]
-    output.print_table(labels, output.told(labels))
+    output.print_table(labels, output.reported(labels))
     if outcome.exposures:  # whatever came of them
         labels = [
             {"exposure": name, "transitions": count, **against_truth(name)}
             for name, count in outcome.exposures.items()
         ]
-        output.print_table(labels, output.told(labels))
+        output.print_table(labels, output.reported(labels))
     for line in _unknown(row):
         console.print(line, markup=False, soft_wrap=True)
     console.print(

@@ -32,12 +32,12 @@ def print_scores(path: Path, by: str | None, *, json: bool) -> int:
         )
         return ExitCode.OK
     output.print_table(score_rows(found, by))
-    told = [row for row in bins if row["known"]]
-    if told:
+    reported = [row for row in bins if row["known"]]
+    if reported:
         output.stdout().print(
             "\nA probability is reliable if, among steps with probability p, a share p is true:"
         )
-        output.print_table(reliability_rows(told))
+        output.print_table(reliability_rows(reported))
     return ExitCode.OK
 
 

@@ -235,10 +235,10 @@ def _in_training(document: dict[str, Any], most: float) -> list[str]:
     updates, batch_size = TRAINING
     short = []
     for line in document["strata"]:
-        asked = line["wanted_share"] * document["logs_share_wanted"]
+        requested = line["wanted_share"] * document["logs_share_wanted"]
         bears = most * line["rows"] / (updates * batch_size)
-        if bears < 0.98 * asked:
-            short.append(f"{line['stratum']} {bears:.1%} of {asked:.1%}")
+        if bears < 0.98 * requested:
+            short.append(f"{line['stratum']} {bears:.1%} of {requested:.1%}")
     lines = [f"no row is drawn more than {most:g} times (max_replays_per_row)"]
     if short:
         lines.append(

@@ -172,7 +172,7 @@ class ProfileCommand:
         for loss in losses:
             output.say(f"lost: {loss}")
         for finding in proposal.findings:
-            output.say(visible(finding.told))
+            output.say(visible(finding.reported))
         for problem in proposal.problems:
             names = visible(", ".join(self.paths))
             sys.stderr.write(f"restock: {names}: cannot be used yet: {problem}\n")

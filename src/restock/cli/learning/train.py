@@ -188,14 +188,14 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     from restock.cli.output import say
 
     # On a thread: a handler must not print while what it interrupts does.
-    told = Thread(target=say, args=(_STOPPING,))
+    reported = Thread(target=say, args=(_STOPPING,))
     stopping = False
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal stopping
         if not stopping:
             stopping = True
-            told.start()
+            reported.start()
         elif callable(before):
             before(number, frame)
         else:
@@ -207,7 +207,7 @@ def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     finally:
         signal.signal(signal.SIGINT, before)
         if stopping:
-            told.join()
+            reported.join()
 
 
 def _progress_note(values: dict[str, Any]) -> str:

@@ -139,8 +139,8 @@ class CheckCommand:
         if shown:
             output.print_table(shown, columns)
         counts = {name: sum(row["status"] == name for row in rows) for name in WORST_FIRST}
-        told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        output.stdout().print(f"{len(rows)} checks: {told}")
+        reported = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        output.stdout().print(f"{len(rows)} checks: {reported}")
 
 
 def _rows(parts: list[Part]) -> list[dict[str, Any]]:

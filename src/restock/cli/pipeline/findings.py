@@ -99,13 +99,13 @@ def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Find
     for row in rows:
         severity: Severity = "error" if row["verdict"] in ("worse", "refused") else "warning"
         bad = row["verdict"] in ("worse", "refused", "inconclusive")
-        told = f"Success in {row['condition']}, {row['perturbation']}, against {baseline}"
+        reported = f"Success in {row['condition']}, {row['perturbation']}, against {baseline}"
         shown = {key: value for key, value in row.items() if value is not None}
         found.append(
             _finding(
                 f"{row['perturbation']}.{row['condition']}",
                 severity,
-                told,
+                reported,
                 row["reason"] or "`restock compare` and `restock diagnose` help to find out why",
                 [shown] if bad else [],
             )

@@ -56,31 +56,33 @@ def edited(profile: Path | str | None, out: Path) -> bool:
     return not proposed.is_file() or read_json(proposed)["toml"] != path.read_text("utf-8")
 
 
-def several_kinds(kinds: list[Any], asked: StartCommand) -> Stop:
+def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
     """Recordings of several kinds of robots: one call for each, the profile's own first.
 
     With the options that were given; what describes one robot is for the first kind alone.
     """
-    out = asked.out
+    out = requested.out
     folders = [out, *(out.with_name(f"{out.name}-{n}") for n in range(2, len(kinds) + 1))]
-    told = [f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds]
+    reported = [
+        f"{counted(len(kind['recordings']), 'recording')} ({kind['robot']})" for kind in kinds
+    ]
     calls = []
     for kind, folder in zip(kinds, folders, strict=True):
-        options = _options(asked, but=() if folder == out else OF_ONE_ROBOT)
+        options = _options(requested, but=() if folder == out else OF_ONE_ROBOT)
         words = [*kind["recordings"], "--out", str(folder), *options]
         calls.append(f"restock start {shlex.join(words)}")
     return Stop(
         f"these are recordings of {len(kinds)} kinds of robots, but a profile describes one kind: "
-        f"{' | '.join(told)}",
+        f"{' | '.join(reported)}",
         (*calls, f"or add --accept: recordings of the other kinds are left out of {out}"),
     )
 
 
-def _options(asked: StartCommand, *, but: Collection[str]) -> list[str]:
+def _options(requested: StartCommand, *, but: Collection[str]) -> list[str]:
     """The options of a call that are not the default, as they are typed."""
     words = []
-    for field in dataclasses.fields(asked):
-        value = getattr(asked, field.name)
+    for field in dataclasses.fields(requested):
+        value = getattr(requested, field.name)
         if field.name in (*NOT_AGAIN, *but) or value == field.default:
             continue
         flag = f"--{field.name.replace('_', '-')}"
@@ -337,7 +339,7 @@ def robot_line(profile: Path | str | None) -> str:
     robot = None if profile is None else load_profile(str(profile)).robot
     if robot is None:
         return "the twin's default robot, as nothing describes yours: give --urdf FILE"
-    told = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
+    reported = [robot.drive if "drive" in robot.origin else f"{robot.drive} (why: {profile})"]
     untold = []
     for key, name, unit in (
         ("wheel_radius_m", "wheel radius", "m"),
@@ -347,10 +349,12 @@ def robot_line(profile: Path | str | None) -> str:
         if (value := getattr(robot, key)) is None:
             untold.append(name)
         else:
-            told.append(f"{name} {value:g} {unit} (from {robot.origin.get(key, 'the profile')})")
+            reported.append(
+                f"{name} {value:g} {unit} (from {robot.origin.get(key, 'the profile')})"
+            )
     if untold:
-        told.append(f"{', '.join(untold)} guessed from its outline: give --urdf FILE")
-    return ", ".join(told)
+        reported.append(f"{', '.join(untold)} guessed from its outline: give --urdf FILE")
+    return ", ".join(reported)
 
 
 __all__ = [

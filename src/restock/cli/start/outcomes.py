@@ -152,13 +152,13 @@ def floor(document: Document) -> list[str]:
 def fit(document: Document) -> list[str]:
     """The parameters that the logs tell, and the distance before and after."""
     (first, *_) = document["fits"]
-    told = [
+    reported = [
         f"{item['name']} {interval_text(item['value'], item['low'], item['high'], '.3g')}"
         for item in first["estimates"]
         if item["fitted"]
     ]
     untold = [item["name"] for item in first["estimates"] if not item["fitted"]]
-    lines = [f"fitted: {', '.join(told) or 'nothing'}"]
+    lines = [f"fitted: {', '.join(reported) or 'nothing'}"]
     if untold:
         lines.append(f"not identified by these logs: {', '.join(untold)}")
     return lines

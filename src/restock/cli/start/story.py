@@ -147,8 +147,10 @@ def films(to: Settings) -> list[str]:
     from restock.train.evaluation.film import FOLDER
 
     found = sorted((to.run / FOLDER).glob("*-rescue.webp"))
-    told = ["The policy that failed is on the left; the report shows them, too."] if found else []
-    return [*map(str, found), *told]
+    reported = (
+        ["The policy that failed is on the left; the report shows them, too."] if found else []
+    )
+    return [*map(str, found), *reported]
 
 
 def rare_event(to: Settings) -> list[str]:

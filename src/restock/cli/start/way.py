@@ -59,23 +59,23 @@ class Way:
     that of a plan, which reads none.
     """
 
-    def __init__(self, asked: StartCommand, work: Work, first: str | None = None) -> None:
-        self.asked, self.work = asked, work
-        self.first = asked.paths[0] if first is None else first
-        self.again = f"then run the same command again: finished stages are kept in {asked.out}"
+    def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:
+        self.requested, self.work = requested, work
+        self.first = requested.paths[0] if first is None else first
+        self.again = f"then run the same command again: finished stages are kept in {requested.out}"
         self.to = Settings(
-            logs=asked.paths,
-            out=asked.out,
-            profile=asked.profile or asked.out / "profile.toml",
-            seconds=30.0 * asked.minutes,
-            episodes=max(round(4 * asked.minutes), 1),
-            device=asked.device,
-            mixture=asked.mixture,
-            typestore=asked.typestore,
-            definitions=asked.definitions,
-            salvage=asked.salvage,
-            tags=asked.tag,
-            map=asked.map,
+            logs=requested.paths,
+            out=requested.out,
+            profile=requested.profile or requested.out / "profile.toml",
+            seconds=30.0 * requested.minutes,
+            episodes=max(round(4 * requested.minutes), 1),
+            device=requested.device,
+            mixture=requested.mixture,
+            typestore=requested.typestore,
+            definitions=requested.definitions,
+            salvage=requested.salvage,
+            tags=requested.tag,
+            map=requested.map,
         )
 
     def go(self) -> Stop | None:
@@ -111,24 +111,24 @@ class Way:
 
     def _profile(self, readable: list[Document]) -> None:
         """The user's profile, or one that is proposed; and what it makes of a recording."""
-        asked, to = self.asked, self.to
+        requested, to = self.requested, self.to
         recording = fullest({"recordings": readable}) or self.first
-        own = asked.profile is not None
-        proposed = not own and not edited(to.profile, asked.out)
+        own = requested.profile is not None
+        proposed = not own and not edited(to.profile, requested.out)
         if proposed:
-            self._propose(asked.paths if len(readable) != 1 else (recording,))
-        elif given := [name for name in OF_ONE_ROBOT if getattr(asked, name) is not None]:
+            self._propose(requested.paths if len(readable) != 1 else (recording,))
+        elif given := [name for name in OF_ONE_ROBOT if getattr(requested, name) is not None]:
             options, why = " and ".join(f"--{n}" for n in given), "given" if own else "edited"
             self._warn(
                 f"{to.profile} was {why}: {options} can only change a proposal, and has no effect"
             )
-        others = [] if own or self.work.plan else of_other_kinds(asked.out)
+        others = [] if own or self.work.plan else of_other_kinds(requested.out)
         mine = [row for row in readable if row["path"] not in others]
         if len(mine) < len(readable):
             self.to = to = replace(to, logs=tuple(row["path"] for row in mine))
             recording = fullest({"recordings": mine}) or recording
         if not (own or self.work.plan):
-            recording = proposed_from(asked.out) or recording
+            recording = proposed_from(requested.out) or recording
         checked = self.work.do(stages.check(to, recording))
         if not checked.good:
             known = "; if it is of another robot, give only the recordings of this one"
@@ -138,19 +138,19 @@ class Way:
                 self.again,
             )
         outline = wrong_outline(checked.document, to.profile, proposed=proposed)
-        if outline is not None and not asked.accept:
+        if outline is not None and not requested.accept:
             raise Stopped(outline.why, *outline.remedies)
         if not self.work.plan:
             self.work.say(f"   the robot in the twin: {escape(robot_line(to.profile))}")
 
     def _propose(self, sources: tuple[str, ...]) -> None:
-        asked, to = self.asked, self.to
-        flags = [] if asked.footprint is None else ["--footprint", asked.footprint]
-        flags += [] if asked.urdf is None else ["--urdf", str(asked.urdf)]
-        flags += [] if asked.robot is None else ["--robot", asked.robot]
-        flags += [ODOMETRY] * asked.odometry_as_command
+        requested, to = self.requested, self.to
+        flags = [] if requested.footprint is None else ["--footprint", requested.footprint]
+        flags += [] if requested.urdf is None else ["--urdf", str(requested.urdf)]
+        flags += [] if requested.robot is None else ["--robot", requested.robot]
+        flags += [ODOMETRY] * requested.odometry_as_command
         flags.append("--hindsight-goals")  # without a goal there is no success to train for
-        proposed = self.work.do(stages.propose(to, sources, flags, asked.urdf))
+        proposed = self.work.do(stages.propose(to, sources, flags, requested.urdf))
         if not proposed.good:
             raise Stopped("no profile can be proposed", f"write {to.profile}: docs/profile.md")
         document = proposed.document
@@ -158,19 +158,19 @@ class Way:
             Path(str(to.profile)).unlink(missing_ok=True)  # there is nothing in it to edit
             raise Stopped("; ".join(document["problems"]), "give recordings of a robot on wheels")
         if problems := document.get("problems"):
-            told = f"edit {to.profile}: its first lines list what is missing"
+            reported = f"edit {to.profile}: its first lines list what is missing"
             if document.get("missing"):
-                told = (
+                reported = (
                     "give recordings that contain it; or, if a topic in these recordings does, "
                     f"edit {to.profile}, whose first lines list the topics"
                 )
             if any(ODOMETRY in problem for problem in problems):
-                told = f"add {ODOMETRY} to this command, or {told}"
-            raise Stopped("; ".join(problems), told, self.again)
-        if asked.accept:
+                reported = f"add {ODOMETRY} to this command, or {reported}"
+            raise Stopped("; ".join(problems), reported, self.again)
+        if requested.accept:
             return
         if kinds := document.get("kinds"):
-            stop = several_kinds(kinds, asked)
+            stop = several_kinds(kinds, requested)
             raise Stopped(stop.why, *stop.remedies)
         if driving := document.get("commands", []):
             raise Stopped(
@@ -201,8 +201,8 @@ class Way:
 
     def _twin(self) -> Ended | None:
         """The floor, where a policy can be trained in the twin; None: on the logs alone."""
-        asked, to = self.asked, self.to
-        if asked.twin == "no":
+        requested, to = self.requested, self.to
+        if requested.twin == "no":
             return None
         floor = self.work.do(stages.floor(to))
         if not floor.good and to.map is not None:
@@ -226,7 +226,7 @@ class Way:
         if fitted:
             settings.append(f"env.perturbation={to.fitted}")
         why, remedy = no_room(floor), ""
-        if why is None and asked.twin != "yes" and not self.work.plan:
+        if why is None and requested.twin != "yes" and not self.work.plan:
             why, remedy = mistrust(floor, gap), " (--twin yes overrides)"
         if why is not None:
             self._warn(f"no training in the twin{remedy}: {why}")
@@ -269,9 +269,9 @@ class Way:
         return self.work.do(stages.gap(self.to, horizon_s, fitted=False)), False
 
     def _policy(self, floor: Ended | None, coverage: Document, panel: Document) -> None:
-        asked, twin = self.asked, floor is not None
+        requested, twin = self.requested, floor is not None
         settings = [*self.to.train] if twin else logs_alone_settings(coverage)
-        settings += updates_settings(panel, asked.minutes, twin=twin, seconds=self.to.seconds)
+        settings += updates_settings(panel, requested.minutes, twin=twin, seconds=self.to.seconds)
         self.to = replace(self.to, train=tuple(settings))
         trained = self.work.do(stages.train(self.to, twin=twin))
         if not trained.good:

@@ -102,7 +102,7 @@ class Work:
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
         self._keep()
         self._stamps.append(stamp)
-        return self._note(self._run(stage, stamp), told=stage.shows_progress)
+        return self._note(self._run(stage, stamp), reported=stage.shows_progress)
 
     def _run(self, stage: Stage, stamp: str) -> Ended:
         printed, complaints = io.StringIO(), io.StringIO()
@@ -136,12 +136,12 @@ class Work:
         self._keep()
         return ended
 
-    def _note(self, ended: Ended, *, told: bool = False) -> Ended:
+    def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
         """Say what came of a stage, and its complaints where they were not `told` already."""
         self.ended.append(ended)
         for line in ended.outcome:
             self.say(f"   {escape(line)}")
-        if not ended.good and not told:
+        if not ended.good and not reported:
             for line in ended.errors:
                 self.say(f"   [yellow]{escape(line)}[/yellow]")
         if ended.files:
@@ -234,10 +234,10 @@ def _fingerprint(path: Path) -> str:
         if not file.is_file():
             continue
         status = file.stat()
-        told = f"{status.st_size} {status.st_mtime_ns}"
+        reported = f"{status.st_size} {status.st_mtime_ns}"
         if status.st_size <= SMALL_BYTES:
-            told = hashlib.blake2b(file.read_bytes(), digest_size=12).hexdigest()
-        parts.append(f"{file} {told}")
+            reported = hashlib.blake2b(file.read_bytes(), digest_size=12).hexdigest()
+        parts.append(f"{file} {reported}")
     return "\n".join(parts)
 
 

@@ -118,8 +118,8 @@ def _more_of(kind: str, episodes: int) -> str:
 
 def _without_empty(rows: Rows) -> Rows:
     """Without the columns that say nothing in any row."""
-    told = {name for row in rows for name, value in row.items() if value != ""}
-    return [{name: value for name, value in row.items() if name in told} for row in rows]
+    reported = {name for row in rows for name, value in row.items() if value != ""}
+    return [{name: value for name, value in row.items() if name in reported} for row in rows]
 
 
 def amount(value: float) -> str:

@@ -84,7 +84,7 @@ def live(spec: Spec) -> Spec:
         del inner["layer"]
         inner["layer"] = [{name: inner.pop(name) for name in ("mark", "encoding")}]
     units = inner["layer"]
-    told = _told([unit for unit in units if _is_of_rows(unit)], found.get("facet", {}), rows)
+    reported = _told([unit for unit in units if _is_of_rows(unit)], found.get("facet", {}), rows)
     series = next(filter(None, map(_series, units)), None)
     if series is not None:
         for number, unit in enumerate(of for of in units if _series(of) == series):
@@ -92,7 +92,7 @@ def live(spec: Spec) -> Spec:
     for unit in list(units):
         if not _is_of_rows(unit):
             continue
-        unit["encoding"].setdefault("tooltip", told)
+        unit["encoding"].setdefault("tooltip", reported)
         if _mark(unit)["type"] == "line":
             units.append(_points(unit))
     return found
@@ -151,8 +151,8 @@ def _told(units: list[Spec], facet: Spec, rows: Mapping[str, Any]) -> list[Spec]
     for channel in (*facets, *_channels(units)):
         if "field" in channel and (channel.get("title") or channel["field"] not in found):
             found.setdefault(channel["field"], channel)
-    told = [_field(name, channel, units, rows) for name, channel in found.items()]
-    several = [one for one in told if one is not None]
+    reported = [_field(name, channel, units, rows) for name, channel in found.items()]
+    several = [one for one in reported if one is not None]
     return sorted(several, key=lambda one: ("format" in one, _ENDS.index(_end(one["field"]))))
 
 
@@ -170,8 +170,8 @@ def _field(name: str, channel: Spec, units: list[Spec], rows: Mapping[str, Any])
     values = [row[name] for of in rows.values() for row in of if row.get(name) is not None]
     numbers = [value for value in values if isinstance(value, int | float)]
     if len(numbers) < len(values) or not numbers:
-        told = {"field": name, "type": "nominal", "title": title}
-        return told if len(set(map(str, values))) > 1 else None
+        reported = {"field": name, "type": "nominal", "title": title}
+        return reported if len(set(map(str, values))) > 1 else None
     whole = all(float(value).is_integer() for value in numbers)
     form = ".1~%" if _is_share(name, units) else "," if whole and not end else ",.4~r"
     return {"field": name, "type": "quantitative", "title": title, "format": form}

@@ -21,11 +21,11 @@ def capacity_section(facts: Facts) -> Section | None:
     capacity = chosen or _of_panel(facts)
     if capacity is None:
         return None
-    asked = capacity["recommended"]
+    requested = capacity["recommended"]
     how = (
         "chosen by task diversity"
         if chosen
-        else (f"by the panel's diversity, {asked:,} would be enough")
+        else (f"by the panel's diversity, {requested:,} would be enough")
     )
     intro = f"The ring holds {ring or 0:,} rows; {how}: {capacity['reason']}."
     rows = [
@@ -45,7 +45,7 @@ def capacity_section(facts: Facts) -> Section | None:
         "How large must the buffer be?",
         intro=f"{intro} A cell is a condition x zone x action. A smaller first-in-first-out "
         "buffer forgets whole cells, which no sampling can bring back.",
-        figures=[Figure(_curve(capacity, asked), "Cells covered by the newest logged rows")],
+        figures=[Figure(_curve(capacity, requested), "Cells covered by the newest logged rows")],
         two=True,
         tables=[Table(rows, set(rows[0]) if rows else set())],
     )
@@ -61,7 +61,7 @@ def _of_panel(facts: Facts) -> dict[str, Any] | None:
     return {**asdict(capacity), "reason": capacity.reason}
 
 
-def _curve(capacity: dict[str, Any], asked: int) -> Drawing:
+def _curve(capacity: dict[str, Any], requested: int) -> Drawing:
     def chart(width: int) -> Any:
         line = (
             charts.plot(capacity["curve"])
@@ -81,7 +81,7 @@ def _curve(capacity: dict[str, Any], asked: int) -> Drawing:
                 ),
             )
         )
-        at = charts.plot([{"at": asked, "text": f"{asked:,} rows"}]).encode(x="at:Q")
+        at = charts.plot([{"at": requested, "text": f"{requested:,} rows"}]).encode(x="at:Q")
         rule = at.mark_rule(strokeDash=[4, 3], color="#0f172a")
         text = at.mark_text(
             align="right", dx=-4, dy=-4, baseline="bottom", fontSize=12, color="#475569"

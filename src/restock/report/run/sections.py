@@ -83,11 +83,13 @@ def success(facts: Facts) -> Section | None:
 
 def _success_table(perturbation: str, rows: Rows) -> Table:
     """Of one perturbation, folded but for the clean one, without the columns that tell nothing."""
-    told = {name for row in rows for name, value in row.items() if value != ""} - {"perturbation"}
+    reported = {name for row in rows for name, value in row.items() if value != ""} - {
+        "perturbation"
+    }
     shown, before = [], None
     for row in rows:
         kind = row["kind of episode"]
-        line = {name: value for name, value in row.items() if name in told}
+        line = {name: value for name, value in row.items() if name in reported}
         shown.append(line | {"kind of episode": "" if kind == before else kind})
         before = kind
     clean = perturbation == "clean"

@@ -256,15 +256,15 @@ def cost_cards(rows: Rows) -> list[dict[str, str]]:
             if row["env_steps"] is None
             else f"{row['env_steps']:,.0f} environment steps",
         }
-        told = [text for text in known.values() if text is not None]
-        told += [f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else []
-        if told:
+        reported = [text for text in known.values() if text is not None]
+        reported += [f"{row['gradient_steps']:,.0f} updates"] if row["gradient_steps"] else []
+        if reported:
             seeds = f"{counted(row['runs'], 'seed')}"
             cards.append(
                 {
-                    "value": told[0],
+                    "value": reported[0],
                     "label": f"of training, a run of {row['arm']} ({seeds})"
-                    + (f": {', '.join(told[1:])}" if told[1:] else ""),
+                    + (f": {', '.join(reported[1:])}" if reported[1:] else ""),
                 }
             )
     return cards

@@ -58,16 +58,16 @@ def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, f
 def about(moment: Moment, critic: Critic | None) -> str:
     """Which transition the moment is about, as JSON."""
     keys = ("transition_id", "episode_id", "step_index", "stamp_ns", "condition", "zone")
-    told = {key: moment.at[key] for key in (*keys, "behaviour_policy", "reward", "source_file")}
+    reported = {key: moment.at[key] for key in (*keys, "behaviour_policy", "reward", "source_file")}
     if critic is not None:
-        told["critic"] = f"{critic.run}: {critic.weights}"
-    return json.dumps(told)
+        reported["critic"] = f"{critic.run}: {critic.weights}"
+    return json.dumps(reported)
 
 
 def about_evaluated(evaluated: Evaluated, critic: Critic | None) -> str:
     """Which episode of an evaluation it is, and how it went, as JSON."""
     keys = ("condition", "block", "episode_seed", "layout", "version", "success", "failure")
-    told = {key: evaluated.outcome[key] for key in (*keys, "bumps", "time_s", "return")}
+    reported = {key: evaluated.outcome[key] for key in (*keys, "bumps", "time_s", "return")}
     if critic is not None:
-        told["critic"] = f"{critic.run}: {critic.weights}"
-    return json.dumps(told)
+        reported["critic"] = f"{critic.run}: {critic.weights}"
+    return json.dumps(reported)
