@@ -33,7 +33,6 @@ from replay_contenders import (
     SHARES,
     IndexSelected,
     MultinomialDraw,
-    OnDevice,
     Packed,
     Prioritised,
     RowsAlone,
@@ -46,7 +45,6 @@ from restock.native import is_used
 from restock.replay.mixture.packed_row import row_width
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.device import DeviceSampler
 from restock.replay.sampling.priorities import Lap, Per, PrioritySampler
 from restock.replay.sampling.sampler import uniform_sampler
 
@@ -76,7 +74,6 @@ def sampling(quick: bool) -> dict[str, Any]:
     rows = in_memory(count, row_width(OBSERVATION))
     stratum_rows = strata(count)
     columns = contenders.Columns(rows.numpy(), OBSERVATION, ACTIONS)
-    device = DeviceSampler(stratum_rows, SHARES, BATCH, seed=0, device="cpu")
     peers, left_out = installed(contenders.uniform(columns, BATCH))
     us = measure(
         {
@@ -87,7 +84,6 @@ def sampling(quick: bool) -> dict[str, Any]:
             "rows_alone": RowsAlone(rows),
             "quotas": Packed(rows, quota_sampler(stratum_rows)),
             "quotas_in_turns": Packed(rows, quota_sampler(stratum_rows, replacement=False)),
-            "quotas_by_torch": OnDevice(rows, device),
             "multinomial": MultinomialDraw(rows, stratum_rows),
             **peers,
         },

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from restock.replay.sampling.device import DeviceSampler
 from restock.replay.sampling.gather import gather_rows
 from restock.replay.sampling.sampler import QuotaSampler, Sampler, uniform_sampler
 
@@ -75,17 +74,6 @@ class Prioritised(Packed):
         if (weights := self.sampler.drawn_weights) is not None:
             torch.from_numpy(weights)
         self.sampler.update(index, self.errors)
-
-
-class OnDevice(Packed):
-    """Drawn and gathered by torch alone, as on a GPU; here on the CPU."""
-
-    def __init__(self, rows: torch.Tensor, device_sampler: DeviceSampler) -> None:
-        super().__init__(rows, uniform_sampler(len(rows), BATCH, np.random.default_rng(0)))
-        self.device_sampler = device_sampler
-
-    def __call__(self) -> None:
-        self.gather(self.device_sampler.draw()[0])
 
 
 class MultinomialDraw(Packed):

@@ -6,9 +6,9 @@ Equal network (2 x 256 ReLU), equal batch (256 and 1,024), Adam, plain DQN targe
 full buffer of 50,000 rows included: Stable-Baselines3 with its own defaults, and with Restock's
 settings (a Polyak pull at every update, fused Adam: `_equal`). Restock as `restock train --device
 cuda` makes its updates: drawn and recorded by the host in blocks, made by a CUDA graph. Beside it
-the same without the graph (`_launched`), with the rows drawn on the device (`_device_sampler`), and
-the default (double DQN, LayerNorm, half of the batch from logs by quotas) without and with its
-record. Figures are wall time, the device waited for at the end of each round.
+the same without the graph (`_launched`), and the default (double DQN, LayerNorm, half of the batch
+from logs by quotas) without and with its record. Figures are wall time, the device waited for at
+the end of each round.
 
 `--runs` times whole runs of the default recipe instead, without logs, on the CPU and on the device:
 with more updates, and with a wide network and large batches. It shows where a GPU pays.
@@ -28,14 +28,11 @@ import numpy as np
 import torch
 from harness import finish, in_turns, medians, option_parser
 from own_updates import Restock, config
-from train_peers import ROWS, Arrays, Updates, data, stable_baselines3
+from train_peers import Arrays, Updates, data, stable_baselines3
 
-from restock.replay.sampling.device import DeviceSampler
 from restock.train import train
-from restock.train.dqn.captured_update import CapturedUpdates, UpdateBlock
 from restock.train.dqn.config import TrainConfig
 from restock.train.run.run import Run
-from restock.train.update_blocks import LONGEST
 
 WARM_UP = 256  # environment steps before a run's first update
 TARGET = 5.0  # times Stable-Baselines3, at either batch
@@ -48,30 +45,6 @@ RUNS: dict[str, tuple[list[str], int]] = {
     "two updates per step": (["schedule.updates_per_env_step=2"], 6_000),
     "2 x 1,024 units, batch 1,024": (WIDE, 2_000),
 }
-
-
-class ByDeviceSampler:
-    """Drawn where the rows lie; the host sends nothing, and reads the losses of the last block."""
-
-    def __init__(self, batch: int, arrays: Arrays, device: str) -> None:
-        whole = Restock(_plain(batch, device), arrays)
-        table = torch.from_numpy(whole.batches.ring.rows).to(device)
-        self._sampler = DeviceSampler([np.arange(ROWS)], [1.0], batch, seed=0, device=device)
-        self._updates = CapturedUpdates(
-            whole.learner, table, batch_size=batch, width=table.shape[1], longest=LONGEST
-        )
-        self._weight = torch.ones(LONGEST, batch, device=device)
-        self._none = torch.zeros(LONGEST)
-
-    def __call__(self, updates: int) -> None:
-        for begin in range(0, updates, LONGEST):
-            count = min(LONGEST, updates - begin)
-            rows = torch.stack([self._sampler.draw()[0] for _ in range(count)])
-            none = self._none[:count]
-            block = UpdateBlock(rows, None, self._weight[:count], none, none, None)
-            launched = self._updates.launch(block)
-            self._updates.learner.count(count, labelled=False)
-        launched.outcome()
 
 
 def _plain(batch: int, device: str) -> TrainConfig:
@@ -99,7 +72,6 @@ def measured(
         "stable_baselines3_equal": stable_baselines3(batch, arrays, equal=True, device=device),
         "restock": Restock(plain, arrays, blocks=True),
         "restock_launched": Restock(plain, arrays),
-        "restock_device_sampler": ByDeviceSampler(batch, arrays, device),
         "restock_default": Restock(default, arrays, logs=True, blocks=True),
         "restock_default_recorded": Restock(default, arrays, logs=True, blocks=True, run=run),
     }

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from restock.replay.review.doubtful import doubtful_events as doubtful_events
     from restock.replay.review.verdicts import read_verdicts as read_verdicts
     from restock.replay.sampling.chunked import ChunkedSampler as ChunkedSampler
-    from restock.replay.sampling.device import DeviceSampler as DeviceSampler
     from restock.replay.sampling.gather import gather_rows as gather_rows
     from restock.replay.sampling.priorities import Lap as Lap
     from restock.replay.sampling.priorities import Per as Per
@@ -64,7 +63,6 @@ else:
             "restock.replay.review.doubtful": ["doubtful_events"],
             "restock.replay.review.verdicts": ["read_verdicts"],
             "restock.replay.sampling.chunked": ["ChunkedSampler"],
-            "restock.replay.sampling.device": ["DeviceSampler"],
             "restock.replay.sampling.gather": ["gather_rows"],
             "restock.replay.sampling.priorities": ["Lap", "Per", "PrioritySampler"],
             "restock.replay.sampling.sampler": ["QuotaSampler", "Sampler"],

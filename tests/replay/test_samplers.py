@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -18,7 +17,6 @@ from support.states import through_json
 
 from restock.errors import MixtureError
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.device import DeviceSampler
 from restock.replay.sampling.priorities import Lap, Per, PrioritySampler, Rule
 from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
 from restock.train.run import checkpoint
@@ -37,35 +35,25 @@ WIDTH = 3  # of the rows that are read in chunks
 
 
 class Drawing:
-    """One sampler, seen through numpy."""
+    """One sampler, with copies of what it draws."""
 
-    def __init__(self, sampler: Any, device: torch.device | None = None) -> None:
-        self.sampler, self._device = sampler, device
+    def __init__(self, sampler: Any) -> None:
+        self.sampler = sampler
 
     def draw(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         rows, strata = self.sampler.draw()
         weights = self.sampler.drawn_weights
-        if self._device is None:
-            return rows.copy(), strata.copy(), None if weights is None else weights.copy()
-        assert rows.device.type == self._device.type
-        weights = None if weights is None else weights.cpu().numpy()
-        return rows.cpu().numpy(), strata.cpu().numpy(), weights
+        return rows.copy(), strata.copy(), None if weights is None else weights.copy()
 
     def update(self, rows: np.ndarray, td_abs: np.ndarray) -> None:
-        if self._device is None:
-            self.sampler.update(rows, td_abs)
-        else:
-            parts = (torch.from_numpy(part).to(self._device) for part in (rows, td_abs))
-            self.sampler.update(*parts)
+        self.sampler.update(rows, td_abs)
 
 
 Make = Callable[..., Drawing]  # seed, batch_size
 
 
-@pytest.fixture(params=["host", "cpu", "cuda", "chunks"])
+@pytest.fixture(params=["memory", "chunks"])
 def kind(request: pytest.FixtureRequest) -> str:
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
     return str(request.param)
 
 
@@ -92,12 +80,8 @@ def make(kind: str, way: str, tmp_path: Path) -> Iterator[Make]:
                 )
             )
             return Drawing(opened[-1])
-        if kind == "host":
-            by = PrioritySampler if "rule" in rule else QuotaSampler
-            return Drawing(by(STRATA, SHARES, batch_size, rng, **rule))
-        device = torch.device(kind)
-        sampler = DeviceSampler(STRATA, SHARES, batch_size, seed=seed, device=device, **rule)
-        return Drawing(sampler, device)
+        by = PrioritySampler if "rule" in rule else QuotaSampler
+        return Drawing(by(STRATA, SHARES, batch_size, rng, **rule))
 
     yield made
     for sampler in opened:
@@ -202,11 +186,8 @@ def test_a_state_of_other_strata_is_refused() -> None:
         uniform_sampler(11, 4, np.random.default_rng(0)).load_state_dict(state)
 
 
-def test_a_state_of_another_rule_is_refused(kind: str) -> None:
+def test_a_state_of_another_rule_is_refused() -> None:
     def sampler(by_priority: bool) -> Any:
-        if kind in ("cpu", "cuda"):
-            rule = Lap() if by_priority else None
-            return DeviceSampler(STRATA, SHARES, 50, seed=0, device=kind, rule=rule)
         rng = np.random.default_rng(0)
         if by_priority:
             return PrioritySampler(STRATA, SHARES, 50, rng, rule=Lap())
