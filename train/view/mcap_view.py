@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 from restock.ingest.decoding.messages import Channel
 from restock.replay.trace.moment import Moment
 from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.twin.recording.messages import build, serialise, stamp, typestore
 from restock.train.view.critic import Critic
+from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside

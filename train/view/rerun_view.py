@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 from restock.arrays import F64
 from restock.imports import import_extra
 from restock.replay.trace.moment import Moment
 from restock.replay.trace.seen_at_ticks import SeenScan
 from restock.train.view.critic import Critic
+from restock.train.view.reported import about, about_evaluated, numbers_of, texts_of
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside, Evaluated
