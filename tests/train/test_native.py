@@ -61,7 +61,7 @@ def test_values_and_gradients_are_autograds(
         expected.backward(gradient.double())
         found = []
         for made, backprop in both:
-            made.zero_grad(set_to_none=False)
+            backprop.zero_grad()
             next_q = backprop(after).detach()
             q = backprop(now)
             q.backward(gradient)
@@ -78,6 +78,17 @@ def test_values_and_gradients_are_autograds(
             found.append([q, next_q, *(one.grad for one in made.parameters())])
         for wide, as_narrow in zip(*found, strict=True):
             assert torch.equal(wide, as_narrow)
+
+
+@compiled
+def test_gradients_of_two_passes_add_up() -> None:
+    held, plain = network((16, 16), layer_norm=True), network((16, 16), layer_norm=True)
+    backprop = made_native(held)
+    batches = [normal(5, OBSERVATION, seed=seed) for seed in (0, 1)]
+    for made in (backprop, plain):
+        sum((made(batch) ** 2).sum() for batch in batches).backward()
+    for found, expected in zip(held.parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(found.grad, expected.grad)
 
 
 @compiled

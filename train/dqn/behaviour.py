@@ -197,7 +197,7 @@ class Behaviour(Stateful):
         return [*self.optimizer.moved, self._slow]
 
     def _fill_gradient(self, labelled: Labelled) -> None:
-        self.optimizer.gradient.zero_()
+        self._logits.zero_grad(set_to_none=False)
         loss = imitation_loss(self._logits(labelled.observation), labelled.action)
         loss.backward()  # type: ignore[no-untyped-call]
 

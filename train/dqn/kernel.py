@@ -6,8 +6,7 @@ whether there is one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +15,18 @@ from restock import native
 from restock.train.dqn.network import QNetwork
 
 UpdatePath = Literal["native", "autograd"]
+
+
+class Differentiable(Protocol):
+    """A network that learns, or the kernel that computes the same."""
+
+    def __call__(self, observation: Tensor) -> Tensor:
+        """Return action values (B, A) of observations (B, D)."""
+        ...
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forget the gradient; False keeps its memory."""
+        ...
 
 
 def update_path(device: str, threads: int = 1) -> UpdatePath:
@@ -30,7 +41,7 @@ def update_path(device: str, threads: int = 1) -> UpdatePath:
 
 def differentiable(
     path: UpdatePath, network: QNetwork, values: Tensor, gradient: Tensor | None = None
-) -> Callable[[Tensor], Tensor]:
+) -> Differentiable:
     """Return what a loss is computed with: a kernel, or the network itself.
 
     Args:
@@ -47,7 +58,7 @@ def differentiable(
 class Kernel:
     """A plain `QNetwork` on flat parameters: observations (B, D) to action values (B, A).
 
-    Gradients are added to those that are there, as autograd does. One thread at a time may use it;
+    Gradients are added up until `zero_grad`, as autograd does. One thread at a time may use it;
     while it computes, other threads run.
 
     Args:
@@ -70,26 +81,32 @@ class Kernel:
         norms = [module.eps for module in modules if isinstance(module, nn.LayerNorm)]
         self._actions = network.actions
         self._gradient = gradient
-        # What one backward pass writes, before it is added to the gradient.
-        self._one_pass = None if gradient is None else torch.zeros_like(gradient)
-        self._anchor = torch.zeros((), requires_grad=True)  # lets autograd record the function
+        self._adds = False  # whether the next backward pass adds to the gradient or overwrites it
         self._passes = 0  # forward passes so far: only the last can be differentiated
         self._network = native.compiled.Network(
             (network.observation_size, *widths, network.actions),
             norms[0] if norms else -1.0,
             values.numpy(),
-            None if self._one_pass is None else self._one_pass.numpy(),
+            None if gradient is None else gradient.numpy(),
             wide,
         )
 
     def __call__(self, observation: Tensor) -> Tensor:
-        """Return action values (B, A)."""
-        if self._gradient is None or not torch.is_grad_enabled():
-            return self._forward(observation)
-        values: Tensor = _Differentiated.apply(  # type: ignore[no-untyped-call]
-            self._anchor, observation, self
-        )
+        """Return action values (B, A); those of a network that learns are a leaf of the graph.
+
+        Their gradient goes through the kernel as soon as autograd has all of it.
+        """
+        values = self._forward(observation)
+        if self._gradient is not None and torch.is_grad_enabled():
+            made_by = self._passes
+            values.requires_grad_().register_post_accumulate_grad_hook(  # type: ignore[no-untyped-call]
+                lambda leaf: self._backward(observation, made_by, leaf.grad)
+            )
         return values
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Let the next backward pass overwrite the gradient instead of adding to it."""
+        self._adds = False
 
     def _forward(self, observation: Tensor) -> Tensor:
         out = observation.new_empty(len(observation), self._actions)
@@ -97,28 +114,16 @@ class Kernel:
         self._passes += 1
         return out
 
-    def _backward(self, observation: Tensor, made_by: int, gradient: Tensor) -> None:
-        if self._gradient is None or self._one_pass is None:
-            raise RuntimeError("this network does not learn: its parameters have no gradients")
+    def _backward(self, observation: Tensor, made_by: int, gradient: Tensor | None) -> None:
+        assert self._gradient is not None
+        assert gradient is not None
         if made_by != self._passes:  # another pass has overwritten what this one left
             self._forward(observation)
+        earlier = self._gradient.clone() if self._adds else None
         self._network.backward(gradient.contiguous().numpy())
-        self._gradient.add_(self._one_pass)
+        if earlier is not None:
+            self._gradient.add_(earlier)
+        self._adds = True
 
 
-class _Differentiated(torch.autograd.Function):
-    """The kernel as one operation of a graph."""
-
-    @staticmethod
-    def forward(ctx: Any, anchor: Tensor, observation: Tensor, kernel: Kernel) -> Tensor:
-        values = kernel._forward(observation)
-        ctx.kernel, ctx.observation, ctx.made_by = kernel, observation, kernel._passes
-        return values
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, None, None]:
-        ctx.kernel._backward(ctx.observation, ctx.made_by, gradients[0])
-        return None, None, None
-
-
-__all__ = ["Kernel", "UpdatePath", "differentiable", "update_path"]
+__all__ = ["Differentiable", "Kernel", "UpdatePath", "differentiable", "update_path"]

@@ -172,7 +172,7 @@ class Learner(Stateful):
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 
     def _fill_gradient(self, rows: Tensor, terms: Terms) -> Loss:
-        self.optimizer.gradient.zero_()
+        self._online.zero_grad(set_to_none=False)
         loss = self.algorithm.loss(self._online, self._target, self._batch(rows, terms))
         descended = loss.value if loss.penalty is None else loss.value + loss.penalty
         descended.backward()  # type: ignore[no-untyped-call]
