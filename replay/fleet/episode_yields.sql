@@ -1,5 +1,5 @@
 -- Every episode of a store as something that was logged once and could be logged again: what it met,
--- how long it took, and where. Not for Spark: it takes parameters.
+-- how long it took, and where. It takes parameters.
 
 -- $kinds are the kinds of missions there are; an episode is of the one it met longest, by the truth
 -- where the recording knew it, else by a label that held for $min_steps steps; else nominal.

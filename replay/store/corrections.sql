@@ -1,5 +1,5 @@
 -- What people said of labels, one row a correction: a view over `recordings`. Recordings of an older
--- store have none. Not translated for Spark.
+-- store have none.
 CREATE OR REPLACE VIEW corrections AS
 SELECT
     recording_id,

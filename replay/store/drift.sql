@@ -6,7 +6,7 @@
 -- the error, too) or, where recordings are too few, one episode. Means trimmed by a tenth are compared
 -- with Student's test, whose error is from how a robot's samples vary within its periods (Yuen and
 -- Dixon 1973); events an hour with a quasi-Poisson score test. p is corrected over all signals, robots
--- and periods (Benjamini and Hochberg 1995). Not in Spark's list of views.
+-- and periods (Benjamini and Hochberg 1995).
 
 -- Two-sided p of Student's t at a whole number of degrees of freedom (Abramowitz and Stegun 26.7.3
 -- and 26.7.4; at most 200, which is on the safe side). Smaller ones than 1e-15 are given as that.

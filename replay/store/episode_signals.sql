@@ -1,6 +1,6 @@
 -- What drift is looked for in: one value an episode of each signal (episode_signals), and how often
 -- each condition began (episode_conditions). drift.sql compares them over weeks. docs/coverage.md says what
--- each signal tells. Not in Spark's list of views.
+-- each signal tells.
 
 -- The names of the profiles' own signals.
 CREATE OR REPLACE VIEW custom_signals AS

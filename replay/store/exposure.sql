@@ -1,5 +1,5 @@
 -- Exposures: the situations that rows were in, whatever came of them, beside their conditions. Views
--- over `recordings`, `transitions` and `episodes`; Spark has them too. Rows of an older store have no
+-- over `recordings`, `transitions` and `episodes`. Rows of an older store have no
 -- exposures: there they are null, and count as in none.
 
 -- The exposures that are told of the store's rows, of the newest ingest.

@@ -1,5 +1,5 @@
 -- What drift is looked for in, from the rows. Where manifests keep it (summaries.sql), nothing is
--- scanned. Not in Spark's list of views.
+-- scanned.
 
 -- One value an episode of each signal.
 CREATE OR REPLACE VIEW measured_signals AS

@@ -1,5 +1,5 @@
 -- What each recording has of each cell, from the rows. Where manifests keep it (summaries.sql), nothing is
--- scanned. Not in Spark's list of views.
+-- scanned.
 CREATE OR REPLACE VIEW recording_cells AS
 SELECT recording_id, primary_condition AS condition, action, behaviour_policy, count(*) AS rows
 FROM transitions

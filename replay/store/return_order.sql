@@ -3,8 +3,6 @@
 --
 --     mission (null: every driver had missions of its own), driver, handed_over, condition, outcome,
 --     success, return, discounted_return
---
--- Not translated for Spark: `query_table` is DuckDB's.
 
 -- Student's t at .975, by its expansion in the normal quantile (Abramowitz and Stegun 26.7.5), within
 -- 1 %; null below 2 degrees of freedom: the spread of one or two episodes says nothing.

@@ -1,5 +1,5 @@
 -- What drivers earned: discounted and undiscounted return of a store's episodes, by driver (behaviour
--- policies with their versions), condition and outcome. Not translated for Spark: see return_order.sql.
+-- policies with their versions), condition and outcome.
 
 -- Whole episodes only: what is missing of the others was earned, too, and nobody knows how much.
 CREATE OR REPLACE MACRO discounted_episodes(discount) AS TABLE

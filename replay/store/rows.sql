@@ -1,7 +1,6 @@
 -- The two tables of a store as views, over stored_transitions and stored_recordings (its Parquet as
 -- it lies, or that of several stores): all other views are of these. A nullable column that no row has
--- yet is null: the list is rendered from `ingest/task/schema.py`. Both are written for Spark in
--- `spark.py`.
+-- yet is null: the list is rendered from `ingest/task/schema.py`.
 
 -- A recording's manifest row is committed before its transitions: an ingest that was cut between
 -- the two is in stored_recordings and in no view.

@@ -1,7 +1,7 @@
 -- Rows that look like no other of their recording, and like one of another recording: by content (task,
 -- action, observation and pose, rounded to a thousandth), not by stamp, as each ingest estimates its own
 -- clock. From the rows; where manifests have the content of theirs (shared_rows.py), nothing is read but
--- that. Not in Spark's list of views.
+-- that.
 CREATE OR REPLACE VIEW shared_rows AS
 WITH places AS (
     -- Few rows pass this, and only theirs are read whole.

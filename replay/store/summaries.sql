@@ -1,6 +1,6 @@
 -- The common views over what each manifest keeps of its recording (`stored_summaries`, made by
 -- ingest/store/summary.sql), in place of those of views.sql and macros.sql, which scan the rows. Only where
--- every recording of the store has a summary. Not in Spark's list.
+-- every recording of the store has a summary.
 
 CREATE OR REPLACE VIEW episodes AS
 SELECT

@@ -1,7 +1,6 @@
 -- The views of a store, over its `recordings` and `transitions` (rows.sql).
 -- Every column is documented in columns.toml (those of `transitions` in ingest/schema.py), and a
--- test holds that. `spark.py` translates these statements into Spark's SQL, by its table of rules and
--- of the few that no rule translates.
+-- test holds that.
 
 -- The discrete actions of each task, from the definition the recordings carry.
 CREATE OR REPLACE VIEW actions AS
