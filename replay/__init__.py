@@ -5,10 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from restock.public import lazy
-from restock.replay.store.computed import INSTALLERS
-
-INSTALLERS["mixture", "mixture_rows"] = "restock.replay.panel.mixture_tables:install_mixtures"
-INSTALLERS["gaps",] = "restock.replay.fleet.gap_tables:install_gaps"
 
 if TYPE_CHECKING:
     from restock.replay.export.dataset import export_dataset as export_dataset
@@ -39,7 +35,6 @@ if TYPE_CHECKING:
     from restock.replay.store.capacity import recommend_capacity as recommend_capacity
     from restock.replay.store.frames import CameraFrame as CameraFrame
     from restock.replay.store.frames import camera_frames as camera_frames
-    from restock.replay.store.spark import install_views as install_views
     from restock.replay.store.store import Store as Store
     from restock.replay.trace.trace import TracePlaces as TracePlaces
     from restock.replay.trace.trace import audited_rows as audited_rows
@@ -69,7 +64,6 @@ else:
             "restock.replay.store.audit": ["load_audits", "load_thresholds", "run_audits"],
             "restock.replay.store.capacity": ["recommend_capacity"],
             "restock.replay.store.frames": ["CameraFrame", "camera_frames"],
-            "restock.replay.store.spark": ["install_views"],
             "restock.replay.store.store": ["Store"],
             "restock.replay.trace.trace": ["TracePlaces", "audited_rows", "trace_row"],
         },

@@ -16,6 +16,8 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table
 from restock.ingest.store.location import Location
 from restock.ingest.store.version import Version
+from restock.replay.fleet.gap_tables import install_gaps
+from restock.replay.panel.mixture_tables import install_mixtures
 from restock.replay.store.definitions import definitions
 from restock.replay.store.parquet_views import REMAKE, read_parquet
 from restock.replay.store.store import Store, is_store
@@ -55,6 +57,7 @@ def open_place(
     if only_store or place.folder is None or is_store(place):
         with Store(place, version=version, memory_limit=memory_limit) as store:
             opened(store)
+            add_computed_tables(store)
             _add_all(store.bare, beside)
             for schema, path in (beside or {}).items():
                 _refuse_of_another_store(store, schema, path)
@@ -76,6 +79,12 @@ def open_place(
         _add_all(connection, beside)
         _list_columns(connection)
         yield connection
+
+
+def add_computed_tables(store: Store) -> None:
+    """Let a store's queries name the table macros that Python computes: they are made on demand."""
+    store.add_tables(("mixture", "mixture_rows"), install_mixtures)
+    store.add_tables(("gaps",), install_gaps)
 
 
 def _add_all(

@@ -1,6 +1,6 @@
 -- A mixture's plan over a store, before any panel is built: FROM mixture('coverage').
 -- `planned_strata` and `planned_rows` are functions in Python (mixture_tables.py), of the name of a
--- shipped mixture or the path of a TOML file: the macros are in `restock sql` and `Store.sql` alone.
+-- shipped mixture or the path of a TOML file.
 
 -- A row a stratum: what is there, wanted, drawn, and left of it after weights.
 CREATE OR REPLACE MACRO mixture(name) AS TABLE

@@ -86,9 +86,10 @@ class Definitions:
         connection: that of a store.
         observation_type: what observations are cast to.
         summaries: take the common views from `stored_summaries`.
-        computed: names of macros -> what makes them, where a text names one.
-        replaced: the same of tables in place of views, which take too long to make for a list;
-            with the table `same_drives`, in place of none.
+        replaced: names of tables -> what makes them when a text names one, in place of views that
+            take too long to make for a list.
+
+    `computed` are table macros that Python computes, in the same form.
     """
 
     def __init__(
@@ -97,14 +98,13 @@ class Definitions:
         observation_type: str,
         *,
         summaries: bool = False,
-        computed: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
         replaced: Mapping[tuple[str, ...], Callable[[], None]] | None = None,
     ) -> None:
         self._connection, self.summaries = connection, summaries
         self._statements = dict(_statements(_of_store(observation_type, (*VIEWS, FRAMES, *MACROS))))
         if summaries:
             self._statements |= _statements(definitions(names=[SUMMARIES]))
-        self._computed = dict(computed or {})
+        self.computed: dict[tuple[str, ...], Callable[[], None]] = {}
         self._replaced: dict[tuple[str, ...], Callable[[], None]] = dict(replaced or {})
         self._replaced[("same_drives",)] = partial(install_same_drives, connection)
         self._made: set[str] = set()
@@ -118,7 +118,7 @@ class Definitions:
             self.make_all()
             return
         self._make(words)
-        for makers in (self._computed, self._replaced):
+        for makers in (self.computed, self._replaced):
             for names in [names for names in makers if words & set(names)]:
                 makers.pop(names)()
 
@@ -129,8 +129,8 @@ class Definitions:
     def make_all(self) -> None:
         """Every one, and the view `columns` of them."""
         self._make(self._statements)
-        for names in list(self._computed):
-            self._computed.pop(names)()
+        for names in list(self.computed):
+            self.computed.pop(names)()
         if "columns" not in self._made:
             install_columns(self._connection)
             self._made.add("columns")

@@ -13,6 +13,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -38,7 +39,6 @@ from restock.ingest.task.conditions import NOMINAL, Condition
 from restock.ingest.task.schema import frame_schema
 from restock.ingest.task.task import Task
 from restock.interrupts import interrupts_raised
-from restock.replay.store.computed import computed
 from restock.replay.store.definitions import Definitions, install_common
 from restock.replay.store.parquet_views import damage
 from restock.replay.store.query import query
@@ -133,14 +133,11 @@ class Store:
             ) from error
         self._tasks = self._read_tasks()
         self.observation_type = self._observation_type()
-        # Of a query's text, before it runs: what only fails while rows are fetched is said here.
-        self.checks: list[Callable[[str], None]] = []
         summaries = self._present_summaries()
         self._definitions = Definitions(
             self.bare,
             self.observation_type,
             summaries=summaries,
-            computed=computed(self),
             replaced={SHARED: self._install_shared_rows} if summaries else {},
         )
 
@@ -182,16 +179,15 @@ class Store:
 
     @interrupts_raised
     def sql(self, text: str) -> duckdb.DuckDBPyRelation:
-        """The result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
+        """Return the result of a query: `.to_arrow_table()`, `.df()`, `.pl()`, `.fetchall()`.
 
-        Raises QueryError with DuckDB's message, where the query would write, or while another
-        thread reads what it asked for; ConfigError where it names a mixture that there is not.
+        Raises:
+            QueryError: DuckDB's message; the query would write; or another thread still reads the
+                result of an earlier query.
         """
         try:
             with self._asking:
                 self._definitions.make(text)
-                for check in self.checks:
-                    check(text)
                 return query(self.bare, text, where=str(self.path))
         except (duckdb.Error, QueryError) as error:
             if "connection is busy" not in str(error):
@@ -201,6 +197,10 @@ class Store:
                 where=str(self.path),
                 remedy="open a Store in each thread",
             ) from error
+
+    def add_tables(self, names: tuple[str, ...], install: Callable[[Store], None]) -> None:
+        """Call `install` with this store before the first query that contains one of `names`."""
+        self._definitions.computed[names] = partial(install, self)
 
     def conditions(self) -> tuple[Condition, ...]:
         """The conditions that labelled the store's rows, of the newest ingest.

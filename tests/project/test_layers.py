@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",
-    "replay": "panel store ingest/store",
+    "replay": "fleet panel store ingest/store",
     "replay/store": "ingest/camera ingest/store ingest/task",
     "replay/mixture": "",
     "replay/sampling": "mixture",

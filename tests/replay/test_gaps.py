@@ -21,6 +21,7 @@ from restock.replay.fleet.missions_file import MissionOrder, MissionsFile, as_to
 from restock.replay.fleet.shopping_list import shopping_list
 from restock.replay.fleet.yields import Yields
 from restock.replay.mixture.mixture import load_mixture, parse_mixture
+from restock.replay.places import add_computed_tables
 from restock.replay.plan.forecast import forecast, missions_to_see_one, probability_to_close
 from restock.replay.store.capacity import recommend_capacity
 from restock.replay.store.store import Store
@@ -391,6 +392,7 @@ def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFi
 def test_gaps_are_a_table_of_sql(store: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(ASKING)
     with Store(store) as opened:
+        add_computed_tables(opened)
         query = f"FROM gaps('{tmp_path / 'mine.toml'}') WHERE asked_by LIKE 'mixture%'"
         rows = opened.sql(query).to_arrow_table().to_pylist()
         none = opened.sql("FROM gaps('uniform') WHERE asked_by LIKE 'mixture%'").fetchall()

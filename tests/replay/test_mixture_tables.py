@@ -12,10 +12,10 @@ from support.panels import EVERY, NO_SPLIT
 from support.stores import recording_transitions, write_store
 
 from restock import cli
-from restock.errors import ConfigError
 from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import open_source, write_panel
 from restock.replay.panel.mixture_tables import ROWS, STRATA
+from restock.replay.places import add_computed_tables
 from restock.replay.plan.plan import plan_panel
 from restock.replay.store.store import Store
 
@@ -55,6 +55,7 @@ def test_mix_packs_exactly_what_the_tables_say(folder: Path, tmp_path: Path, nam
         mixture = str(folder / "mixture.toml")
         Path(mixture).write_text(text)
     with Store(folder / ("half" if name == "unlabelled" else "store")) as store:
+        add_computed_tables(store)
         strata = store.sql(f"FROM mixture('{mixture}')").to_arrow_table()
         rows = store.sql(f"FROM mixture_rows('{mixture}')").to_arrow_table()
         loaded = load_mixture(mixture)
@@ -81,6 +82,7 @@ def test_a_file_that_changed_is_planned_again(folder: Path, tmp_path: Path) -> N
     path = tmp_path / "m.toml"
     path.write_text("seed = 1\n" + EVERY)
     with Store(folder / "store") as store:
+        add_computed_tables(store)
         query = f"SELECT list(transition_id ORDER BY transition_id) FROM mixture_rows('{path}')"
         first = store.sql(query).fetchall()
         assert store.sql(query).fetchall() == first
@@ -128,13 +130,3 @@ def test_what_cannot_be_mixed_is_refused_as_by_mix(
         said = capsys.readouterr().err
         assert message in said
         assert "UDF" not in said
-
-
-@pytest.mark.parametrize("table", ["mixture", "MIXTURE_ROWS", "gaps"])
-def test_a_mixture_that_there_is_not_is_said_before_the_query_runs(folder: Path, table: str):
-    """Not by DuckDB, in its own words, when the rows are fetched."""
-    with Store(folder / "store") as store:
-        with pytest.raises(ConfigError, match="no mixture 'nope'") as caught:
-            store.sql(f"SELECT count(*) FROM {table}( 'nope')")
-        assert "coverage" in str(caught.value.remedy)
-        assert store.sql("SELECT 'mixture of nope'").fetchall()
