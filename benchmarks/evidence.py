@@ -204,7 +204,16 @@ def _make_store(store: Path, requested: list[tuple[Path, list[str], str]], worke
 def _record(recording: Path, flags: list[str], conditions: str) -> None:
     if not recording.exists():
         _say(f"recording {recording.name}")
-        command = [sys.executable, "-m", "restock", "record", "--out", str(recording), *flags]
+        command = [
+            sys.executable,
+            "-m",
+            "restock",
+            "twin",
+            "record",
+            "--out",
+            str(recording),
+            *flags,
+        ]
         command += ["--rates", RATES, "--conditions", conditions]
         subprocess.run(command, check=True, stdout=sys.stderr)
 

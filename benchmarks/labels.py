@@ -109,7 +109,7 @@ def stored(cache: Path, floors: str, seeds: Sequence[int], minutes: float) -> Pa
             print(f"recording {log.name}", file=sys.stderr)
             record(log, RecordingPlan(minutes=minutes, seed=seed, layouts=floors))
         run_restock(["ingest", str(log), "--store", str(store)])
-    run_restock(["label", str(store)])
+    run_restock(["store", "label", str(store)])
     return store
 
 

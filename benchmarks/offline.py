@@ -98,7 +98,14 @@ def _panel(out: Path, hours: float) -> Path:
     while left > 0:
         number = round((hours * 60 - left) / RECORDING_MINUTES)
         minutes = min(left, RECORDING_MINUTES)
-        words = ["record", "--out", str(logs / f"day_{number}.mcap"), "--minutes", f"{minutes:g}"]
+        words = [
+            "twin",
+            "record",
+            "--out",
+            str(logs / f"day_{number}.mcap"),
+            "--minutes",
+            f"{minutes:g}",
+        ]
         words += ["--seed", str(FIRST_SEED + number)]
         once(logs / f"day_{number}.done", words, partial(run_restock, words))
         left -= minutes

@@ -283,7 +283,7 @@ LATER = [
 NOTHING = Fault("nothing", "", "")
 SETS = {"healthy": [NOTHING], "tuned": TUNED, "left out": LEFT_OUT, "later": LATER}
 MOSTLY = {"slippery": "wheel_slip", "blocked": "blocked_aisle", "crowded": "near_collision"}
-UNCHANGED = {  # name: arguments of `restock record`
+UNCHANGED = {  # name: arguments of `restock twin record`
     **{f"plain{n}": ("25", 700 + n, ()) for n in range(1, 7)},
     **{
         f"{name}{n}": ("30", seed + n, ("--conditions", f"nominal=.3,{kind}=.7"))
@@ -369,7 +369,7 @@ def unchanged(out: Path) -> list[Path]:
         paths.append(out / f"{name}.mcap")
         if not paths[-1].exists():
             where = ["--out", str(paths[-1]), "--missions", missions, "--seed", str(seed)]
-            run_restock(["record", *where, *flags])
+            run_restock(["twin", "record", *where, *flags])
     return paths
 
 

@@ -162,7 +162,7 @@ def measured(
         if words:
             said(["ingest", path, *profile, *words])
     figures["by_year"] = json.loads(said(["sql", str(store), BY_YEAR, "--json"]))
-    drift = json.loads(said(["drift", str(store), "--json"]))
+    drift = json.loads(said(["coverage", "drift", str(store), "--json"]))
     figures["drift"] = {
         "tests": dict(Counter(f"{one['against']}: {one['verdict']}" for one in drift["tests"])),
         "findings": [one["finding"] for one in drift["findings"]],

@@ -28,13 +28,11 @@ NOT_PAGES = ("build.py", "__pycache__")
 
 def list_verbs() -> Iterator[str]:
     """Yield a section for each verb and each of its jobs: its `--help`."""
-    from restock.cli import VERBS
+    from restock.cli import JOBS, VERBS
 
     for verb in VERBS:
-        text = _help(verb)
-        yield f"## restock {verb}\n\n```text\n{text}```\n"
-        jobs = re.match(r"usage: restock [\w -]+ \[-h\] \{([\w,-]+)\}\n", text)
-        for job in jobs[1].split(",") if jobs else []:
+        yield f"## restock {verb}\n\n```text\n{_help(verb)}```\n"
+        for job in JOBS.get(verb, ()):
             yield f"### restock {verb} {job}\n\n```text\n{_help(verb, job)}```\n"
 
 

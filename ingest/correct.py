@@ -80,7 +80,7 @@ def correct_store(
             raise StoreError(
                 f"recording {recording} was ingested again or removed in the meantime",
                 where=str(store.path),
-                remedy="list its events again with `restock label STORE --review N`",
+                remedy="list its events again with `restock store label STORE --review N`",
             )
     outcomes: list[Corrected] = []
 

@@ -115,7 +115,7 @@ def _refusal(
 
 
 def _removal(store: StoreWriter, recording_id: str) -> str:
-    return f"`restock remove {quoted(store.path)} {recording_id}`"
+    return f"`restock store remove {quoted(store.path)} {recording_id}`"
 
 
 def _commit(

@@ -18,7 +18,7 @@ from restock.errors import StoreError, expect
 from restock.ingest.store.writer import StoreWriter
 from restock.words import counted, quoted
 
-OPERATION = "restock remove"
+OPERATION = "restock store remove"
 ID_DIGITS = 16
 PREFIX_DIGITS = 6  # of an id, at least
 _MAX_NAMED = 5

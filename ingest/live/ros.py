@@ -67,7 +67,7 @@ def load_ros() -> Ros:
     except (ImportError, AttributeError) as error:
         raise ConfigError(
             f"needs ROS 2, whose rclpy cannot be imported: {error}",
-            where="restock node",
+            where="restock-node",
             remedy="source /opt/ros/DISTRO/setup.bash (Jazzy or later), in an environment made"
             " with --system-site-packages; without ROS, --on RECORDING plays a recording to it",
         ) from error

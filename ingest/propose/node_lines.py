@@ -1,4 +1,4 @@
-"""What Restock's own node published: a proposal reads it as `restock node --write-profile` does."""
+"""What Restock's own node published: a proposal reads it as `restock-node --write-profile` does."""
 
 from __future__ import annotations
 

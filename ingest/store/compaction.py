@@ -28,7 +28,7 @@ FILE_ROWS = 500_000  # of transitions: what replacing one of its recordings writ
 MIN_FILES = 2
 FOLD_FILES = 50  # manifests of a file each, which cost each opening 5 ms; joining one costs 20 ms
 FULL_MANIFESTS = 2_000  # a file of so many is left alone: else each fold would write all of them
-OPERATION = "restock compact"
+OPERATION = "restock store compact"
 
 
 @dataclass

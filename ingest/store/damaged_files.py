@@ -46,7 +46,7 @@ from restock.ingest.store.reader import StoreReader, frame_files
 from restock.ingest.store.writer import StoreWriter
 from restock.words import counted, quoted
 
-OPERATION = "restock compact --drop-damaged"
+OPERATION = "restock store compact --drop-damaged"
 READ_AT_ONCE = 4  # files, of each of which a row group may be in memory
 VERIFIED = "verified.json"  # in a store: path -> [bytes, time written in ns] of files found whole
 Files = Mapping[str, list[StoredFile]]  # by table

@@ -1,8 +1,9 @@
 """Which ingests the files of a store's tables hold.
 
 A file that `restock ingest` wrote is named by its one ingest: `<recording_id>/<ingest_id>.parquet`.
-One that was compacted holds several: `restock compact` keeps their list in the file's metadata, and
-of files that other tools compacted it is read from the columns `recording_id` and `ingest_id`.
+One that was compacted holds several: `restock store compact` keeps their list in the file's
+metadata. For files that other tools compacted, it is read from the columns `recording_id` and
+`ingest_id`.
 """
 
 from __future__ import annotations
@@ -167,8 +168,8 @@ def damage_remedy(place: Location, path: str) -> str:
     if name == FRAMES or (name == TRANSITIONS and OWN_PATH.fullmatch(file)):
         return "restore the file from a copy, or ingest its recording again with --force"
     return (
-        f"restore the file from a copy, or let `restock compact {quoted(place)} --drop-damaged`"
-        " take it out of the store: it names the recordings to ingest again"
+        f"restore the file from a copy, or let `restock store compact {quoted(place)}"
+        " --drop-damaged` take it out of the store: it names the recordings to ingest again"
     )
 
 

@@ -70,7 +70,7 @@ class Drift:
         )
 
     def document(self) -> dict[str, Any]:
-        """As `restock drift --json` prints it."""
+        """As `restock coverage drift --json` prints it."""
         return {
             "store": self.store,
             "version": self.version,

@@ -1,7 +1,7 @@
 """`gaps(name)`: what a mixture and the audits of coverage find missing, as a store's SQL.
 
-Missions are of the kinds that the store's conditions name; `restock gaps` takes those that the twin
-can drive.
+Missions are of the kinds that the store's conditions name; `restock coverage gaps` takes those that
+the twin can drive.
 """
 
 from __future__ import annotations

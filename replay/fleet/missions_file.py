@@ -1,4 +1,4 @@
-"""A missions file: which missions to drive next, as TOML for people and for `restock record`.
+"""A missions file: which missions to drive next, as TOML for people and for `restock twin record`.
 
 [[missions]]
 kind = "wheel_slip"      # what it is to meet
@@ -63,7 +63,7 @@ def read_missions(path: str | Path) -> MissionsFile:
     Raises:
         ConfigError: it cannot be read, an unknown key, or a value that does not fit.
     """
-    remedy = "`restock gaps STORE --missions-out FILE` writes one"
+    remedy = "`restock coverage gaps STORE --missions-out FILE` writes one"
     return typed(
         read_toml(Path(path), remedy=remedy), MissionsFile, where=str(path), remedy=_REMEDY
     )
@@ -117,9 +117,9 @@ def write_missions(path: Path, missions: MissionsFile) -> None:
 def as_toml(missions: MissionsFile) -> str:
     """The text of the file."""
     driven = any(order.missions is not None for order in missions.missions)
-    how = "`restock record --missions` drives it" if driven else "the twin cannot drive hours"
+    how = "`restock twin record --missions` drives it" if driven else "the twin cannot drive hours"
     lines = [
-        f"# What to log next, as `restock gaps` planned it; {how}.",
+        f"# What to log next, as `restock coverage gaps` planned it; {how}.",
         f"format = {toml_value(missions.format)}",
         f"store = {toml_value(missions.store)}",
         f"store_version = {missions.store_version}",

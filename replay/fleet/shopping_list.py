@@ -258,7 +258,7 @@ def describe_cell(gap: Gap) -> str:
 
 
 def document(found: ShoppingList) -> dict[str, Any]:
-    """Plain values: what `restock gaps --json` prints of it."""
+    """Plain values: what `restock coverage gaps --json` prints of it."""
     return {
         "unit": found.unit,
         "confidence": found.confidence,

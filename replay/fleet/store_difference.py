@@ -87,7 +87,7 @@ class StoreDifference:
         return bool(self.definitions or self.recordings or self.labels or self.other_labels)
 
     def document(self) -> dict[str, Any]:
-        """What `restock diff --json` prints."""
+        """What `restock coverage diff --json` prints."""
         changed = {
             change: sum(row["change"] == change for row in self.episodes)
             for change in ("in", "out", "changed")

@@ -86,7 +86,7 @@ def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns
     if bare.any() and mixture.unlabelled == "refuse":
         raise MixtureError(
             f"{int(bare.sum())} rows have no coverage label: their condition is unknown",
-            remedy='`restock label` the store, or set unlabelled = "drop" (or "nominal")',
+            remedy='`restock store label` the store, or set unlabelled = "drop" (or "nominal")',
         )
     if mixture.unlabelled == "drop":
         out.add("without a coverage label", bare)
@@ -145,8 +145,8 @@ def repeats_of(
         raise MixtureError(
             f"all {int(repeated.sum())} rows outside the evaluation split repeat its steps:"
             " the same drive is in the store more than once",
-            remedy="take the repeated recordings out with `restock remove STORE RECORDING` (the"
-            " audit `repeated_steps` lists them), or ingest more",
+            remedy="take the repeated recordings out with `restock store remove STORE RECORDING`"
+            " (the audit `repeated_steps` lists them), or ingest more",
         )
     return repeated
 

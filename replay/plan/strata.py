@@ -144,7 +144,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
             "`where`",
             where="mixture",
             remedy=f"name one of {', '.join([NOMINAL, *sorted(known)])}; or give it a `where`; or"
-            " add it to the profile and run `restock label`",
+            " add it to the profile and run `restock store label`",
         )
     if rule.unit == "episode":
         # Chosen by what the whole episode met, not by what came of this step.

@@ -27,7 +27,7 @@ def too_few(rule: StratumRule, rows: int, episodes: int) -> str:
     """Return why a stratum gets nothing, and what to change; "" if it has what it needs."""
     if not rows:
         other = "change its `where`" if rule.where is not None else "leave it out of the strata"
-        return f"has no row that may be drawn: record some (see `restock gaps`), or {other}"
+        return f"has no row that may be drawn: record some (`restock coverage gaps`), or {other}"
     needs = {"min_rows": (rule.min_rows, rows), "min_episodes": (rule.min_episodes, episodes)}
     short = [f"{name} = {least:,}" for name, (least, has) in needs.items() if has < least]
     if not short:
@@ -103,7 +103,7 @@ def _less_often(taker: ResolvedStratum, steps: int) -> str:
     at_source = (
         "make its `where` stricter"
         if taker.rule.where is not None
-        else "raise its threshold in the profile and run `restock label`"
+        else "raise its threshold in the profile and run `restock store label`"
     )
     return (
         f"{in_mixture}{at_source}; or list the other conditions under [[strata]] in place of"

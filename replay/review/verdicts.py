@@ -160,8 +160,8 @@ class _Reading:
         raise LabelError(
             "; ".join(shown) if len(shown) == 1 else "\n    ".join(["", *shown]),
             where=str(self.path),
-            remedy="correct or remove these lines; `restock label STORE --review N` lists events "
-            "with their present steps",
+            remedy="correct or remove these lines; `restock store label STORE --review N` lists "
+            "events with their present steps",
         )
 
     def _lines(self, text: str) -> Iterator[Verdict]:
@@ -190,8 +190,8 @@ class _Reading:
             raise LabelError(
                 f"it has no column {', no column '.join(missing)}",
                 where=str(self.path),
-                remedy="use a file from `restock label STORE --review N --out FILE`, or write one "
-                "with the columns episode_id,condition,first_step,last_step,value",
+                remedy="use a file from `restock store label STORE --review N --out FILE`, or "
+                "write one with the columns episode_id,condition,first_step,last_step,value",
             )
 
     def _line(self, line: int, said: Mapping[str, str]) -> Verdict | None:

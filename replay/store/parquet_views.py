@@ -135,8 +135,8 @@ def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | Non
     return StoreError(
         f"is damaged or cannot be read: {first_line(error)}",
         where=where,
-        remedy="restore its files from a copy, or let `restock compact STORE --drop-damaged` find"
-        " the file: it names the recordings to ingest again",
+        remedy="restore its files from a copy, or let `restock store compact STORE --drop-damaged`"
+        " find the file: it names the recordings to ingest again",
     )
 
 

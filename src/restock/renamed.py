@@ -28,3 +28,13 @@ AUDITS = {  # and their thresholds
     "observation_drift": _now("'signal_drift'"),
     "max_flattery": _now("'max_bias'"),
 }
+
+VERBS = {  # what to type instead
+    **{verb: f"it is `restock store {verb}` now" for verb in ("label", "compact", "remove")},
+    **{verb: f"it is `restock coverage {verb}` now" for verb in ("gaps", "drift", "diff")},
+    "record": "it is `restock twin record` now",
+    "study": "it is `restock train STUDY.toml` now",
+    "node": "it is a command of its own now: `restock-node`",
+    "schema": "it is `restock profile schema` now",
+    "completion": "it is `restock --tyro-write-completion SHELL FILE` now",
+}

@@ -14,6 +14,7 @@ from support.paths import ROOT
 from restock import cli, native
 from restock.cli.output import print_table
 from restock.errors import ExitCode, RecordingError
+from restock.renamed import VERBS as RENAMED
 
 
 def restock(*args: str, **kwargs: object) -> subprocess.CompletedProcess[str]:
@@ -40,6 +41,24 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
 def test_every_verb_is_in_the_docs(verb: str) -> None:
     pages = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "docs").glob("*.md"))
     assert f"restock {verb}" in pages
+
+
+@pytest.mark.parametrize("verb", RENAMED)
+def test_an_old_verb_is_answered_with_the_new_one(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main([verb, "store"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert RENAMED[verb] in said
+    named = re.findall(r"`restock (\w+)(?: (\w+))?", said)
+    assert all(new in cli.VERBS and verb != new for new, _ in named)
+
+
+@pytest.mark.parametrize("words", [["store"], ["store", "none"], ["twin", "none"]], ids=" ".join)
+def test_a_job_must_be_named(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == ExitCode.USAGE
+    printed = "".join(capsys.readouterr())
+    assert all(job in printed for job in cli.JOBS[words[0]])
 
 
 def test_an_unknown_verb_suggests_the_near_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -193,9 +212,9 @@ def sample_rows(tmp_path):
         ["diagnose", "run", "--seed", "3"],
         ["diagnose", "run", "--no-twin"],
         ["diagnose", "--before-training", "panel", "--no-rows"],
-        ["gaps", "store", "--min-rows", "-4"],
-        ["gaps", "store", "--by", "zone"],
-        ["label", "store", "--all"],
+        ["coverage", "gaps", "store", "--min-rows", "-4"],
+        ["coverage", "gaps", "store", "--by", "zone"],
+        ["store", "label", "store", "--all"],
         ["export", "run", "--to", "onnx", "--out", "p.onnx", "--license", "apache-2.0"],
         ["export", "run", "--to", "onnx", "--out", "p.onnx", "--cameras", "front"],
         ["audit", "store", "--capacity", "--strict"],

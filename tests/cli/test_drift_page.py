@@ -1,4 +1,4 @@
-"""`restock drift`: names what changed, as text, JSON and a page."""
+"""`restock coverage drift`: names what changed, as text, JSON and a page."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class Text(HTMLParser):
 
 
 def test_it_names_the_worn_wheel(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["drift", str(store)]) == 0
+    assert cli.main(["coverage", "drift", str(store)]) == 0
     out = capsys.readouterr().out
     assert "amr-2: wheels: odometry_scale 0.9" in out
     assert "since 2026-03-16 (2 of 2 weeks)" in out
-    assert cli.main(["drift", str(store), "--exit-code"]) == 1
+    assert cli.main(["coverage", "drift", str(store), "--exit-code"]) == 1
 
 
 def test_the_page_says_the_same_and_trusts_no_name(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "pages" / "drift.html"
-    assert cli.main(["drift", str(store), "--out", str(page), "--json"]) == 0
+    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {row["robot"] for row in document["findings"] if row["part"] == "wheels"} == {"amr-2"}
     assert {row["against"] for row in document["tests"]} == {"own reference", "other robots"}
@@ -66,7 +66,7 @@ def test_a_fleet_with_nothing_to_compare_says_so(
 ) -> None:
     store = fleet_store(tmp_path / "store", [SyntheticRobot(None)], weeks=1, episodes=2)
     page = tmp_path / "drift.html"
-    assert cli.main(["drift", str(store), "--out", str(page), "--exit-code"]) == 0
+    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--exit-code"]) == 0
     out = capsys.readouterr().out
     assert "<code>restock ingest --tag robot=NAME</code>" in page.read_text(encoding="utf-8")
     assert "untagged drove in one week only" in out
@@ -83,7 +83,7 @@ def test_alike_robots_without_a_reference_are_not_called_unchanged(
 ) -> None:
     robots = [SyntheticRobot("amr-1"), SyntheticRobot("amr-2")]
     store = fleet_store(tmp_path / "store", robots, weeks=1, recordings=3)
-    assert cli.main(["drift", str(store), "--json"]) == 0
+    assert cli.main(["coverage", "drift", str(store), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert any(row["p"] is not None for row in document["tests"])  # of the robots, with each other
     assert (document["tested"], document["findings"]) == (0, [])
@@ -98,7 +98,7 @@ def test_too_few_episodes_in_every_week_are_said(
     store = fleet_store(
         tmp_path / "store", [SyntheticRobot("amr-1")], weeks=2, recordings=1, episodes=2
     )
-    assert cli.main(["drift", str(store)]) == 0
+    assert cli.main(["coverage", "drift", str(store)]) == 0
     out = capsys.readouterr().out
     assert re.search(r"Nothing could be tested: none of \d+ comparisons has enough episodes", out)
 
@@ -108,7 +108,7 @@ def test_no_change_is_said_with_its_number_of_tests(
 ) -> None:
     store = fleet_store(tmp_path / "store", [SyntheticRobot("amr-1")], recordings=3)
     page = tmp_path / "drift.html"
-    assert cli.main(["drift", str(store), "--out", str(page), "--json"]) == 0
+    assert cli.main(["coverage", "drift", str(store), "--out", str(page), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     own = [row for row in document["tests"] if row["against"] == "own reference"]
     tests = sum(row["p"] is not None for row in own)
@@ -118,7 +118,7 @@ def test_no_change_is_said_with_its_number_of_tests(
     text = Text()
     text.feed(page.read_text("utf-8"))
     assert said in text.text
-    assert cli.main(["drift", str(store)]) == 0
+    assert cli.main(["coverage", "drift", str(store)]) == 0
     assert said in capsys.readouterr().out
 
 
@@ -133,5 +133,5 @@ def test_no_change_is_said_with_its_number_of_tests(
 def test_what_it_cannot_do_is_refused(
     flags: list[str], said: str, store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["drift", str(store), *flags]) == 2
+    assert cli.main(["coverage", "drift", str(store), *flags]) == 2
     assert said in capsys.readouterr().err

@@ -903,11 +903,14 @@ def test_no_file_of_a_command_is_written_into_a_store_nor_into_another_run(
         (["report", str(own), "--figures", str(store_path / "figures")], f"the store {store}"),
         (["coverage", store, "--out", str(store_path / "page.html")], f"the store {store}"),
         (["audit", store, "--junit", str(store_path / "x.xml")], f"the store {store}"),
-        (["schema", "--out", store], f"the store {store}"),
+        (["profile", "schema", "--out", store], f"the store {store}"),
         (["profile", "new", "a.mcap", "--out", f"{store}/p.toml"], f"the store {store}"),
-        (["label", store, "--review", "3", "--out", f"{store}/l.csv"], f"the store {store}"),
+        (
+            ["store", "label", store, "--review", "3", "--out", f"{store}/l.csv"],
+            f"the store {store}",
+        ),
         (["sql", store, "--export", f"{store}/views.sql"], f"the store {store}"),
-        (["gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
+        (["coverage", "gaps", store, "--missions-out", f"{store}/m.toml"], f"the store {store}"),
         (["twin", "layout", "--png", f"{run}/floor.png"], f"the run {run}"),
         (["twin", "fit", store, "--out", f"{store}/fitted.toml"], f"the store {store}"),
     ):

@@ -193,7 +193,7 @@ NEVER_SEEN = {
 
 
 def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[str, Any]:
-    """As `restock gaps --json` prints it."""
+    """As `restock coverage gaps --json` prints it."""
     place = {"store": "store", "store_version": 1, "mixture": "coverage", "confidence": 0.8}
     whole = {**NO_PLAN, **plan}
     return {**place, "unit": unit, "closed": not gaps, "gaps": list(gaps), "plan": whole}
@@ -257,7 +257,7 @@ def test_a_condition_of_ones_own_has_one_colour_in_bars_weeks_and_map(tmp_path: 
 
 @pytest.mark.parametrize("unit", ["missions", "hours"])
 def test_missions_to_drive_are_offered_where_the_plan_is_of_missions(unit: str) -> None:
-    """The twin drives no hours of logging: `restock record --missions` refused the file."""
+    """The twin drives no hours of logging: `restock twin record --missions` refused the file."""
     gap = {**NEVER_SEEN, "best": "logging", "amount": 3, "amount_low": 2, "amount_high": 5}
     order = {"kind": None, "zone": None, "robot": None, "missions": 3, "hours": 0.1}
     plan = {"orders": [{**order, "fills": ["wheel_slip"]}], "total": 3.0}

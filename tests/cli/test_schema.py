@@ -1,4 +1,4 @@
-"""`restock schema`: what Restock reads an editor accepts, what it refuses an editor underlines."""
+"""`restock profile schema`: an editor accepts what Restock reads, and nothing else."""
 
 from __future__ import annotations
 
@@ -128,11 +128,11 @@ def test_keys_have_the_comments_beside_them_as_descriptions() -> None:
 def test_the_command_prints_lists_and_writes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["schema", "--json"]) == 0
+    assert cli.main(["profile", "schema", "--json"]) == 0
     assert [row["name"] for row in json.loads(capsys.readouterr().out)] == list(CONFIGS)
-    assert cli.main(["schema", "study"]) == 0
+    assert cli.main(["profile", "schema", "study"]) == 0
     assert json.loads(capsys.readouterr().out) == SCHEMAS["study"]
-    assert cli.main(["schema", "--out", str(tmp_path)]) == 0
+    assert cli.main(["profile", "schema", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {f"{n}.schema.json" for n in CONFIGS}
-    assert cli.main(["schema", "robot"]) == 2
+    assert cli.main(["profile", "schema", "robot"]) == 2
     assert "choose one of train" in capsys.readouterr().err

@@ -85,7 +85,7 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
         ["audit", "STORE"],
         ["audit", "STORE", "--reward"],
         ["check", "STORE"],
-        ["gaps", "STORE"],
+        ["coverage", "gaps", "STORE"],
     ],
     ids=" ".join,
 )

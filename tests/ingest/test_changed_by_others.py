@@ -47,7 +47,7 @@ def test_a_reader_feature_that_is_not_known_is_refused_by_name(store, capsys, fe
     """Rows that deletion vectors delete are in the Parquet files still."""
     before = sum(shown(store).values())
     with_protocol(store, **features(feature))
-    for verb in (["sql", str(store), "FROM coverage"], ["compact", str(store)]):
+    for verb in (["sql", str(store), "FROM coverage"], ["store", "compact", str(store)]):
         assert cli.main(verb) == 2
         said = capsys.readouterr().err
         assert f"its table `transitions` uses Delta's feature `{feature}`" in said

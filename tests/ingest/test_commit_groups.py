@@ -157,7 +157,7 @@ def test_of_a_part_and_the_whole_it_is_the_part_that_is_to_go(tmp_path, repeated
     group.add(0, waiting(store, (manifest(part), part), repeated))
     group.add(1, waiting(store, (manifest(rows), rows), repeated))
     group.commit()
-    result, removal = group.results[1], f"`restock remove {tmp_path / 's'} {7:016x}` takes"
+    result, removal = group.results[1], f"`restock store remove {tmp_path / 's'} {7:016x}` takes"
     if isinstance(result, IngestResult):
         assert f"{removal} out that one, which holds less" in result.notes[-1]
     else:

@@ -433,13 +433,13 @@ def test_files_that_others_add_meanwhile_are_not_counted(tmp_path, monkeypatch):
 def test_what_the_command_says(tmp_path, capsys):
     place = str(tmp_path / "s")
     StoreWriter(place).write_all([one(1), one(2)])
-    assert main(["compact", place, "--dry-run"]) == 0
+    assert main(["store", "compact", place, "--dry-run"]) == 0
     planned = capsys.readouterr().err
     assert "2 -> 1 files" in planned
     assert "manifests: 2 -> 1 files" in planned
-    assert main(["compact", place]) == 0
+    assert main(["store", "compact", place]) == 0
     assert capsys.readouterr().err == planned.replace("would write", "wrote")
-    assert main(["compact", place]) == 0
+    assert main(["store", "compact", place]) == 0
     said = capsys.readouterr().err
     assert "nothing to join: 1 file of transitions, 1 of manifests" in said
     assert "wrote" not in said
@@ -473,5 +473,5 @@ def test_what_is_no_store_is_said_to_be_what_it_is(tmp_path, capsys, file, said)
     else:
         (tmp_path / "x").mkdir()
         (tmp_path / "x" / file).write_text("{}")
-    assert main(["compact", str(tmp_path / "x")]) == 2
+    assert main(["store", "compact", str(tmp_path / "x")]) == 2
     assert said in capsys.readouterr().err

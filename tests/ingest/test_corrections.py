@@ -259,6 +259,6 @@ def test_label_uses_the_profile_that_the_store_keeps_where_its_file_is_gone(
     (tmp_path / "amr.toml").unlink()
     relabel_store(StoreWriter(store), lambda name: [Condition("always", "pre", "true")])
     capsys.readouterr()
-    assert main(["label", str(store), "--json"]) == 0
+    assert main(["store", "label", str(store), "--json"]) == 0
     recordings = json.loads(capsys.readouterr().out)["recordings"]
     assert [row["changed"] for row in recordings] == [0]

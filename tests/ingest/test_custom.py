@@ -317,7 +317,7 @@ def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, 
     assert before["n"] > 0
     changed = tmp_path / "changed.toml"
     changed.write_text(with_signals(*OWN, FAST.format(7)))
-    assert main(["label", str(store), "--profile", str(changed)]) == 0
+    assert main(["store", "label", str(store), "--profile", str(changed)]) == 0
     (after,), (seven,) = ask(store, labelled, capsys), ask(store, by_hand.format(7), capsys)
     assert after == seven
     assert 0 < after["n"] < before["n"]
@@ -330,7 +330,7 @@ def test_a_condition_on_a_signal_that_is_not_stored_asks_for_an_ingest(store, tm
     own = '[[condition]]\nname = "heavy"\ntiming = "pre"\nsql = "imu_z > 9"\n'
     profile = tmp_path / "p.toml"
     profile.write_text(with_signals(*OWN, more, own))
-    assert main(["label", str(store), "--profile", str(profile)]) == 2
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 2
     said = capsys.readouterr().err
     assert "condition 'heavy'" in said
     assert "imu_z" in said

@@ -97,7 +97,7 @@ def test_what_is_lost_with_a_damaged_file_is_named_and_comes_back_by_ingest(plac
     writer = joined(place)
     writer.clean(retention_hours=0)  # the files that it was made of
     damage(place, next(one for one in active(place, name) if "compacted" in one), how)
-    with pytest.raises(StoreError, match=r"restock compact .* --drop-damaged"):
+    with pytest.raises(StoreError, match=r"restock store compact .* --drop-damaged"):
         writer.write(*one(1, "c"))
     done = drop_damaged(writer)
     assert len(done.dropped) == 1
@@ -180,7 +180,7 @@ def test_rows_with_changed_bytes_are_neither_joined_nor_read(tmp_path, capsys):
     file = f"{TRANSITIONS}/{1:016x}/{1:016x}-a.parquet"
     damage(place, file, "numbers")
     before, version = active(place, TRANSITIONS), writer.path.open_table(TRANSITIONS).version()
-    assert main(["compact", str(place)]) == 2
+    assert main(["store", "compact", str(place)]) == 2
     assert f"its file {file} cannot be read" in capsys.readouterr().err
     assert active(place, TRANSITIONS) == before
     assert writer.path.open_table(TRANSITIONS).version() == version
@@ -270,13 +270,13 @@ def test_rows_that_are_lost_with_their_manifests_are_counted(tmp_path):
 def test_the_command_names_what_is_lost_and_exits_3(tmp_path, capsys):
     place = tmp_path / "s"
     writer = joined(place)
-    assert main(["compact", str(place), "--drop-damaged"]) == 0
+    assert main(["store", "compact", str(place), "--drop-damaged"]) == 0
     assert "no file is damaged" in capsys.readouterr().err
     writer.clean(retention_hours=0)
     file = next(one for one in active(place, TRANSITIONS) if "compacted" in one)
     damage(place, file, "cut")
     for options in (["--dry-run"], ["--json"]):
-        assert main(["compact", str(place), "--drop-damaged", *options]) == 3
+        assert main(["store", "compact", str(place), "--drop-damaged", *options]) == 3
         out, said = capsys.readouterr()
         assert file in said
         assert "logs/1.mcap (recording 0000000000000001" in said
@@ -296,7 +296,7 @@ def test_a_store_without_one_of_its_tables_is_restored_and_not_made_again(tmp_pa
     for command in (
         ["sql", str(place), "SELECT 1"],
         ["audit", str(place)],
-        ["compact", str(place)],
+        ["store", "compact", str(place)],
         ["ingest", str(log), "--store", str(place)],
     ):
         assert main(command) == 2

@@ -159,7 +159,7 @@ def test_a_store_lists_exposures_beside_its_conditions(store, profile):
 
 def test_changed_exposures_are_told_again_from_the_store(store, profile):
     profile.write_text(profile.read_text().replace("pose_x_m > 2", "pose_x_m > 2.2"))
-    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
     with Store(store) as opened:
         assert opened.sql(
             "SELECT min(pose_x_m) > 2.2, any_value(primary_condition) FROM transitions"
@@ -176,10 +176,10 @@ def test_a_store_from_before_exposures_opens_and_says_null(store, profile, capsy
         assert opened.sql("SELECT DISTINCT exposures FROM transitions").fetchall() == [(None,)]
         assert opened.sql("FROM coverage_by_exposure").fetchall() == []
     # A condition is not left out so: the recordings have to be read again for its signals.
-    assert main(["label", str(store), "--profile", str(profile)]) == 2
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 2
     assert "ingest the recordings again" in capsys.readouterr().err
     profile.write_text(profile.read_text().replace(', "blocked_aisle"]', "]"))
-    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
     with Store(store) as opened:
         held = opened.sql("SELECT DISTINCT unnest(exposures) FROM transitions").fetchall()
         assert held == [("far_out",)]

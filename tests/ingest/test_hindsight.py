@@ -121,7 +121,7 @@ def test_what_stands_on_the_driven_path_is_unknown_not_false(tmp_path, capsys) -
         assert (held["blocked_aisle"], held["near_collision"]) == (None, 0)
     more = '[[condition]]\nname = "close"\ntiming = "pre"\nsql = "plan_gap_m < 9"\n'
     file.write_text(file.read_text() + more)
-    assert main(["label", str(store), "--profile", str(file)]) == 0  # and again, of one's own
+    assert main(["store", "label", str(store), "--profile", str(file)]) == 0
     with Store(store) as opened:
         assert [name for (name,) in opened.sql(query).fetchall()] == [
             "blocked_aisle",

@@ -1,4 +1,4 @@
-"""`restock label`: changed conditions over stored signals, in one commit."""
+"""`restock store label`: changed conditions over stored signals, in one commit."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, caps
     files = len(DeltaTable(str(store / "transitions")).file_uris())
     version = DeltaTable(str(store / "transitions")).version()
     capsys.readouterr()
-    assert main(["label", str(store), "--profile", str(changed), "--json"]) == 0
+    assert main(["store", "label", str(store), "--profile", str(changed), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["version"] == version + 1  # one commit for both recordings
     assert [row["changed"] for row in said["recordings"]] == [6, 6]
@@ -79,7 +79,7 @@ def test_changed_conditions_change_labels_and_nothing_else(store, tmp_path, caps
     with Store(store) as opened:
         assert "1.95" in next(c.sql for c in opened.conditions() if c.name == "soon")
         assert opened.sql("SELECT count(*) FROM recordings").fetchall() == [(2,)]
-    assert main(["label", str(store), "--profile", str(changed), "--json"]) == 0
+    assert main(["store", "label", str(store), "--profile", str(changed), "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["version"] is None
     assert [row["changed"] for row in again["recordings"]] == [0, 0]
@@ -90,8 +90,8 @@ def test_an_ingest_after_a_relabel_finds_it_unchanged(store, tmp_path, capsys):
     shipped = tmp_path / "shipped.toml"
     shipped.write_text(TEXT)
     profile = str(tmp_path / "amr.toml")
-    assert main(["label", str(store), "--profile", str(shipped)]) == 0
-    assert main(["label", str(store), "--profile", profile]) == 0
+    assert main(["store", "label", str(store), "--profile", str(shipped)]) == 0
+    assert main(["store", "label", str(store), "--profile", profile]) == 0
     capsys.readouterr()
     command = ["ingest", str(tmp_path / "a"), "--store", str(store), "--profile", profile]
     assert main([*command, "--json"]) == 0
@@ -102,7 +102,7 @@ def test_a_dry_run_says_what_would_change_and_writes_nothing(store, tmp_path, ca
     shipped = tmp_path / "shipped.toml"
     shipped.write_text(TEXT)
     before = sorted(store.rglob("*"))
-    assert main(["label", str(store), "--profile", str(shipped), "--dry-run"]) == 0
+    assert main(["store", "label", str(store), "--profile", str(shipped), "--dry-run"]) == 0
     assert "soon" in capsys.readouterr().out
     assert sorted(store.rglob("*")) == before
 
@@ -137,11 +137,11 @@ def test_rows_without_their_episodes_ends_are_refused(store):
 
 
 def test_wrong_usage(store, tmp_path, capsys):
-    assert main(["label", str(tmp_path / "none")]) == 2
+    assert main(["store", "label", str(tmp_path / "none")]) == 2
     assert "there is no store, or it is empty" in capsys.readouterr().err
     bad = tmp_path / "bad.toml"
     bad.write_text(TEXT + SOON.format("lead(pose_x_mm) OVER episode > 2"))
-    assert main(["label", str(store), "--profile", str(bad)]) == 2
+    assert main(["store", "label", str(store), "--profile", str(bad)]) == 2
     assert "`condition[0].sql` ('soon'): its SQL fails" in capsys.readouterr().err
 
 
@@ -176,7 +176,7 @@ def test_the_audit_names_stale_labels_until_they_are_run_again(store, tmp_path, 
     bag = str(tmp_path / "b")
     assert main(["ingest", bag, "--store", str(store), "--profile", str(profile)]) == 0
     assert stale(store, capsys) == ["a"]
-    assert main(["label", str(store), "--profile", str(profile)]) == 0
+    assert main(["store", "label", str(store), "--profile", str(profile)]) == 0
     assert stale(store, capsys) == []
     bags = [str(tmp_path / name) for name in "ab"]
     command = ["ingest", *bags, "--store", str(store), "--profile", str(profile), "--json"]

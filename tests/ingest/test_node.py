@@ -273,7 +273,7 @@ def test_in_shadow_it_commands_nothing_and_its_log_is_compared_in_sql(
     assert len(graph.of(SHADOW)) == len(graph.of(ACTION)) == steps
     assert not graph.of("/behaviour_policy")
     profile = tmp_path / "with_node.toml"
-    assert main(["node", str(policy), "--write-profile", str(profile)]) == 0
+    assert node([str(policy), "--write-profile", str(profile)]) == 0
     bag = graph.write(tmp_path / "bag")
     line = ["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "store")]
     assert main(line) == 0

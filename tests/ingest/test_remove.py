@@ -190,7 +190,7 @@ def test_a_store_that_may_only_be_read_is_not_called_unreadable(tmp_path, monkey
         raise OSError(said)
 
     monkeypatch.setattr(DeltaTable, "create_write_transaction", denied)
-    assert main(["remove", str(tmp_path / "s"), name_of(1)]) == 2
+    assert main(["store", "remove", str(tmp_path / "s"), name_of(1)]) == 2
     reported = capsys.readouterr().err
     assert "cannot be written: " in reported
     assert "Permission denied" in reported
@@ -236,12 +236,12 @@ def test_a_commit_whose_answer_is_lost_is_not_done_twice(tmp_path, monkeypatch, 
 def test_the_command_says_what_was_removed_and_how_to_get_it_back(tmp_path, capsys):
     place = str(tmp_path / "s")
     three(place)
-    assert main(["remove", place, "logs/2.mcap", "--dry-run"]) == 0
+    assert main(["store", "remove", place, "logs/2.mcap", "--dry-run"]) == 0
     out, said = capsys.readouterr()
     assert name_of(2) in out
     assert "would remove 1 recording" in said
     assert len(shown(place)) == 3
-    assert main(["remove", place, "2.mcap", name_of(3)]) == 0
+    assert main(["store", "remove", place, "2.mcap", name_of(3)]) == 0
     out, said = capsys.readouterr()
     assert all(word in out for word in (name_of(2), "logs/2.mcap", str(len(one(2)[1]))))
     assert "removed 2 recordings" in said
@@ -251,7 +251,7 @@ def test_the_command_says_what_was_removed_and_how_to_get_it_back(tmp_path, caps
     assert shown(place) == expected((1, "a"))
     assert main(["sql", place, "--version", str(version), "FROM recordings", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 3
-    assert main(["remove", place, name_of(1), "--json"]) == 0
+    assert main(["store", "remove", place, name_of(1), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["recordings"][0]["source_file"] == "logs/1.mcap"
     assert (document["left"], document["dry_run"]) == (0, False)
@@ -261,9 +261,12 @@ def test_what_names_no_recording_exits_2(tmp_path, capsys):
     place = str(tmp_path / "s")
     three(place)
     for names in (["logs/9.mcap"], ["00000000"], []):
-        assert main(["remove", place, name_of(1), *names] if names else ["remove", place]) == 2
+        assert (
+            main(["store", "remove", place, name_of(1), *names] if names else ["remove", place])
+            == 2
+        )
     assert "names no recording" in capsys.readouterr().err
-    assert main(["remove", str(tmp_path / "none"), name_of(1)]) == 2
+    assert main(["store", "remove", str(tmp_path / "none"), name_of(1)]) == 2
     assert len(shown(place)) == 3
 
 
@@ -271,8 +274,8 @@ def test_commands_that_messages_suggest_can_be_typed_where_a_path_has_a_space(tm
     place, nowhere = tmp_path / "my store", tmp_path / "no store"
     three(place)
     for arguments, suggested, path in (
-        (["remove", place, "nowhere.mcap"], "sql", place),
-        (["remove", place], "sql", place),
+        (["store", "remove", place, "nowhere.mcap"], "sql", place),
+        (["store", "remove", place], "sql", place),
         (["sql", nowhere, "FROM coverage"], "ingest", nowhere),
     ):
         assert main([str(argument) for argument in arguments]) == 2
@@ -293,7 +296,7 @@ def test_corrected_labels_of_a_removed_recording_are_in_no_ones_way(tmp_path, ca
         for row, at_ns in zip((first, second), stamps, strict=True)
     }
     correct_store(writer, given)
-    assert main(["remove", str(tmp_path / "s"), name_of(2)]) == 0
+    assert main(["store", "remove", str(tmp_path / "s"), name_of(2)]) == 0
     assert "does not bring back 1 correction of labels" in capsys.readouterr().err
     with pytest.raises(StoreError, match="was ingested again or removed"):
         correct_store(writer, given)

@@ -55,7 +55,7 @@ def test_the_whole_after_a_part_is_said(
     }
     (note,) = (note for note in whole["notes"] if "a part of the same drive twice" in note)
     assert str(part) in note
-    assert f"`restock remove {store} {first['recording_id']}` takes out that one" in note
+    assert f"`restock store remove {store} {first['recording_id']}` takes out that one" in note
 
 
 def test_the_whole_takes_the_place_of_a_part_where_asked(
@@ -85,11 +85,11 @@ def test_what_people_corrected_stays(
         "episode_id,condition,first_step,last_step,verdict\n"
         f"{first['recording_id']}/0,near_collision,0,3,yes\n"
     )
-    assert main(["label", str(store), "--corrections", str(review)]) == 0
+    assert main(["store", "label", str(store), "--corrections", str(review)]) == 0
     whole = ingested(capsys, MONDAY, "--store", store, "--repeated", "replace")
     (note,) = (note for note in whole["notes"] if "It stays" in note)
     assert "people corrected 1 label of it" in note
-    assert f"`restock remove {store} {first['recording_id']}`" in note
+    assert f"`restock store remove {store} {first['recording_id']}`" in note
 
 
 @pytest.mark.long

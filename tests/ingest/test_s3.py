@@ -64,17 +64,17 @@ def test_every_verb_of_a_store_takes_the_address(place, tmp_path, run):
     code, said, _ = run("audit", place)
     assert code in (0, 1)
     assert said["store"].replace("s3:/", "").strip("/") == place.replace("s3:/", "").strip("/")
-    code, said, _ = run("label", place, "--dry-run")
+    code, said, _ = run("store", "label", place, "--dry-run")
     assert (code, said["recordings"][0]["changed"]) == (0, 0)
     code, said, err = run("mix", place, "--mixture", "uniform", "--out", tmp_path / "panel")
     assert (code, err) == (0, "")
     assert said["store_version"] == 1
     header = json.loads((tmp_path / "panel" / "panel.json").read_text())
     assert place in json.dumps(header, ensure_ascii=False)
-    code, said, err = run("diff", f"{place}@0", place)
+    code, said, err = run("coverage", "diff", f"{place}@0", place)
     assert (code, err) == (0, "")
     assert (said["a"]["rows"], said["b"]["rows"]) == (0, count)
-    code, said, err = run("gaps", place)
+    code, said, err = run("coverage", "gaps", place)
     assert (code, err, said["store_version"]) == (0, "", 1)
 
 

@@ -97,7 +97,7 @@ def test_relabelling_keeps_the_tags(bag, tmp_path):
     assert ingest(bag, store, "--tag", "robot=amr-07") == 0
     other = tmp_path / "other.toml"
     other.write_text(WAREHOUSE + '\n[[condition]]\nname = "never"\ntiming = "pre"\nsql = "false"\n')
-    assert main(["label", str(store), "--profile", str(other)]) == 0
+    assert main(["store", "label", str(store), "--profile", str(other)]) == 0
     assert requested(store, "SELECT DISTINCT robot FROM transitions") == [("amr-07",)]
 
 

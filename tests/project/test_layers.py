@@ -114,37 +114,35 @@ MAY_IMPORT = {
     ),
     "report/fleet": "look replay/fleet replay/store",
     "report/study": "look",
-    "cli": "ingest/steps replay/store",
+    "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
         "cli ingest ingest/containers ingest/profile ingest/propose ingest/propose/evidence"
-        " ingest/steps ingest/store ingest/task replay replay/export replay/fleet"
-        " replay/mixture replay/panel replay/plan replay/review replay/store report"
-        " train/comparison train/dqn train/evaluation train/twin/missions"
+        " ingest/steps ingest/store ingest/task replay replay/export replay/mixture replay/panel"
+        " replay/plan replay/store train/dqn train/evaluation"
+    ),
+    "cli/fleet": (
+        "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"
+        " train/comparison train/twin/missions"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace train"
-        " train/comparison train/diagnosis train/dqn train/evaluation train/run train/study"
-        " train/twin/floors train/twin/physics train/view"
+        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/store"
+        " replay/trace train train/comparison train/diagnosis train/dqn train/evaluation train/run"
+        " train/study train/twin/calibration train/twin/floors train/twin/physics train/view"
     ),
-    "cli/pages": (
-        "cli report ingest/store replay/fleet replay/mixture replay/store"
-        " train/twin/calibration train/twin/missions"
-    ),
-    "cli/pipeline": ("cli ingest/store replay replay/fleet replay/store train/evaluation"),
-    "cli/robot": "cli ingest/live ingest/profile ingest/task",
+    "cli/pipeline": "cli ingest/store replay replay/fleet replay/store train/evaluation",
     "cli/start": (
-        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence"
-        " ingest/task replay/mixture replay/panel replay/store replay/trace train/diagnosis"
-        " train/dqn train/evaluation train/evaluation/off_policy train/run"
-        " train/twin/calibration train/twin/floors train/twin/missions"
+        "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
+        " replay/mixture replay/panel replay/store replay/trace train/diagnosis train/dqn"
+        " train/evaluation train/evaluation/off_policy train/run train/twin/calibration"
+        " train/twin/floors train/twin/missions"
     ),
-    "cli/upkeep": "cli ingest ingest/store",
     "cli/twin": (
         "cli report report/run ingest/containers ingest/profile ingest/propose/evidence"
         " ingest/store ingest/task replay/fleet replay/store train/evaluation"
-        " train/twin/calibration train/twin/env train/twin/floors train/twin/physics"
-        " train/twin/recording train/twin/survey train/twin/missions"
+        " train/twin/calibration train/twin/env train/twin/floors train/twin/missions"
+        " train/twin/physics train/twin/recording train/twin/survey"
     ),
+    "cli/upkeep": "cli ingest ingest/profile ingest/store ingest/task replay/review replay/store",
 }
 
 

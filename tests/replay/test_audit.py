@@ -741,7 +741,7 @@ def test_a_store_that_lost_all_its_rows_passes_no_gate(
     StoreWriter(store).write(manifest(rows), rows)
     for file in (store / "transitions").rglob("*.parquet"):
         file.unlink()
-    assert cli.main(["compact", str(store), "--drop-damaged"]) == 3
+    assert cli.main(["store", "compact", str(store), "--drop-damaged"]) == 3
     assert cli.main([words[0], str(store), *words[1:]]) == 2
     assert "it holds no transitions: there is nothing to audit" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""`restock gaps`: what is missing, what fills it, and how sure that is."""
+"""`restock coverage gaps`: what is missing, what fills it, and how sure that is."""
 
 from __future__ import annotations
 
@@ -175,12 +175,12 @@ def test_a_gap_names_its_action(tmp_path: Path, capsys: pytest.CaptureFixture[st
         )
     ]
     path = write_store(tmp_path / "store", [rows.filter(pa.array([not one for one in turned]))])
-    assert main(["gaps", str(path), "--json"]) == 0
+    assert main(["coverage", "gaps", str(path), "--json"]) == 0
     gaps = json.loads(capsys.readouterr().out)["gaps"]
     cells = [one for one in gaps if one["asked_by"] == "audit missing_cells"]
     (gap,) = [one for one in cells if (one["condition"], one["action"]) == ("wheel_slip", 3)]
     assert (gap["action_name"], gap["cell"]) == ("turn left 1.2", "wheel_slip, turn left 1.2")
-    assert main(["gaps", str(path)]) == 0
+    assert main(["coverage", "gaps", str(path)]) == 0
     assert "turn left 1.2" in capsys.readouterr().out
     assert main(["coverage", str(path), "--out", str(tmp_path / "page.html")]) == 0
     page = (tmp_path / "page.html").read_text("utf-8")
@@ -228,7 +228,9 @@ def test_mix_and_gaps_say_the_same_hours_for_the_same_rows(
     chosen = ("--mixture", str(tmp_path / "mine.toml"))
     assert main(["mix", store, *chosen, "--dry-run", "--json"]) == 0
     mixed = json.loads(capsys.readouterr().out)["strata"]
-    assert main(["gaps", store, *chosen, "--unit", "hours", "--no-audits", "--json"]) == 0
+    assert (
+        main(["coverage", "gaps", store, *chosen, "--unit", "hours", "--no-audits", "--json"]) == 0
+    )
     gaps = {gap["stratum"]: gap for gap in json.loads(capsys.readouterr().out)["gaps"]}
     short = [line for line in mixed if line["missing_rows"]]
     assert short
@@ -242,7 +244,7 @@ def test_mix_and_gaps_say_the_same_hours_for_the_same_rows(
     # On a terminal, too, and each says what its number assumes.
     assert main(["mix", store, *chosen, "--dry-run"]) == 0
     mixed_text = capsys.readouterr().out
-    assert main(["gaps", store, *chosen, "--unit", "hours", "--no-audits"]) == 0
+    assert main(["coverage", "gaps", store, *chosen, "--unit", "hours", "--no-audits"]) == 0
     gaps_text = capsys.readouterr().out
     gap = gaps[short[0]["stratum"]]
     amount, low, high = (figure(gap[f"amount{end}"]) for end in ("", "_low", "_high"))
@@ -258,7 +260,7 @@ def test_planned_missions_are_said_to_be_another_question_than_hours_of_any_driv
 ) -> None:
     (tmp_path / "mine.toml").write_text(ASKING)
     chosen = (str(store), "--mixture", str(tmp_path / "mine.toml"))
-    assert main(["gaps", *chosen, "--no-audits"]) == 0
+    assert main(["coverage", "gaps", *chosen, "--no-audits"]) == 0
     text = capsys.readouterr().out
     assert "missions: of the kind that is best, until one gap is closed: median" in text
     assert "`restock mix` counts hours of driving as logged, nothing chosen" in text
@@ -339,7 +341,7 @@ def test_the_list_is_a_file_that_reads_back(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.toml").write_text(ASKING)
-    args = ["gaps", str(store), "--mixture", str(tmp_path / "mine.toml"), "--json"]
+    args = ["coverage", "gaps", str(store), "--mixture", str(tmp_path / "mine.toml"), "--json"]
     out = tmp_path / "next.toml"
     assert main([*args, "--missions-out", str(out)]) == 0
     plan = json.loads(capsys.readouterr().out)["plan"]
@@ -348,8 +350,8 @@ def test_the_list_is_a_file_that_reads_back(
     assert read.store_version == 2
     assert main([*args, "--missions-out", str(out)]) == 2
     assert "--force" in capsys.readouterr().err
-    assert main(["gaps", str(store), "--no-audits", "--mixture", "uniform", "--missions-out",
-                 str(tmp_path / "none.toml")]) == 2  # fmt: skip
+    assert main(["coverage", "gaps", str(store), "--no-audits", "--mixture", "uniform",
+                 "--missions-out", str(tmp_path / "none.toml")]) == 2  # fmt: skip
     assert "there are no gaps" in capsys.readouterr().err
     assert not (tmp_path / "none.toml").exists()
 
@@ -358,8 +360,8 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
     whole = MissionsFile(missions=(MissionOrder(kind="wheel_slip", missions=3, zone='"x"'),))
     (tmp_path / "good.toml").write_text(as_toml(whole))
     assert read_missions(tmp_path / "good.toml") == whole
-    assert "`restock record --missions` drives it" in as_toml(whole)
-    assert "restock record" not in as_toml(MissionsFile(missions=(MissionOrder(hours=8.8),)))
+    assert "`restock twin record --missions` drives it" in as_toml(whole)
+    assert "restock twin record" not in as_toml(MissionsFile(missions=(MissionOrder(hours=8.8),)))
     for text, message in (
         ("[[missions]]\nkind = 'x'\n", "must be given"),
         ("[[missions]]\nkind = 'x'\nmissions = 0\n", "missions"),
@@ -373,7 +375,7 @@ def test_a_missions_file_says_what_is_wrong_with_it(tmp_path: Path) -> None:
 
 
 def test_wrong_columns_of_a_cell_are_named(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
+    assert main(["coverage", "gaps", str(store), "--min-rows", "3", "--by", "condition,aisle"]) == 2
     assert "'aisle' cannot define a cell" in capsys.readouterr().err
     mixture: Any = load_mixture("uniform")
     with Store(store) as opened:

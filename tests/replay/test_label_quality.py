@@ -1,4 +1,4 @@
-"""`restock label --score`: labels against the truth, by step and event, and their reliability."""
+"""`restock store label --score`: labels against the truth, and their reliability."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ def test_the_scores_of_a_store_say_how_sure_they_are(store: Path) -> None:
 def test_the_command_prints_scores_and_reliability(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["label", str(store), "--score"]) == 0
+    assert main(["store", "label", str(store), "--score"]) == 0
     said = capsys.readouterr().out
     assert "event recall" in said
     assert "wheel_slip" in said
-    assert main(["label", str(store), "--score", "--by", "source_file", "--json"]) == 0
+    assert main(["store", "label", str(store), "--score", "--by", "source_file", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {row["group"] for row in document["scores"]} == {"logs/1.mcap", "logs/5.mcap"}
     assert {row["condition"] for row in document["reliability"]} == {"recovery"}
-    assert main(["label", str(store), "--by", "source_file"]) == 2
-    assert main(["label", str(store), "--score", "--corrections", "none"]) == 2
+    assert main(["store", "label", str(store), "--by", "source_file"]) == 2
+    assert main(["store", "label", str(store), "--score", "--corrections", "none"]) == 2
 
 
 def test_a_store_without_truth_has_nothing_to_score(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_store(tmp_path / "store", [recording_transitions(1)])
-    assert main(["label", str(path), "--score"]) == 0
+    assert main(["store", "label", str(path), "--score"]) == 0
     assert "nothing to score" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""`restock diff` of panels: rows, mixture, shares, weights; other kinds and tasks are refused."""
+"""`restock coverage diff` of panels: rows, mixture, shares and weights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_rows_shares_and_keys_that_differ(
     store = write_store(tmp_path / "store", [recording_transitions(1), recording_transitions(2)])
     panel_of(store, EVERY + NO_SPLIT, tmp_path / "a")
     panel_of(store, "where = \"zone = 'cross'\"\n" + HALF, tmp_path / "b")
-    assert main(["diff", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 0
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     zones = [row["zone"] for n in (1, 2) for row in recording_transitions(n).to_pylist()]
     cross = zones.count("cross")
@@ -35,9 +35,9 @@ def test_rows_shares_and_keys_that_differ(
     assert slip["wanted_share_b"] == 0.5
     assert slip["share_a"] == pytest.approx(slip["natural_share_a"])
     assert found["weights"]["rows_changed"] > 0
-    assert main(["diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     assert "strata[wheel_slip].share" in capsys.readouterr().out
-    assert main(["diff", str(tmp_path / "a"), str(tmp_path / "a"), "--exit-code"]) == 0
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "a"), "--exit-code"]) == 0
 
 
 def test_two_tasks_and_two_kinds_of_places_are_refused(
@@ -48,13 +48,13 @@ def test_two_tasks_and_two_kinds_of_places_are_refused(
     second = write_store(tmp_path / "second", [recording_transitions(1, task=other)], task=other)
     panel_of(first, EVERY, tmp_path / "a")
     panel_of(second, EVERY, tmp_path / "b")
-    assert main(["diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
     message = capsys.readouterr().err
     assert TASK.hash in message
     assert other.hash in message
-    assert main(["diff", str(tmp_path / "a"), str(first)]) == 2
+    assert main(["coverage", "diff", str(tmp_path / "a"), str(first)]) == 2
     assert "is a panel" in capsys.readouterr().err
-    assert main(["diff", str(first), str(tmp_path / "none")]) == 2
+    assert main(["coverage", "diff", str(first), str(tmp_path / "none")]) == 2
     assert "no such store" in capsys.readouterr().err
 
 

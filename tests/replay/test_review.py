@@ -119,9 +119,9 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     monday: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "my review.csv"
-    assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 0
+    assert main(["store", "label", str(monday), "--review", "3", "--out", str(file)]) == 0
     shown, said = capsys.readouterr()
-    then = ["label", str(monday), "--corrections", str(file)]
+    then = ["store", "label", str(monday), "--corrections", str(file)]
     assert shlex.split(said.split("then run: restock ")[1]) == then
     assert max(map(len, shown.splitlines())) <= 120  # what does not fit is a second table
     with file.open(newline="") as text:
@@ -139,7 +139,7 @@ def test_the_list_is_a_file_whose_commands_open_the_moment(
     assert traced["transition"]["step_index"] == int(rows[0]["first_step"])
     assert traced["messages"]
     # Verdicts may be in it: it is not written over.
-    assert main(["label", str(monday), "--review", "3", "--out", str(file)]) == 2
+    assert main(["store", "label", str(monday), "--review", "3", "--out", str(file)]) == 2
     assert "may contain verdicts" in capsys.readouterr().err
 
 
@@ -153,14 +153,14 @@ def test_a_list_without_events_is_a_header_and_says_so(
         rows = rows.set_column(rows.column_names.index(name), field, values)
     store, file = write_store(tmp_path / "store", [rows]), tmp_path / "review.csv"
     for more in ([], ["--json"]):
-        assert main(["label", str(store), "--review", "3", "--out", str(file), *more]) == 0
+        assert main(["store", "label", str(store), "--review", "3", "--out", str(file), *more]) == 0
         shown = capsys.readouterr()
         reported = " ".join((shown.err if more else shown.out).split())
         assert "no uncertain event is left to review" in reported
         assert f"{file} has only a header" in reported
         assert not more or json.loads(shown.out) == []
         # As with verdicts that are all empty, there is nothing to take from it.
-        assert main(["label", str(store), "--corrections", str(file)]) == 0
+        assert main(["store", "label", str(store), "--corrections", str(file)]) == 0
         assert "contains no verdict" in " ".join(capsys.readouterr().out.split())
         file.unlink()
 
@@ -193,7 +193,7 @@ def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
     first = events[long].first_step
     file = fill(small, events, tmp_path / "review.csv", {no: "No", long: f"{first}..{first}"})
     for dry in (["--dry-run"], []):
-        assert main(["label", str(small), "--corrections", str(file), "--json", *dry]) == 0
+        assert main(["store", "label", str(small), "--corrections", str(file), "--json", *dry]) == 0
         said = json.loads(capsys.readouterr().out)
         assert (said["verdicts"], said["without_verdict"]) == (2, len(events) - 2)
         assert (said["version"] is None) == bool(dry)
@@ -210,7 +210,7 @@ def test_verdicts_of_a_review_change_the_labels_and_a_dry_run_does_not(
             ).fetchall()
             length = event.last_step - event.first_step + 1
             assert [one for (one,) in held] == (begins + [False] * length)[:length]
-    assert main(["label", str(small), "--corrections", str(file)]) == 0  # the same again
+    assert main(["store", "label", str(small), "--corrections", str(file)]) == 0  # the same again
     assert "unchanged" in capsys.readouterr().out
 
 
@@ -281,7 +281,7 @@ def test_a_review_whose_verdicts_are_empty_says_so(
 ) -> None:
     file = tmp_path / "file.csv"
     file.write_text(HEADER + f"{1:016x}/0,wheel_slip,0,3,\n")
-    main(["label", str(reviewed[0]), "--corrections", str(file), "--dry-run"])
+    main(["store", "label", str(reviewed[0]), "--corrections", str(file), "--dry-run"])
     shown = capsys.readouterr()
     assert "contains no verdict" in shown.out + shown.err
 
@@ -303,6 +303,6 @@ def test_wrong_usage_writes_nothing(
         (["--review", "0"], "must be 1 or more"),
         (["--corrections", "gone.csv"], "gone.csv: cannot be read: No such file"),
     ):
-        assert main(["label", str(reviewed[0]), *words]) == 2
+        assert main(["store", "label", str(reviewed[0]), *words]) == 2
         assert problem in " ".join(capsys.readouterr().err.split())
     assert sorted(reviewed[0].rglob("*")) == before

@@ -1,4 +1,4 @@
-"""`restock diff` of stores and versions: what came, went and changed; two tasks are refused."""
+"""`restock coverage diff` of stores and versions: what came, went and changed."""
 
 from __future__ import annotations
 
@@ -95,12 +95,26 @@ def test_two_versions_of_a_store_by_number_and_by_time(
     writer = StoreWriter(tmp_path / "store")
     for number in (1, 2):
         newest = writer.write(*one(number))
-    assert main(["diff", f"{tmp_path}/store@{newest - 1}", f"{tmp_path}/store", "--json"]) == 0
+    assert (
+        main(["coverage", "diff", f"{tmp_path}/store@{newest - 1}", f"{tmp_path}/store", "--json"])
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert [row["change"] for row in found["recordings"]] == ["in"]
     assert (found["a"]["version"], found["b"]["version"]) == (newest - 1, newest)
-    assert main(["diff", f"{tmp_path}/store", f"{tmp_path}/store", "--exit-code"]) == 0
-    assert main(["diff", f"{tmp_path}/store@{newest - 1}", f"{tmp_path}/store", "--exit-code"]) == 1
+    assert main(["coverage", "diff", f"{tmp_path}/store", f"{tmp_path}/store", "--exit-code"]) == 0
+    assert (
+        main(
+            [
+                "coverage",
+                "diff",
+                f"{tmp_path}/store@{newest - 1}",
+                f"{tmp_path}/store",
+                "--exit-code",
+            ]
+        )
+        == 1
+    )
     with Store(tmp_path / "store", version=parse_version("2999-01-01T00:00Z")) as store:
         assert store.version == newest
     with pytest.raises(StoreError, match="the first is from"):
@@ -119,7 +133,7 @@ def test_stores_of_two_tasks_are_refused_with_both_names(
     other = msgspec.structs.replace(TASK, actions=TASK.actions[:3])
     first = write_store(tmp_path / "a", [recording_transitions(1)])
     second = write_store(tmp_path / "b", [recording_transitions(1, task=other)], task=other)
-    assert main(["diff", str(first), str(second)]) == 2
+    assert main(["coverage", "diff", str(first), str(second)]) == 2
     message = capsys.readouterr().err
     assert TASK.hash in message
     assert other.hash in message

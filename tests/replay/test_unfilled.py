@@ -94,11 +94,11 @@ def test_a_condition_that_every_episode_meets_is_named_with_what_fills_nominal(
         strata, warnings = mix(store, NOMINAL + rest)
         assert strata["nominal"]["rows"] > 100, name
         assert not [text for text in warnings if text.startswith("nominal")]
-    assert "raise its threshold in the profile and run `restock label`" in warning
+    assert "raise its threshold in the profile and run `restock store label`" in warning
     raised, again = tmp_path / "raised.toml", tmp_path / "again"
     shutil.copytree(store, again)
     raised.write_text(WAREHOUSE + BRAKING.format(0.4))
-    assert main(["label", str(again), "--profile", str(raised)]) == 0
+    assert main(["store", "label", str(again), "--profile", str(raised)]) == 0
     strata, warnings = mix(again, NOMINAL + EACH)
     assert strata["nominal"]["rows"] > 100
     assert not [text for text in warnings if text.startswith("nominal")]
@@ -137,8 +137,8 @@ def test_a_quota_for_what_the_logs_lack_is_named_with_what_to_change(
     strata, warnings = mix(store, where + "[each_condition]\nshare = 'equal'\n")
     assert strata["wheel_slip"]["rows"] == 0
     assert (
-        "wheel_slip has no row that may be drawn: record some (see `restock gaps`), or leave it"
-        " out of the strata" in warnings
+        "wheel_slip has no row that may be drawn: record some (`restock coverage gaps`), or leave"
+        " it out of the strata" in warnings
     )
     assert strata["wheel_slip"]["missing_hours"] is None
     own = '[[strata]]\nname = "wet_floor"\nwhere = "zone = \'nowhere\'"\nshare = 0.2\n'
@@ -149,7 +149,7 @@ def test_a_quota_for_what_the_logs_lack_is_named_with_what_to_change(
     unknown = mix.refused(store, own.replace("where = \"zone = 'nowhere'\"\n", "") + EACH)
     assert "stratum 'wet_floor' is not a condition or exposure of this store" in unknown
     assert "name one of nominal, " in unknown
-    assert "or give it a `where`; or add it to the profile and run `restock label`" in unknown
+    assert "or give it a `where`; or add it to the profile and run `restock store label`" in unknown
 
 
 def test_quotas_that_no_shelf_can_fill_are_each_named(store_path: Path, mix: Mix) -> None:

@@ -19,7 +19,8 @@ from restock.replay.store.store import Store
 
 pytestmark = pytest.mark.usefixtures("summaries_once")
 
-VERBS = ("sql", "audit", "gaps", "drift", "mix", "export", "trace", "label")
+VERBS = ("sql", "audit", "mix", "export", "trace")
+JOBS = ("coverage gaps", "coverage drift", "store label")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     return path, first
 
 
-@pytest.mark.parametrize("verb", [*VERBS, "twin fit", "twin gap"])
+@pytest.mark.parametrize("verb", [*VERBS, *JOBS, "twin fit", "twin gap"])
 def test_the_flag_is_the_same_everywhere(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*verb.split(), "--help"]) == 0
     assert "--version N|TIME" in capsys.readouterr().out
@@ -53,7 +54,7 @@ def test_each_reads_what_was(
     plan = requested("mix", store, "--mixture", "uniform", "--dry-run")
     assert isinstance(plan, dict)
     assert plan["store_version"] == first
-    gaps = requested("gaps", store, "--mixture", "uniform")
+    gaps = requested("coverage", "gaps", store, "--mixture", "uniform")
     assert isinstance(gaps, dict)
     assert (gaps["store_version"], gaps["episodes"]) == (first, 12)
     out = tmp_path / "rows.parquet"
@@ -63,7 +64,7 @@ def test_each_reads_what_was(
     found = requested("trace", store, str(identity))
     assert isinstance(found, dict)
     assert found["store"]["version"] == first
-    labelled = requested("label", store, "--dry-run")
+    labelled = requested("store", "label", store, "--dry-run")
     assert isinstance(labelled, dict)
     assert len(labelled["recordings"]) == 1
     with restock.open(store, version=first) as opened:
@@ -76,7 +77,7 @@ def test_what_has_no_versions_says_so(
     versions: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, first = versions
-    assert main(["label", str(path), "--version", str(first)]) == 2
+    assert main(["store", "label", str(path), "--version", str(first)]) == 2
     assert "--dry-run" in capsys.readouterr().err
     assert main(["mix", str(path), "--out", str(tmp_path / "panel")]) == 0
     for args in (
@@ -90,18 +91,16 @@ def test_what_has_no_versions_says_so(
         restock.open(str(path), version="yesterday")
 
 
-@pytest.mark.parametrize(
-    "verb", ["sql", "audit", "gaps", "drift", "coverage", "compact", "check", "label"]
-)
+@pytest.mark.parametrize("verb", ["sql", "audit", "coverage", "store compact", *JOBS])
 def test_a_version_after_an_at_is_said_to_be_an_option(
     verb: str, versions: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, first = versions
-    assert main([verb, f"{path}@{first}"]) == 2
+    assert main([*verb.split(), f"{path}@{first}"]) == 2
     said = capsys.readouterr().err
     assert f"`{path}` is a store: name its version with --version {first}" in said
     assert "restock ingest" not in said
-    assert main([verb, f"{path}x@{first}"]) == 2  # and that is no store
+    assert main([*verb.split(), f"{path}x@{first}"]) == 2  # and that is no store
     assert "restock ingest" in capsys.readouterr().err
 
 

@@ -162,7 +162,7 @@ def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
 ) -> None:
     text = STUDY.replace("rare =", "power = { sd = 0.06, effect = 0.05 }\nrare =")
     study(tmp_path, text)
-    line = ["study", str(tmp_path / "s.toml")]
+    line = ["train", str(tmp_path / "s.toml")]
     assert main([*line, "--power"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "auc_wheel_slip of quotas against uniform, 4 seeds" in said
@@ -192,7 +192,7 @@ def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
 def test_a_study_of_two_seeds_is_too_small_whatever_pilots_say(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--dry-run"]
+    line = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--dry-run"]
     (tmp_path / "s.toml").write_text(STUDY.replace("[0, 1, 2, 3]", "[0, 1]"))
     assert main(line) == 0
     said = " ".join(capsys.readouterr().err.split())
@@ -215,9 +215,9 @@ def test_power_needs_a_contrast_and_a_spread(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     study(tmp_path)
-    assert main(["study", str(tmp_path / "s.toml"), "--power"]) == 2
+    assert main(["train", str(tmp_path / "s.toml"), "--power"]) == 2
     assert "does not give the spread" in capsys.readouterr().err
-    assert main(["study", str(tmp_path / "s.toml")]) == 2
+    assert main(["train", str(tmp_path / "s.toml")]) == 2
     assert "--out" in capsys.readouterr().err
 
 

@@ -39,7 +39,7 @@ def test_a_policy_of_another_task_is_refused(
     other = kept_run(tmp_path / "b", profile="turtlebot3")
     assert main(["eval", str(run), "--policies", f"run:{other}", "--dry-run"]) == 2
     assert "was trained on task" in capsys.readouterr().err
-    record = ["record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
+    record = ["twin", "record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
     assert main([*record, "--policy", f"run:{other}"]) == 2
     assert "was trained on task" in capsys.readouterr().err
 

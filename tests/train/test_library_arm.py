@@ -191,7 +191,7 @@ library = "sb3-ppo"
 arguments = {{ n_steps = 40, batch_size = 20, n_epochs = 2 }}
 """)
     out = tmp_path / "out"
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(out), "--engine", engine, "--json"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--engine", engine, "--json"]
     argv += ["--workers", "2"]
     assert main(argv) == 0
     found = json.loads(capsys.readouterr().out)

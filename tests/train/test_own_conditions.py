@@ -102,7 +102,9 @@ def test_a_run_says_which_conditions_its_twin_cannot_evaluate(
     text = (folder / "mine.toml").read_text().replace("26.395", "20")
     (folder / "mine.toml").write_text(text)
     capsys.readouterr()
-    assert main(["label", str(folder / "store"), "--profile", str(folder / "mine.toml")]) == 0
+    assert (
+        main(["store", "label", str(folder / "store"), "--profile", str(folder / "mine.toml")]) == 0
+    )
     query = (
         "SELECT count(*) FILTER (primary_condition = 'creeping' AND battery_v IS NULL) AS fresh,"
     )

@@ -1,4 +1,4 @@
-"""`restock diff` of runs: settings, feed and evaluation side by side, whatever the gate says."""
+"""`restock coverage diff` of runs: settings, feed and evaluation side by side."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_what_moved_is_shown_where_compare_refuses(
     )
     assert main(["compare", str(first), "--against", str(second), "--json"]) == 1
     capsys.readouterr()
-    assert main(["diff", str(first), str(second), "--json"]) == 0
+    assert main(["coverage", "diff", str(first), str(second), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     settings = {row["setting"]: (row["first"], row["second"]) for row in found["settings"]}
     assert settings["config.network.layer_norm"] == (True, False)
@@ -40,7 +40,7 @@ def test_what_moved_is_shown_where_compare_refuses(
     assert found["evaluated_by"] == "training"
     assert found["comparable"]["algorithm"] == "incomparable"
     assert found["different"]
-    assert main(["diff", str(first), str(second)]) == 0
+    assert main(["coverage", "diff", str(first), str(second)]) == 0
     assert "incomparable as methods" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""`restock study`: every arm with every seed, once; what is there is not done again."""
+"""`restock train`: every arm with every seed, once; what is there is not done again."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ PRIMARY = "primary = { arm = 'b', baseline = 'a', measure = 'auc_rare' }"
 def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, capsys) -> None:
     (tmp_path / "s.toml").write_text(SMALL)
     out = tmp_path / "out"
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
     # So short a run shows too few episodes for the gate: refused, and said so.
     assert main(argv) == 1
     found = json.loads(capsys.readouterr().out)
@@ -74,7 +74,7 @@ def test_a_study_runs_every_arm_once_and_ends_in_a_comparison(tmp_path: Path, ca
 def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> None:
     text = SMALL.replace("[settings]", "[settings]\nenv.layouts = 'nowhere.toml'")
     (tmp_path / "s.toml").write_text(text)
-    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o")]) == 2
+    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o")]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "plain-0.log: `restock train` failed with exit code 2" in said
     assert "nowhere.toml" in said
@@ -82,7 +82,7 @@ def test_a_run_that_fails_says_where_its_words_are(tmp_path: Path, capsys) -> No
 
 def test_the_plan_is_shown_before_anything_is_run(tmp_path: Path, capsys) -> None:
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 7]"))
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
     assert main(argv) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [Path(row["run"]).name for row in rows] == [
@@ -111,7 +111,7 @@ name = "coverage"
 name = "method"
 treatment = "method"
 """)
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
     assert main(argv) == 0
     assert [row["against"] for row in json.loads(capsys.readouterr().out)] == [
         *("coverage (algorithm)", None),
@@ -145,7 +145,7 @@ def test_a_finished_study_may_be_moved_and_a_changed_one_says_what_is_different(
         request["panel"] = str(plan.panel(job.arm))  # as an earlier Restock wrote it
         job.done.write_text(json.dumps(request))
     moved = out.rename(tmp_path / "moved")
-    line = ["study", str(study), "--out", str(moved), "--dry-run", "--json"]
+    line = ["train", str(study), "--out", str(moved), "--dry-run", "--json"]
     assert main(line) == 0
     assert all(row["done"] for row in json.loads(capsys.readouterr().out))
     study.write_text(text.replace("n_step = 1", "n_step = 3"))
@@ -170,7 +170,7 @@ def test_each_comparison_has_its_own_treatment(tmp_path: Path, capsys, monkeypat
 
     requested: list[tuple[str, str, str]] = []
     monkeypatch.setattr(study_run, "compare", compared)
-    assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
+    assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
     assert requested == [("plain-0", "dueling-0", "algorithm"), ("dueling-0", "again-0", "method")]
     first, second = json.loads(capsys.readouterr().out)["comparisons"]
     assert (first["arm"], first["baseline"], first["treatment"]) == (
@@ -197,7 +197,7 @@ def test_a_comparison_that_fails_ends_no_study(tmp_path: Path, capsys, monkeypat
         return Comparison(treatment, "comparable", [], [], [], [], "evaluation", [])
 
     monkeypatch.setattr(study_run, "compare", compared)
-    assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
+    assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--json"]) == 1
     first, second = json.loads(capsys.readouterr().out)["comparisons"]
     assert (first["verdict"], second["verdict"]) == ("inconclusive", "comparable")
     why = "runs/dueling-0: has no record of the episodes it sampled"
@@ -259,7 +259,7 @@ def test_an_interrupted_study_says_how_to_continue(tmp_path: Path, capsys, monke
 
     monkeypatch.setattr(study_run, "run_job", stopped)
     (tmp_path / "s.toml").write_text(SMALL)
-    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")]) == 130
+    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")]) == 130
     said = " ".join(capsys.readouterr().err.split())
     assert "interrupted; finished runs are kept" in said
     assert "continue with the same command" in said
@@ -290,7 +290,7 @@ def test_after_a_run_failed_none_is_begun_and_those_that_run_can_be_interrupted(
     monkeypatch.setattr(study_run, "run_job", job)
     monkeypatch.setattr(study_run, "interrupt_running", ended.set)
     (tmp_path / "s.toml").write_text(SMALL.replace("[0]", "[0, 1]"))
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--workers", "2"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--workers", "2"]
     assert main(argv) == (130 if interrupted else 2)
     assert ended.is_set() is interrupted
     assert sorted(begun) == ["dueling-0", "plain-0"]
@@ -299,7 +299,7 @@ def test_after_a_run_failed_none_is_begun_and_those_that_run_can_be_interrupted(
 
 def test_a_panel_that_is_not_there_is_refused_before_the_runs(tmp_path: Path, capsys) -> None:
     (tmp_path / "s.toml").write_text(f"{TWO}panel = 'p'\n")
-    assert main(["study", str(tmp_path / "s.toml"), "--out", str(tmp_path), "--dry-run"]) == 2
+    assert main(["train", str(tmp_path / "s.toml"), "--out", str(tmp_path), "--dry-run"]) == 2
     assert "p: arm 'b': there is no panel here" in capsys.readouterr().err
 
 
@@ -307,7 +307,7 @@ def test_a_dry_run_plans_the_mixtures(tmp_path: Path, capsys) -> None:
     arms = '[[arms]]\nname = "a"\nmixture = "uniform"\n[[arms]]\nname = "b"\nmixture = "b.toml"\n'
     (tmp_path / "s.toml").write_text(f'store = "s"\ntreatment = "mixture"\n{arms}')
     (tmp_path / "b.toml").write_text("where = 'speed > 1'\n[each_condition]\n")
-    argv = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "o"), "--dry-run", "--json"]
     assert main(argv) == 2
     assert f"{tmp_path / 's'}: no such store" in capsys.readouterr().err
     write_store(tmp_path / "s", [recording_transitions(1)])
@@ -322,7 +322,7 @@ def test_a_study_is_not_put_into_its_store(tmp_path: Path, capsys) -> None:
     (tmp_path / "s.toml").write_text(SMALL)
     write_store(tmp_path / "s", [recording_transitions(1)])
     for out, why in ((tmp_path / "s" / "o", "within the store"), (tmp_path / "s.toml", "a file")):
-        assert main(["study", str(tmp_path / "s.toml"), "--out", str(out), "--dry-run"]) == 2
+        assert main(["train", str(tmp_path / "s.toml"), "--out", str(out), "--dry-run"]) == 2
         assert why in " ".join(capsys.readouterr().err.split())
 
 

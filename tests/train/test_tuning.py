@@ -1,4 +1,4 @@
-"""`restock study` of a space: what is drawn, what is stopped, and how it goes on after a cut."""
+"""`restock train` of a space: what is drawn, what is stopped, and how it goes on after a cut."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ def test_the_space_is_shown_before_anything_is_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan_of(tmp_path)
-    words = ["study", str(tmp_path / "search.toml"), "--out", str(tmp_path / "out")]
+    words = ["train", str(tmp_path / "search.toml"), "--out", str(tmp_path / "out")]
     assert cli.main([*words, "--dry-run", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert [row["key"] for row in shown["space"]] == [
@@ -270,7 +270,7 @@ episodes = 1
 [space]
 "loss.n_step" = { low = 1, high = 5 }
 """)
-    words = ["study", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--json"]
+    words = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--json"]
     assert cli.main(words) == 0
     first = json.loads(capsys.readouterr().out)
     assert [trial["state"] for trial in first["trials"]] == ["complete"] * 2

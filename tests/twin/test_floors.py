@@ -282,7 +282,7 @@ def test_what_does_not_fit_a_floor_is_refused_before_anything_is_driven(
     shares = "env.conditions={nominal=1, blocked_aisle=0}"
     with pytest.raises(ConfigError, match=message):
         prepare_new(tmp_path / "run", None, None, [f"env.layouts={hall}", shares])
-    record = ["record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
+    record = ["twin", "record", "--out", str(tmp_path / "a.mcap"), "--missions", "1"]
     assert main([*record, "--layouts", str(hall)]) != 0
     assert message in capsys.readouterr().err
     # Without those conditions it is driven on, and sealed goals are reported.

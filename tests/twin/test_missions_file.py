@@ -127,7 +127,7 @@ def test_a_dry_run_says_what_would_be_driven_and_a_wrong_file_writes_nothing(
 ) -> None:
     out, file = tmp_path / "next.mcap", tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\n')
-    args = ["record", "--out", str(out), "--missions", str(file)]
+    args = ["twin", "record", "--out", str(out), "--missions", str(file)]
     assert main([*args, "--dry-run", "--json"]) == 0
     plan = json.loads(capsys.readouterr().out)
     assert plan["orders"] == [{"kind": "wheel_slip", "missions": 3}]
@@ -135,8 +135,10 @@ def test_a_dry_run_says_what_would_be_driven_and_a_wrong_file_writes_nothing(
     file.write_text('[[missions]]\nkind = "wheel_slip"\nmissions = 3\nzone = "roof"\n')
     assert main(args) == 2
     assert "zone 'roof'" in capsys.readouterr().err
-    assert main(["record", "--out", str(out), "--missions", str(tmp_path / "none.toml")]) == 2
-    assert "restock gaps" in capsys.readouterr().err
+    assert (
+        main(["twin", "record", "--out", str(out), "--missions", str(tmp_path / "none.toml")]) == 2
+    )
+    assert "restock coverage gaps" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -146,7 +148,7 @@ def test_missions_of_a_file_are_recorded_and_counted_by_what_they_met(
     file = tmp_path / "next.toml"
     file.write_text('[[missions]]\nkind = "nominal"\nmissions = 1\n')
     out = tmp_path / "next.mcap"
-    assert main(["record", "--out", str(out), "--missions", str(file), "--json"]) == 0
+    assert main(["twin", "record", "--out", str(out), "--missions", str(file), "--json"]) == 0
     done = json.loads(capsys.readouterr().out)
     assert done["ordered"] == done["missions"] == done["met"] == {"nominal": 1}
     assert out.stat().st_size == done["size_bytes"]
@@ -171,15 +173,15 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
         '[[strata]]\nname = "rest"\nwhere = "true"\nshare = 0.0\npriority = 5000\n'
     )  # fmt: skip
     first = ["--missions", "24", "--conditions", "nominal=.8,wheel_slip=.2"]
-    run("record", "--out", str(tmp_path / "first.mcap"), *first)
+    run("twin", "record", "--out", str(tmp_path / "first.mcap"), *first)
     assert main(["ingest", str(tmp_path / "first.mcap"), "--store", store]) == 0
     capsys.readouterr()
-    gaps = ["gaps", store, "--mixture", str(requested), "--no-audits"]
+    gaps = ["coverage", "gaps", store, "--mixture", str(requested), "--no-audits"]
     before = run(*gaps, "--missions-out", str(tmp_path / "next.toml"), "--confidence", "0.9")
     missing = {gap["cell"]: gap for gap in before["gaps"]}  # type: ignore[attr-defined]
     assert "wheel_slip" in missing
-    run("record", "--out", str(tmp_path / "next.mcap"), "--missions", str(tmp_path / "next.toml"),
-        "--start", "2026-03-03")  # fmt: skip
+    run("twin", "record", "--out", str(tmp_path / "next.mcap"), "--missions",
+        str(tmp_path / "next.toml"), "--start", "2026-03-03")  # fmt: skip
     assert main(["ingest", str(tmp_path / "next.mcap"), "--store", store]) == 0
     capsys.readouterr()
     after = {gap["cell"]: gap for gap in run(*gaps)["gaps"]}  # type: ignore[attr-defined]
@@ -238,6 +240,6 @@ def test_training_refuses_what_its_floors_cannot_hold_before_anything_is_written
                 tmp_path / "run", None, None, [f"env.missions={str(tmp_path / 'next.toml')!r}"]
             )
         assert "env.missions" in str(error.value)
-    with pytest.raises(ConfigError, match="restock gaps"):
+    with pytest.raises(ConfigError, match="restock coverage gaps"):
         prepare_new(tmp_path / "run", None, None, ["env.missions='none.toml'"])
     assert not (tmp_path / "run").exists()

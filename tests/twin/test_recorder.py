@@ -74,7 +74,7 @@ def test_one_driver_alone_can_be_asked_for(tmp_path: Path, policy: str) -> None:
 
 @pytest.mark.parametrize("name", one_in(2, ["a.mcap", "a"]))
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
-    args = ["record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
+    args = ["twin", "record", "--missions", "1", "--seed", "3", "--rates", "odom=10,imu=10,scan=5"]
     for folder in ("first", "second"):
         assert cli.main([*args, "--out", str(tmp_path / folder / name)]) == ExitCode.OK
     assert cli.main([*args[:4], "4", "--out", str(tmp_path / "third" / name)]) == ExitCode.OK
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
 def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "bag"
     code = cli.main(
-        ["record", "--out", str(out), "--minutes", "0.01", "--policy", "random", "--json"]
+        ["twin", "record", "--out", str(out), "--minutes", "0.01", "--policy", "random", "--json"]
     )
     printed = json.loads(capsys.readouterr().out)
     assert code == ExitCode.OK
@@ -106,7 +106,7 @@ def test_json_says_what_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "log.mcap"
-    assert cli.main(["record", "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
+    assert cli.main(["twin", "record", "--out", str(out), "--dry-run", "--json"]) == ExitCode.OK
     printed = json.loads(capsys.readouterr().out)
     assert (printed["minutes"], printed["format"], printed["conditions"]) == (5.0, "mcap", NATURAL)
     assert list(tmp_path.iterdir()) == []
@@ -135,7 +135,7 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_wrong_value_is_one_clear_message(
     flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code = cli.main(["record", "--out", str(tmp_path / "log.mcap"), *flags])
+    code = cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap"), *flags])
     captured = capsys.readouterr()
     assert code == ExitCode.USAGE
     assert captured.out == ""
@@ -146,20 +146,20 @@ def test_a_wrong_value_is_one_clear_message(
 def test_a_name_that_is_neither_a_files_nor_a_folders_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
+    words = ["twin", "record", "--out", str(tmp_path / "drive.txt"), "--minutes", "0.01"]
     assert cli.main(words) == ExitCode.USAGE
     assert "ends in .mcap, or a folder for rosbag2" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert cli.main([*words, "--format", "rosbag2", "--dry-run"]) == ExitCode.OK
     dated = str(tmp_path / "drive.2026-10-05")  # a folder's
-    assert cli.main(["record", "--out", dated, "--dry-run"]) == ExitCode.OK
+    assert cli.main(["twin", "record", "--out", dated, "--dry-run"]) == ExitCode.OK
 
 
 def test_no_recording_is_written_into_a_store(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = write_store(tmp_path / "store", [recording_transitions(1)])
-    assert cli.main(["record", "--out", str(store / "drive.mcap")]) == ExitCode.USAGE
+    assert cli.main(["twin", "record", "--out", str(store / "drive.mcap")]) == ExitCode.USAGE
     assert f"is within the store {store}" in " ".join(capsys.readouterr().err.split())
 
 
@@ -167,14 +167,14 @@ def test_a_recording_is_never_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "log.mcap").write_text("precious")
-    assert cli.main(["record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
+    assert cli.main(["twin", "record", "--out", str(tmp_path / "log.mcap")]) == ExitCode.USAGE
     assert "never overwritten" in capsys.readouterr().err
     assert (tmp_path / "log.mcap").read_text() == "precious"
 
 
 @pytest.mark.long
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "restock", "record", "--minutes", "600", "--out"]
+    command = [sys.executable, "-m", "restock", "twin", "record", "--minutes", "600", "--out"]
     process = subprocess.Popen([*command, str(tmp_path / "log.mcap")], stderr=subprocess.PIPE)
     deadline = time.monotonic() + 240
     while not any(file.stat().st_size for file in tmp_path.rglob("log.mcap")):

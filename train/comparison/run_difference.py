@@ -30,7 +30,7 @@ _Key = tuple[int, str]  # seed, and the values of the perturbation in force
 
 
 def diff_runs(first: Path | str, second: Path | str, *, seed: int = 0) -> dict[str, Any]:
-    """What is different in `second`, as plain values: what `restock diff --json` prints.
+    """What is different in `second`, as plain values: what `restock coverage diff --json` prints.
 
     Raises:
         RunError: one of them is missing or damaged, or they are of different tasks.

@@ -71,7 +71,7 @@ _LABELS = {  # by how the name of their checks, one a condition, begins
     "labels: ": (
         "LABELS_WRONG",
         "labels differ from what their conditions give on the stored signals: wrong in",
-        "`restock label STORE` computes them again; corrections by people are kept",
+        "`restock store label STORE` computes them again; corrections by people are kept",
     ),
 }
 _ON_THEIR_OWN = ("EPISODES_REPEATED", "TERMINATIONS_WRONG")

@@ -91,7 +91,7 @@ def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], 
     others = len(found) - len(same)
     note = (
         f"{others} of {len(found)} recordings were labelled with other rules than the profile's, "
-        "or corrected by people: `restock label STORE` updates them"
+        "or corrected by people: `restock store label STORE` updates them"
         if others
         else ""
     )

@@ -281,7 +281,7 @@ class Practice(Stateful):
                 raise ConfigError(
                     'the rule "missions" practises the missions of a file, but none is given',
                     where=f"{WHERE}.rule",
-                    remedy="give env.missions a missions file (`restock gaps --missions-out`)",
+                    remedy="give env.missions a file of `restock coverage gaps --missions-out`",
                 )
             return weights
         if config.rule == "logs":

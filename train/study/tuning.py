@@ -83,7 +83,7 @@ def require_optuna() -> Any:
 
 
 def run_search(plan: SearchPlan, *, say: Say = lambda line: None) -> dict[str, Any]:
-    """Do the trials that are left, one after the other; returns what `restock study` shows.
+    """Do the trials that are left, one after the other; returns what `restock train` shows.
 
     Raises:
         ConfigError: Optuna is not installed.

@@ -56,7 +56,7 @@ def write_view(
         raise StoreError(
             "is a row from the twin, so there is no recording of it",
             where="--view",
-            remedy="`restock record --policy run:RUN --missions FILE` drives its mission again",
+            remedy="`restock twin record --policy run:RUN --missions FILE` drives it again",
         )
     moment = find_moment(
         trace.origin,

@@ -1,5 +1,5 @@
 -- severity: info
--- advice: Of one robot, they hold what happened in that time twice: take one out with `restock remove STORE RECORDING`. Of several, tell them apart with `restock ingest RECORDING --tag robot=…`: [tags] in docs/ingest.md.
+-- advice: Of one robot, they hold what happened in that time twice: take one out with `restock store remove STORE RECORDING`. Of several, tell them apart with `restock ingest RECORDING --tag robot=…`: [tags] in docs/ingest.md.
 -- doc: Recordings of one robot, or of one profile where no tag names the robot, that cover the same time as an earlier one, by log time.
 WITH beside AS (
     SELECT

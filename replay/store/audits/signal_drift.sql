@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: Check that part of the robot, or the site if its other robots changed in the same way; `restock drift` shows the weeks.
+-- advice: Check that part of the robot, or the site if its other robots changed in the same way; `restock coverage drift` shows the weeks.
 -- doc: Robots with a signal, or the rate of a condition, that changed compared with their own first weeks.
 SELECT robot, site, part, signal, zone, period, scope, compared, change, change_low, change_high, size, q
 FROM drift_by(sizes := false)

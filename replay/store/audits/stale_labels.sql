@@ -1,5 +1,5 @@
 -- severity: warning
--- advice: If only conditions changed, run `restock label STORE --profile PROFILE`; otherwise ingest these recordings again.
+-- advice: If only conditions changed, run `restock store label STORE --profile PROFILE`; otherwise ingest these recordings again.
 -- doc: Recordings that were labelled or read with another version of the conditions or the profile than the newest ingest with a profile of that name.
 WITH newest AS (
     FROM recordings

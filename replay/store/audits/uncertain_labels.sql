@@ -1,5 +1,5 @@
 -- severity: info
--- advice: Leave such rows out of strata, let people review them (restock label --review), or log a better sensor.
+-- advice: Leave such rows out of strata, let people review them (restock store label --review), or log a better sensor.
 -- doc: Conditions with a large share of uncertain rows, by their probability, among all rows that are labelled or uncertain.
 WITH doubted AS (
     SELECT

@@ -10,9 +10,9 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, NoReturn
 
 from restock.cli.streams import drop, substitute_what_cannot_be_shown, work_goes_on
 from restock.errors import ExitCode, RestockError
@@ -21,80 +21,117 @@ from restock.interrupts import kill_as_interrupt, was_interrupted
 
 # verb -> what it does, in the order of the work
 VERBS = {
-    "record": "drive a simulated robot and write what a real one would log",
+    "demo": "all of the below, on sample_logs/",
+    "start": "from your robot's recordings to a policy and a report, stage by stage",
     "info": "what is in these recordings?",
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
-    "label": "label a store again after its conditions changed, without the recordings",
-    "compact": "join a store's many small files into a few large ones",
-    "store": "store verify: compare the checksums of all files of a store",
-    "remove": "take recordings out of a store; its earlier versions keep them for 7 days",
     "sql": "query a store (or a run) in SQL",
-    "coverage": "how much of each condition a store holds, and what is missing, on one page",
+    "coverage": "how much of each condition a store holds; what is missing, different or changed",
     "audit": "check that the coverage is good enough: exit 1 if not",
-    "drift": "which robot's wheels, lidar or floor have changed?",
-    "diff": "what is different between two stores, versions, panels or runs?",
-    "gaps": "what is missing, and which missions would fill it?",
     "mix": "a pinned replay panel with quotas per stratum",
     "export": "write transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
-    "twin": "describe floors (layout), fit the twin to logs (fit), measure its gap to them (gap)",
-    "train": "offline warm-up on the panel, then online in the twin",
+    "train": "offline warm-up on the panel, then online in the twin; or a study of many runs",
     "eval": "success per condition, clean and perturbed",
-    "study": "methods x mixtures x seeds, ending in one comparison",
     "compare": "compare methods; refused if their critics were fed differently",
-    "trace": "trace a sampled row to its source, down to the messages",
     "diagnose": "buffer failure or target failure?",
+    "trace": "trace a sampled row to its source, down to the messages",
     "report": "one HTML page with the results of a run",
+    "store": "label a store again, remove recordings, join its files, or verify them",
+    "twin": "drive a simulated robot and log it, or fit the twin to a robot's logs",
     "check": "a gate for pipelines: audits, changes, regressions; exit 1 if one fails",
-    "node": "run an exported policy on a robot, as a ROS 2 node, in shadow mode or driving",
-    "start": "from your robot's recordings to a policy and a report, stage by stage",
-    "demo": "all of the above, on sample_logs/",
-    "schema": "what a TOML file may contain, as a JSON Schema for editors",
     "doctor": "what is installed here, what works, and whether a store can be read",
-    "completion": "a script that completes verbs and options in bash or zsh",
 }
-# folder -> the verbs whose modules it holds
+# verb -> its jobs, each with its own options, and what they do
+JOBS = {
+    "coverage": {
+        "gaps": "what is missing, and which missions would fill it?",
+        "drift": "which robot's wheels, lidar or floor have changed?",
+        "diff": "what is different between two stores, versions, panels or runs?",
+    },
+    "profile": {"schema": "what a TOML file may contain, as a JSON Schema for editors"},
+    "store": {
+        "label": "label a store again after its conditions changed, without the recordings",
+        "compact": "join a store's many small files into a few large ones",
+        "remove": "take recordings out; earlier versions of the store keep them for 7 days",
+        "verify": "compare the checksums of all files of a store",
+    },
+    "twin": {
+        "record": "drive a simulated robot and write what a real one would log",
+        "layout": "describe a floor",
+        "robot": "drive your robot's MuJoCo model, and say how well it follows commands",
+        "fit": "fit the twin to logs",
+        "gap": "measure how far the twin is from the logs",
+    },
+}
+# folder -> the verbs and jobs whose modules it holds
 FOLDERS = {
-    "data": (
-        *("info", "profile", "ingest", "label", "sql", "audit"),
-        *("drift", "diff", "gaps", "mix", "export"),
+    "data": ("info", "profile", "ingest", "sql", "audit", "mix", "export", "doctor"),
+    "fleet": ("coverage", *(f"coverage {job}" for job in JOBS["coverage"])),
+    "upkeep": tuple(f"store {job}" for job in JOBS["store"]),
+    "learning": (
+        *("train", "study", "eval", "compare", "diagnose", "trace", "report"),
+        "profile schema",
     ),
-    "upkeep": ("compact", "store", "remove"),
-    "learning": ("train", "eval", "study", "compare", "trace", "diagnose", "schema"),
-    "pages": ("coverage", "report"),
-    "twin": ("record", "twin"),
-    "pipeline": ("check",),
-    "robot": ("node",),
+    "twin": tuple(f"twin {job}" for job in JOBS["twin"]),
     "start": ("start", "demo"),
+    "pipeline": ("check",),
 }
 # folders of verbs that multiply no large matrices
-ONE_THREAD_OF_BLAS = ("data", "upkeep", "pages", "pipeline")
+ONE_THREAD_OF_BLAS = ("data", "fleet", "upkeep", "pipeline")
 PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # of work that goes on where nobody reads it
-_FOLDER_OF = {verb: f"{folder}." for folder, verbs in FOLDERS.items() for verb in verbs}
+_FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
+COMPLETION = "--tyro-write-completion"
 
 
 def usage() -> str:
-    width = max(map(len, VERBS))
-    verbs = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in VERBS.items())
+    """Return the text of `restock --help`."""
     return f"""usage: restock VERB [--help] …
 
 Turns robot logs into labelled transitions, shows in SQL what is missing, mixes replay batches
 with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 
-{verbs}
+{_listed(VERBS)}
 
-`restock VERB --help` explains a verb. Exit codes: 0 done, 1 an audit failed or a comparison was
-refused, 2 any other failure: wrong usage, bad input, a file that cannot be read or written,
-3 written but data was lost or skipped, 130 interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
+`restock VERB --help` explains a verb. `restock-node` runs an exported policy on a robot. Exit
+codes: 0 done, 1 an audit failed or a comparison was refused, 2 any other failure: wrong usage,
+bad input, a file that cannot be read or written, 3 written but data was lost or skipped, 130
+interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
+
+
+def _usage_of_jobs(verb: str) -> str:
+    """Return the text of `restock VERB --help` for a verb that has nothing but jobs."""
+    return f"""usage: restock {verb} JOB [--help] …
+
+{VERBS[verb][0].upper()}{VERBS[verb][1:]}.
+
+{_listed(JOBS[verb])}
+
+`restock {verb} JOB --help` explains a job."""
+
+
+def _listed(names: Mapping[str, str]) -> str:
+    width = max(map(len, names))
+    return "\n".join(f"  {name:<{width}}  {summary}" for name, summary in names.items())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command line; returns the exit code."""
+    """Run one command line of `restock`; return the exit code."""
+    return _guarded(_dispatch, list(sys.argv[1:] if argv is None else argv))
+
+
+def node(argv: Sequence[str] | None = None) -> int:
+    """Run one command line of `restock-node`; return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
+    return _guarded(lambda given: _run("node", "restock-node", _without_ros(given)), args)
+
+
+def _guarded(run: Callable[[list[str]], int], args: list[str]) -> int:
+    """Run a command line, and say in one message what goes wrong."""
     substitute_what_cannot_be_shown()
     try:
         with kill_as_interrupt():
-            code = _dispatch(args)
+            code = run(args)
         sys.stdout.flush()  # here, where a reader that went away is no error
         return code
     except KeyboardInterrupt:
@@ -122,51 +159,90 @@ def _dispatch(args: list[str]) -> int:
 
         sys.stdout.write(f"restock {__version__}\nnative code {native.state()}\n")
         return int(ExitCode.OK)
-    verb = args[0]
+    if args[0] == COMPLETION:
+        from restock.cli.completion import write_completion
+
+        return write_completion(args)
+    name, prog, rest = _named(args)
+    if name in ("store", "twin"):  # a verb that has nothing but jobs
+        return _say_jobs(name, rest)
+    return _run(name, prog, rest)
+
+
+def _named(args: list[str]) -> tuple[str, str, list[str]]:
+    """Return the name of the command, what help calls it, and its arguments."""
+    verb, rest = args[0], args[1:]
     if verb not in VERBS:
-        from difflib import get_close_matches
+        _refuse_verb(verb)
+    if rest and rest[0] in JOBS.get(verb, ()):
+        name = f"{verb} {rest[0]}"
+        return name, f"restock {name}", rest[1:]
+    if verb == "train" and rest and not rest[0].startswith("-"):
+        return "study", "restock train", rest
+    return verb, f"restock {verb}", rest
 
-        near = get_close_matches(verb, VERBS, n=1)
-        hint = f"did you mean `restock {near[0]}`?" if near else "see `restock --help`"
-        raise RestockError(f"no verb named {verb!r}", remedy=hint)
 
+def _refuse_verb(verb: str) -> NoReturn:
+    from difflib import get_close_matches
+
+    from restock.renamed import VERBS as RENAMED
+
+    if verb in RENAMED:
+        raise RestockError(f"there is no verb {verb!r} any more", remedy=RENAMED[verb])
+    near = get_close_matches(verb, VERBS, n=1)
+    hint = f"did you mean `restock {near[0]}`?" if near else "see `restock --help`"
+    raise RestockError(f"no verb named {verb!r}", remedy=hint)
+
+
+def _say_jobs(verb: str, rest: list[str]) -> int:
+    if rest and rest[0] not in ("-h", "--help"):
+        raise RestockError(
+            f"no job named {rest[0]!r}",
+            where=f"restock {verb}",
+            remedy=f"choose one of {', '.join(JOBS[verb])}",
+        )
+    sys.stdout.write(_usage_of_jobs(verb) + "\n")
+    return int(ExitCode.OK if rest else ExitCode.USAGE)
+
+
+def _run(name: str, prog: str, rest: list[str]) -> int:
+    """Parse the arguments of a command, and run it."""
     when_imported("pyarrow", _settle_pandas)
-    if any(verb in FOLDERS[folder] for folder in ONE_THREAD_OF_BLAS):
+    if _FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
 
     import tyro
 
-    from restock.cli.command_line import jobs_of, prepared, refuse_empty_paths
+    from restock.cli.command_line import prepared, refuse_empty_paths
     from restock.cli.help import printed
 
-    requested = bool({"-h", "--help"} & set(args))
-    command, name, rest = command_of(verb), f"restock {verb}", args[1:]
-    if rest and (job := jobs_of(command).get(rest[0])):  # as a job, tyro's hints leave the verb out
-        command, name, rest = job, f"{name} {rest[0]}", rest[1:]
+    explained = bool({"-h", "--help"} & set(rest))
     try:
-        command = prepared(command, explained=requested)
-        with printed(help_asked=requested):
+        command = prepared(command_of(name), explained=explained)
+        with printed(help_asked=explained):
             parsed = tyro.cli(
                 command,
-                prog=name,
-                description=command.__doc__ if requested else None,
-                args=_without_ros(rest) if verb == "node" else rest,
+                prog=prog,
+                description=command.__doc__ if explained else None,
+                args=rest,
                 use_underscores=False,
                 config=(tyro.conf.FlagCreatePairsOff,),  # --json, without a --no-json beside it
             )
     except SystemExit as stop:  # tyro has printed its help (0) or its complaint (2)
         return int(stop.code or 0) if isinstance(stop.code, int | None) else int(ExitCode.USAGE)
-    if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in args):
+    if any(not arg or (arg.startswith("--") and arg.endswith("=")) for arg in rest):
         refuse_empty_paths(parsed)
-    with work_goes_on() if verb in PRINTS_ON_THE_WAY else nullcontext():
+    with work_goes_on() if name in PRINTS_ON_THE_WAY else nullcontext():
         code: int | None = parsed.run()
     return int(code or ExitCode.OK)
 
 
-def command_of(verb: str) -> type[Any]:
-    """The dataclass that is a verb's command line."""
-    module = importlib.import_module(f"restock.cli.{_FOLDER_OF.get(verb, '')}{verb}")
-    command: type[Any] = getattr(module, f"{verb.capitalize()}Command")
+def command_of(name: str) -> type[Any]:
+    """Return the dataclass that is the command line of a verb or a job, such as `store label`."""
+    last = name.split()[-1]
+    folder = f"{_FOLDER_OF[name]}." if name in _FOLDER_OF else ""
+    module = importlib.import_module(f"restock.cli.{folder}{last}")
+    command: type[Any] = getattr(module, f"{last.capitalize()}Command")
     return command
 
 

@@ -8,7 +8,7 @@ import inspect
 import textwrap
 import types
 import typing
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,14 +20,6 @@ from restock.errors import ConfigError
 _PREPARED: list[type[Any]] = []
 _EXPLAINED: list[type[Any]] = []
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
-
-
-@dataclasses.dataclass(frozen=True)
-class Names:
-    """In a field's annotation: the names it takes, for the completion of a shell. Others than
-    these are refused by the verb, or are files."""
-
-    names: tuple[str, ...]
 
 
 def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
@@ -51,28 +43,10 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
         texts = _texts(command)
         command.__doc__ = _joined(inspect.getdoc(command) or "")
         for field in dataclasses.fields(command):
-            for job in _jobs_in(field.type):
-                prepared(job, explained=True)
             if text := texts.get(field.name):
                 field.type = Annotated[field.type, tyro.conf.arg(help=text)]
                 command.__annotations__[field.name] = field.type
     return command
-
-
-def jobs_of(command: type[Any]) -> dict[str, type[Any]]:
-    """A verb's commands of its own, by name: `gap` of `twin`."""
-    found = {}
-    for hint in typing.get_type_hints(command, include_extras=True).values():
-        for one in typing.get_args(_bare(hint)):
-            kind, *reported = typing.get_args(one) or (one,)
-            if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-                found[next(t.name for t in reported if getattr(t, "name", None))] = kind
-    return found
-
-
-def _bare(hint: Any) -> Any:
-    """A type without what is annotated."""
-    return typing.get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
 
 
 def _texts(command: type[Any]) -> dict[str, str]:
@@ -94,14 +68,6 @@ def _joined(text: str) -> str:
     """A docstring with each paragraph in one line; what it indents, such as examples, stays."""
     paragraphs = text.split("\n\n")
     return "\n\n".join(one if one.startswith(" ") else " ".join(one.split()) for one in paragraphs)
-
-
-def _jobs_in(hint: Any) -> Iterator[type[Any]]:
-    """The dataclasses in a type: a verb's jobs, each a command of its own."""
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        yield hint
-    for part in typing.get_args(hint):
-        yield from _jobs_in(part)
 
 
 def refuse(command: Any, names: Collection[str], why: str, *, remedy: str) -> None:
@@ -126,9 +92,7 @@ def refuse_empty_paths(command: Any) -> None:
     """
     for field in dataclasses.fields(command):
         value = getattr(command, field.name)
-        if dataclasses.is_dataclass(value):
-            refuse_empty_paths(value)
-        elif Path() in (value if isinstance(value, list | tuple) else (value,)):
+        if Path() in (value if isinstance(value, list | tuple) else (value,)):
             raise ConfigError(
                 "the path is empty: is a variable of the shell not set?",
                 where=field.name.replace("_", "-"),
@@ -142,8 +106,7 @@ def _prepared(hint: Any, default: Any) -> Any:
     if typing.get_origin(bare) in (types.UnionType, typing.Union):
         kinds = [kind for kind in typing.get_args(bare) if kind is not type(None)]
         optional = len(kinds) < len(typing.get_args(bare))
-        jobs = [_job(kind) for kind in kinds]
-        bare = typing.Optional[jobs[0]] if optional else typing.Union[tuple(jobs)]  # noqa: UP007, UP045
+        bare = typing.Optional[kinds[0]] if optional else typing.Union[tuple(kinds)]  # noqa: UP007, UP045
         if optional and typing.get_origin(kinds[0]) is Literal:
             extras.insert(0, _one_of(kinds[0]))
         elif optional:
@@ -167,14 +130,6 @@ def _one_of(literal: Any) -> tyro.constructors.PrimitiveConstructorSpec[str | No
         str_from_instance=lambda value: [str(value)],
         choices=names,
     )
-
-
-def _job(kind: Any) -> Any:
-    """One of a union's types; a command of its own is prepared as well."""
-    inner = typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
-    if dataclasses.is_dataclass(inner) and isinstance(inner, type):
-        prepared(inner)
-    return kind
 
 
 def _metavar(kind: Any) -> str:

@@ -11,12 +11,14 @@ import os
 import traceback
 from collections.abc import Sequence
 
-from restock.cli import command_of
 from restock.errors import TRACEBACK, RestockError, StoreError, print_traceback
 from restock.files import first_line, is_undecoded
 
 _CHECK = "a file is damaged, or is of another kind than the command expects"
-_OF_A_STORE = f"{_CHECK}; `restock compact STORE --drop-damaged --dry-run` looks for one in a store"
+_OF_A_STORE = (
+    f"{_CHECK}; `restock store compact STORE --drop-damaged --dry-run` looks for one in a store"
+)
+WITH_MEMORY_LIMIT = ("sql", "audit", "mix")
 GL = "MUJOCO_GL"
 NO_GL = "unset it, or set it to egl, osmesa or glfw, whose library must be installed"
 # package of an exception -> what to do
@@ -40,7 +42,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             f"DuckDB's memory limit is too small: {full}",
             where=where,
             remedy="raise --memory-limit (default: 80 % of the machine's memory)"
-            if hasattr(command_of(args[0]), "memory_limit")
+            if args[0] in WITH_MEMORY_LIMIT
             else "free some memory, or use a machine with more: DuckDB may take 80 % of it",
         )
     if isinstance(error, StoreError) and error.where is None:  # raised where only rows were known

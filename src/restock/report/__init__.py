@@ -68,7 +68,7 @@ def write_coverage_page(
     """Write the page of a store's coverage; returns its path.
 
     Args:
-        gaps: as `restock gaps --json` prints them.
+        gaps: as `restock coverage gaps --json` prints them.
         drift: what `measure_drift` found, or why it could not be measured.
     """
     return write_page(coverage_page(coverage_facts(store), gaps, drift), out, figures)

@@ -1,4 +1,4 @@
-"""`restock record`: missions driven by the stand-in for the hardware, written as a robot's logs.
+"""`restock twin record`: missions driven by the simulated hardware, written as logs.
 
 The stand-in is the twin with other effective parameters than training assumes, so that there is a
 gap between logs and simulator to be found, and physics at half the timestep. Missions are driven,
@@ -201,7 +201,7 @@ class RecordingSummary:
     work_s: float = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """As `restock record --json` prints it."""
+        """As `restock twin record --json` prints it."""
         files = [self.path] if self.path.is_file() else list(self.path.iterdir())
         return {
             "path": str(self.path),

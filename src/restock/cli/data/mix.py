@@ -258,7 +258,7 @@ def _summary(document: dict[str, Any]) -> list[str]:
     if any(line["missing_hours"] is not None for line in strata):
         lines.append(
             "hours: of driving as in these logs, with nothing chosen for a stratum, until its rows"
-            " are there: median (95 %); `restock gaps` plans what to log"
+            " are there: median (95 %); `restock coverage gaps` plans what to log"
         )
     if document["logs_share"] < document["logs_share_wanted"] - 1e-9:
         lines.append(

@@ -42,6 +42,8 @@ class ProfileCommand:
     (and what the recording has instead), how many transitions would result, how many of them each
     condition would label, and what removes most rows, with advice. Nothing is written.
 
+    `restock profile schema` prints what a TOML file may contain, for editors.
+
     Exit codes: `new` exits with 3 if the proposal cannot be used as it is (it is still written, and
     says why), and `check` with 2 if the profile does not fit. Both exit with 3 if data of a
     recording was lost, or a recording could not be read; the output says what.

@@ -1,4 +1,4 @@
-"""`restock schema`: what a TOML file may say, for editors."""
+"""`restock profile schema`: what a TOML file may say, for editors."""
 
 from __future__ import annotations
 
@@ -11,19 +11,17 @@ from typing import Annotated, Any
 
 import tyro
 
-from restock.cli.command_line import Names
-
 # name -> the files that it is of
 CONFIGS: Mapping[str, str] = {
     "train": "`restock train --config`",
     "mixture": "`restock mix --mixture`",
     "profile": "`restock ingest --profile`: a robot's topics and task",
-    "study": "`restock study`: arms to compare",
-    "search": "`restock study`: a search over a [space]",
+    "study": "`restock train`: arms to compare",
+    "search": "`restock train`: a search over a [space]",
     "layout": "`--layouts`: a floor",
-    "perturbation": "`restock record --perturbation`: effective parameters",
+    "perturbation": "`restock twin record --perturbation`: effective parameters",
     "schedule": "the same: effective parameters, drawn per episode from `ranges`",
-    "missions": "`restock record --missions`",
+    "missions": "`restock twin record --missions`",
 }
 
 
@@ -31,14 +29,12 @@ CONFIGS: Mapping[str, str] = {
 class SchemaCommand:
     """Print the JSON Schema of a config, with which an editor completes and checks the TOML file.
 
-    Without NAME, it lists the configs. Run `restock schema train > train.schema.json`, and make
-    this the first line of the TOML file: #:schema ./train.schema.json (read by Taplo, and so by the
-    VS Code extension Even Better TOML). --out writes all schemas into a folder.
+    Without NAME, it lists the configs. Run `restock profile schema train > train.schema.json`, and
+    make this the first line of the TOML file: #:schema ./train.schema.json (read by Taplo, and so
+    by the VS Code extension Even Better TOML). --out writes all schemas into a folder.
     """
 
-    name: Annotated[
-        str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]"), Names(tuple(CONFIGS))
-    ] = None
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[NAME]")] = None
     """The name of the config."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Write NAME.schema.json into this folder; without NAME, all schemas."""

@@ -1,4 +1,4 @@
-"""`restock study`: methods x seeds, ending in one comparison."""
+"""`restock train`: methods x seeds, ending in one comparison."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class StudyCommand:
     best trial is the one with the highest success in its worst condition. It also writes
     OUT/best.toml.
 
-    Example: `restock study mixtures.toml --out studies/mixtures --workers 2`
+    Example: `restock train mixtures.toml --out studies/mixtures --workers 2`
     """
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
@@ -170,7 +170,7 @@ class StudyCommand:
                 "a search needs --out and cannot be combined with --power, --workers or --engine: "
                 "its trials run one after another",
                 where=str(self.study),
-                remedy="`restock study SEARCH.toml --out DIR`",
+                remedy="`restock train SEARCH.toml --out DIR`",
             )
         if self.dry_run:
             chosen = search.parameters.get(MIXTURE)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class CheckCommand:
     """Audit a store, and compare it and a run with earlier ones: exit 1 if a check fails.
 
-    It is `restock audit`, `restock diff` and `restock eval --baseline` in one, for a team's
+    It is `restock audit`, `coverage diff` and `restock eval --baseline` in one, for a team's
     continuous integration: as JUnit XML for its test view, as Markdown for its page. What fails: an
     audit of severity error, recordings or episodes that were lost, a condition in which the run is
     worse than the baseline, and a comparison that is not possible. The command only reads.

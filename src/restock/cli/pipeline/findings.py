@@ -1,5 +1,7 @@
-"""What `restock check` found, whatever looked: audits' findings, and the like of them for what
-`restock diff` and `restock eval --baseline` say. So one JUnit writer and one table serve all."""
+"""Findings of a store's difference and of a run's regression, as if audits had made them.
+
+So one JUnit writer and one table serve all.
+"""
 
 from __future__ import annotations
 
@@ -72,15 +74,15 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
             "labels_changed",
             "warning",
             "Rows whose condition changed",
-            "`restock diff` shows all of them; `restock label STORE --review` lets a person check "
-            "labels",
+            "`restock coverage diff` shows all of them; `restock store label STORE --review` lets "
+            "a person check labels",
             labels,
         ),
         _finding(
             "signals_shifted",
             "warning",
             "Signals whose mean over episodes shifted (false discovery rate 5 %)",
-            "`restock drift` shows which robot, week and part",
+            "`restock coverage drift` shows which robot, week and part",
             shifted(document["signals"]["shifts"]),
         ),
         _finding(

@@ -253,7 +253,7 @@ def evidence_lines(to: Settings) -> list[str]:
             found += [policy_evidence(store, share, EssGate())] if share else []
     lines = [str(one) for one in found if one.more_h != 0]
     if lines:
-        lines.append(f"which drives to record next: `restock gaps {quoted(to.store)}`")
+        lines.append(f"which drives to record next: `restock coverage gaps {quoted(to.store)}`")
     return lines
 
 

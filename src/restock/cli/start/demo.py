@@ -78,7 +78,7 @@ class DemoCommand:
         plan = []
         if logs is None:
             logs = self.out / "logs"
-            record = ["record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
+            record = ["twin", "record", "--out", str(logs / "sample.mcap"), "--missions", "60"]
             why = "This installation has no sample recordings: a simulated robot records some."
             plan.append(Stage("record", "Record", why, record))
         to = Settings(

@@ -262,7 +262,7 @@ def next_steps(to: Settings) -> list[str]:
         "    the same stages on your own bag or MCAP file; it proposes how topics become signals",
         f'restock sql {quoted(store)} "FROM coverage_by_condition"',
         "    your questions, in SQL: docs/sql.md lists tables and columns",
-        f"restock gaps {quoted(store)} --mixture coverage",
+        f"restock coverage gaps {quoted(store)} --mixture coverage",
         "    what the logs lack, and which missions would fill the gaps",
         f"restock diagnose {quoted(run)}",
         "    why a critic fails: because of what it was fed, or of its target?",

@@ -1,4 +1,4 @@
-"""`restock record`: drive the simulated stand-in and write what a real robot would log."""
+"""`restock twin record`: drive the simulated stand-in and write what a real robot would log."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class RecordCommand:
     between missions. The same seed gives the same bytes. Existing files are never overwritten, and
     Ctrl-C leaves no partial file.
 
-        restock record --out drive.mcap --minutes 5
-        restock record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
-        restock record --out amr07.mcap --tag robot=amr-07 --tag site=oslo --start 2026-10-05T08:00
-        restock record --out mine.mcap --policy run:runs/a --epsilon .05
-        restock record --out next.mcap --missions next.toml
+        restock twin record --out drive.mcap --minutes 5
+        restock twin record --out icy --missions 20 --conditions nominal=.5,wheel_slip=.5
+        restock twin record --out amr07.mcap --tag robot=amr-07 --start 2026-10-05T08:00
+        restock twin record --out mine.mcap --policy run:runs/a --epsilon .05
+        restock twin record --out next.mcap --missions next.toml
     """
 
     out: Path
@@ -45,7 +45,8 @@ class RecordCommand:
     """Stop after the mission in which this much driving is recorded (default 5)."""
     missions: Annotated[str | None, tyro.conf.arg(metavar="N|FILE")] = None
     """Stop after this number of missions instead. Or drive the missions of a file that `restock
-    gaps --missions-out` wrote, until the ordered number of missions has met each condition."""
+    coverage gaps --missions-out` wrote, until the ordered number of missions has met each
+    condition."""
     tag: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
     ] = ()

@@ -1,4 +1,4 @@
-"""`restock compact`: few large files in place of many small ones."""
+"""`restock store compact`: few large files in place of many small ones."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class CompactCommand:
     """Join a store's many small files into a few large ones, so that queries open fewer files.
 
-        restock compact store/
-        restock compact s3://warehouse/store --dry-run
+        restock store compact store/
+        restock store compact s3://warehouse/store --dry-run
 
     Ingest writes one file per recording. This joins the files, to about half a million transitions
     per file, ordered by robot and time, and joins the manifests. Recordings from an older Restock

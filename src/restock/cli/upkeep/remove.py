@@ -1,4 +1,4 @@
-"""`restock remove`: recordings out of a store."""
+"""`restock store remove`: recordings out of a store."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ SHOWN = 3  # recordings whose paths stand in the command that ingests them again
 class RemoveCommand:
     """Take recordings out of a store: those that were ingested twice, or by mistake.
 
-        restock remove store/ 3f2a9c0d7b61e854
-        restock remove store/ 3f2a9c logs/copy.mcap --dry-run
+        restock store remove store/ 3f2a9c0d7b61e854
+        restock store remove store/ 3f2a9c logs/copy.mcap --dry-run
 
     Name a recording by its id, by the first digits of its id (at least 6), or by the path it was
     ingested by; the end of the path is enough, for example the file's name. `restock sql STORE
@@ -59,7 +59,7 @@ class RemoveCommand:
         if not self.recordings:
             raise ConfigError(
                 "names no recording to remove",
-                where="restock remove",
+                where="restock store remove",
                 remedy=f'`restock sql {quoted(self.store)} "SELECT recording_id, source_file FROM'
                 ' recordings"` lists them',
             )

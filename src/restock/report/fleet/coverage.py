@@ -59,7 +59,7 @@ def coverage_page(
 
     Args:
         found: of `coverage_facts`.
-        gaps: as `restock gaps --json` prints them.
+        gaps: as `restock coverage gaps --json` prints them.
         drift: what was measured, or why nothing was.
     """
     (totals,) = found["totals"]

@@ -1,4 +1,4 @@
-"""What to log next, on the page of a store's coverage: the plan of `restock gaps`, and each gap."""
+"""What to log next, on a store's page: the plan of `restock coverage gaps`, and each gap."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
             " at the rates of the store's own episodes; intervals are 95 %."
         )
     if orders and unit == "missions":  # the twin drives no hours
-        intro.append("`restock gaps --missions-out FILE` writes it as missions to drive.")
+        intro.append("`restock coverage gaps --missions-out FILE` writes it as missions to drive.")
     if unknown:
         intro.append(
             "What was never logged has no rate, so no amount to fill it is known: to see one"
@@ -100,7 +100,9 @@ def shopping_section(gaps: dict[str, Any]) -> Section:
                 _without_empty(table),
                 {"there", "needed", unit},
                 title="What is missing",
-                caption=f"{left:,} more gaps: `restock gaps --json` has all." if left else "",
+                caption=f"{left:,} more gaps: `restock coverage gaps --json` has all."
+                if left
+                else "",
             ),
         ],
     )

@@ -1,4 +1,4 @@
-"""`restock label`: new conditions over the signals that are stored."""
+"""`restock store label`: new conditions over the signals that are stored."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LabelCommand:
     def run(self) -> int:
         """Label, and say what changed."""
         from restock.cli import output
-        from restock.cli.data import label_quality, label_review
+        from restock.cli.upkeep import label_quality, label_review
         from restock.ingest.relabel import open_for_relabel, relabel_store
         from restock.ingest.store.version import given_version
 

@@ -1,4 +1,4 @@
-"""`restock label --review` and `--corrections`: doubtful labels for a person, and verdicts back."""
+"""`restock store label --review` and `--corrections`: labels for a person, and verdicts back."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
     output.say(f"to see the first: {rows[0]['open']}")
     output.say(
         f"fill in the last column of {out} with yes, no or FIRST..LAST (the steps where the label "
-        f"is true), then run: restock label {quoted(path)} --corrections {quoted(out)}"
+        f"is true), then run: restock store label {quoted(path)} --corrections {quoted(out)}"
         if out is not None
         else "--out FILE writes them to a CSV file with a column for verdicts"
     )

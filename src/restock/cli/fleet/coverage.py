@@ -17,11 +17,13 @@ class CoverageCommand:
 
     Prints the rows in which each condition holds, their episodes and success. A row can hold
     several conditions and counts for each of them; `by priority` counts it once. With --out, it
-    writes one page: the conditions, what to log next (as `restock gaps`), weeks, robots, the map,
-    and which robots have changed (as `restock drift`).
+    writes one page: the conditions, what to log next (as `gaps`), weeks, robots, the map, and which
+    robots have changed (as `drift`).
 
         restock coverage store/
         restock coverage store/ --out coverage.html
+
+    `restock coverage gaps`, `drift` and `diff` have their own options and --help.
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]

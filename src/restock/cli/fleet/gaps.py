@@ -1,4 +1,4 @@
-"""`restock gaps`: what is missing, and which missions would fill it?"""
+"""`restock coverage gaps`: what is missing, and which missions would fill it?"""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ SHOWN = 15  # lines of a table on a terminal; --json has all
 class GapsCommand:
     """Find what is missing from a store, and how many missions of which kind would fill the gaps.
 
-        restock gaps store/
-        restock gaps store/ --mixture my.toml --missions-out next.toml
-        restock gaps store/ --min-rows 20 --by condition,zone
+        restock coverage gaps store/
+        restock coverage gaps store/ --mixture my.toml --missions-out next.toml
+        restock coverage gaps store/ --min-rows 20 --by condition,zone
 
     A gap is something that a mixture or an audit of coverage asks for and that the store lacks:
     rows of a stratum, rows or episodes of a condition, cells of condition x action; with --min-rows
     also cells of condition x zone x action (x robot). Each gap is printed with the rate seen so
     far, and the number of missions (or hours of driving) needed at that rate, with its 95 %
     interval. The plan is the least number of missions that fills all gaps. It can be written as a
-    file for `restock record --missions`, and for training (env.missions).
+    file for `restock twin record --missions`, and for training (env.missions).
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]

@@ -184,7 +184,7 @@ def _store(path: str) -> list[Finding]:
             if changed := len(store.changed_by_others):
                 what = f"not used: another tool may have changed {counted(changed, 'recording')}"
                 remedy = (
-                    f"rows are counted instead; `restock compact {quoted(path)}` makes new ones"
+                    f"rows are counted instead: `restock store compact {quoted(path)}` makes new"
                 )
                 found.append(Finding("store", "summaries", "ok", what, remedy))
             return found

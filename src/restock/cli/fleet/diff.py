@@ -1,4 +1,4 @@
-"""`restock diff`: what is different between two stores, store versions, panels or runs?"""
+"""`restock coverage diff`: what is different between two stores, store versions, panels or runs?"""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 class DiffCommand:
     """Show the differences between two stores, two versions of a store, two panels or two runs.
 
-        restock diff monday/ tuesday/
-        restock diff store@11 store                 # versions; store@2026-11-01 is as of that day
-        restock diff panels/a panels/b
-        restock diff runs/a runs/b
+        restock coverage diff monday/ tuesday/
+        restock coverage diff store@11 store        # versions; store@2026-11-01 is as of that day
+        restock coverage diff panels/a panels/b
+        restock coverage diff runs/a runs/b
 
     Stores: recordings and episodes that were added or removed, rows whose labels changed, the
     shares of conditions, zones and policies, and signals that shifted, with 95 % intervals over
@@ -42,7 +42,7 @@ class DiffCommand:
     def run(self) -> int:
         """Compare, print, and say with the exit code whether they differ, where that was asked."""
         from restock.cli import output
-        from restock.cli.data import diff_tables
+        from restock.cli.fleet import diff_tables
 
         document = _difference(self.first, self.second)
         if self.json:

@@ -1,4 +1,4 @@
-"""`restock drift`: which robot's wheels, lidar or floor have changed?"""
+"""`restock coverage drift`: which robot's wheels, lidar or floor have changed?"""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class DriftCommand:
     Robots and sites are tags of recordings (`restock ingest --tag robot=amr-1`). See
     docs/coverage.md.
 
-        restock drift store/
-        restock drift store/ --out drift.html
+        restock coverage drift store/
+        restock coverage drift store/ --out drift.html
         restock sql store/ "FROM drift WHERE robot = 'amr-2'"       # every comparison
     """
 

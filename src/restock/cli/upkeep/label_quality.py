@@ -1,4 +1,4 @@
-"""`restock label STORE --score`: how good the labels are, by step and by event."""
+"""`restock store label STORE --score`: how good the labels are, by step and by event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A difference as tables, as `restock diff` shows it: of stores, panels or runs."""
+"""A difference as tables, as `restock coverage diff` shows it: of stores, panels or runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`restock node`: an exported policy as a ROS 2 lifecycle node, or played a recording."""
+"""`restock-node`: an exported policy as a ROS 2 lifecycle node, or played a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class NodeCommand:
     parameters follow --ros-args. With --on, ROS is not needed: a recording is played to the policy,
     and its decisions are counted. See docs/deploy.md.
 
-    Example: `restock node policy.onnx --activate --ros-args -p use_sim_time:=true`
+    Example: `restock-node policy.onnx --activate --ros-args -p use_sim_time:=true`
     """
 
     policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY.onnx")]

@@ -1,9 +1,9 @@
-"""`restock store`: what is done with the files of a store."""
+"""`restock store verify`: compare the checksums of a store's files."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -12,20 +12,18 @@ from restock.words import counted
 
 
 @dataclass
-class StoreCommand:
+class VerifyCommand:
     """Read every file of a store and compare the checksum of each page.
 
         restock store verify store/
 
-    `mix`, `export`, `audit`, `check`, `gaps` and `doctor` do this first, but skip a file that was
-    found whole before if its size and time are the same. This reads all of them again. `sql`,
-    `coverage`, `drift` and `diff` only say how many files nobody has verified.
+    `mix`, `export`, `audit`, `coverage gaps` and `info` do this first, but skip a file that was
+    found whole before if its size and time are the same. This reads all of them again. `sql` and
+    the rest of `coverage` only say how many files nobody has verified.
 
     Exit codes: 0 all are whole, 1 a file is damaged or missing.
     """
 
-    job: Annotated[Literal["verify"], tyro.conf.Positional]
-    """What to do."""
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
     """The store: a folder, or s3://bucket/prefix."""
     json: bool = False
