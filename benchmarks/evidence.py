@@ -37,10 +37,10 @@ from harness import markdown, once, run_restock
 from restock.cli.output import plain
 from restock.errors import RestockError
 from restock.files import write_text
+from restock.report import write_study_page
 from restock.stats import paired_t
 from restock.train.study.contrasts import RunCurve
-from restock.train.study.findings import findings, power_of, too_small
-from restock.train.study.page import as_markdown
+from restock.train.study.findings import findings
 from restock.train.study.study import DONE, Study, StudyPlan, load_study
 from restock.train.study.study_run import run_study
 
@@ -105,11 +105,10 @@ def _answer(options: argparse.Namespace) -> int:
     study = msgspec.structs.replace(study, store=str(store.resolve()))
     mixtures = HERE if logs.archive is None else _beside_the_stores(options.question, out)
     plan = StudyPlan(study, mixtures, out / options.question)
-    if small := too_small(plan, power_of(plan)):
-        _say(small)
     comparisons = run_study(plan, workers=options.workers, say=_say)
     found = findings(plan, comparisons)
-    page = f"{as_markdown(found)}\n{curves(plan)}"
+    write_study_page(plain(found), plan.out / "study.html", options.question)
+    page = f"{(plan.out / 'study.md').read_text(encoding='utf-8')}\n{curves(plan)}"
     write_text(plan.out / "study.md", page)
     write_text(plan.out / "study.json", json.dumps(plain(found), indent=1) + "\n")
     sys.stdout.write(page)

@@ -19,6 +19,10 @@ TRAINING_KEYS = {
     "loss.munchausen_floor": _GONE,
     "loss.munchausen_temperature": _GONE,
 }
+STUDY_KEYS = {
+    "space": "it was removed: call `restock train --set` from Optuna instead",
+    "power": "it was removed: compute the number of seeds before the study, and leave it out",
+}
 MIXTURE_KEYS = {"held_out": _now("`evaluation_split`")}
 MIXTURES = {"missions": _now("'coverage'")}
 AUDITS = {  # and their thresholds

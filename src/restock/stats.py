@@ -262,24 +262,6 @@ def which_adjusted(primary: bool) -> str:
     )
 
 
-def paired_t_power(effect: float, sd: float, pairs: int, *, confidence: float = 0.95) -> float:
-    """The probability that `paired_t` finds a true mean difference (the noncentral t).
-
-    Args:
-        sd: of one paired difference.
-    """
-    from scipy.stats import chi2, norm, t
-
-    if pairs < MIN_PAIRS:
-        return 0.0
-    freedom, shift = pairs - 1, effect / (sd / math.sqrt(pairs))
-    limit = float(t.ppf(0.5 + confidence / 2, freedom))
-    # Over what the sample's own spread may be: scipy's noncentral t is NaN in its tails.
-    estimated = np.sqrt(chi2.ppf((np.arange(2000) + 0.5) / 2000, freedom) / freedom)
-    above, below = norm.cdf(shift - limit * estimated), norm.cdf(-shift - limit * estimated)
-    return float(np.mean(above + below))
-
-
 def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F64:
     """How often a bootstrap over whole clusters draws each of them, (R, C)."""
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)

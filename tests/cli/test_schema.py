@@ -24,7 +24,6 @@ SCHEMAS = {name: json.loads(schema_of(name)) for name in CONFIGS}
 # Of a page's blocks of TOML that are whole files: what they are.
 WRITTEN = {
     ("docs/compare.md", "study.toml"): "study",
-    ("docs/compare.md", "search.toml"): "search",
     ("docs/profile.md", "recipe.toml"): "train",
     ("docs/twin.md", "next.toml"): "missions",
 }

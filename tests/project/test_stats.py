@@ -21,7 +21,6 @@ from restock.stats import (
     mean_over_strata,
     paired_improvement,
     paired_t,
-    paired_t_power,
     percentiles,
     wilson,
 )
@@ -237,18 +236,3 @@ def test_holm_keeps_the_order_and_lowers_nothing(p_values: list[float]) -> None:
     assert all(p <= q <= 1 for p, q in zip(p_values, adjusted, strict=True))
     ranked = [adjusted[place] for place in np.argsort(p_values)]
     assert ranked == sorted(ranked)
-
-
-def test_power_is_how_often_the_test_finds_it() -> None:
-    rng = np.random.default_rng(2)
-    found = [paired_t(rng.normal(0.1, 0.1, 8))[1] < 0.05 for _ in range(3000)]
-    assert paired_t_power(0.1, 0.1, 8) == pytest.approx(np.mean(found), abs=0.025)
-    assert paired_t_power(0.0, 0.1, 8) == pytest.approx(
-        0.05, abs=5e-4
-    )  # of nothing: the error of the test
-    assert paired_t_power(0.1, 0.1, 1) == 0.0
-    assert paired_t_power(9.0, 0.1, 2) == 0.0  # of two, `paired_t` says nothing
-    # Pilots' spread of .06 between the seeds of an arm.
-    sd = 0.06 * 2**0.5
-    reported = [paired_t_power(effect, sd, n) for n, effect in ((5, 0.12), (20, 0.05), (30, 0.05))]
-    assert reported == pytest.approx([0.663, 0.706, 0.877], abs=2e-3)

@@ -23,7 +23,6 @@ from restock.train.comparison.diagnose import diagnose
 from restock.train.comparison.run_difference import diff_runs
 from restock.train.feed.logs import Coded, Logs
 from restock.train.run.run import FORMAT, Run
-from restock.train.study.page import as_markdown
 
 EXTRA = ("update_path",)
 
@@ -253,11 +252,6 @@ def test_too_little_gives_values_without_intervals(tmp_path, capsys, seeds, epis
     assert "-1.00" in shown.out
     assert "[-1.00" not in shown.out
     assert why in " ".join(shown.err.split())
-    names = {"arm": "b", "baseline": "a", **found}
-    study = {"doc": "", "runs": {"a": first, "b": second}, "seeds": [0], "comparisons": [names]}
-    page = as_markdown(study)
-    assert "| -1.00 |" in page
-    assert "**" not in page
 
 
 def test_what_the_treatment_allows_to_differ_is_shown_as_that(tmp_path, capsys) -> None:

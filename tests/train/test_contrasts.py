@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.finished_runs import document, make_run
 
-from restock.cli import main
-from restock.errors import ConfigError
 from restock.report import write_study_page
 from restock.train.comparison.compare import compare
 from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 from restock.train.study.contrasts import RunCurve, area, contrast
-from restock.train.study.findings import contrasts, findings, power_of
-from restock.train.study.page import as_markdown
-from restock.train.study.power import PowerConfig, least_effect, seeds_needed, spread
+from restock.train.study.findings import contrasts, findings
 from restock.train.study.study import StudyPlan, load_study
 
 PRIMARY = 'primary = { arm = "quotas", baseline = "uniform", measure = "auc_wheel_slip" }\n'
@@ -129,98 +124,6 @@ def test_a_study_names_its_primary_contrast_and_adjusts_the_others(tmp_path: Pat
     assert contrasts(plan, {("quotas", "uniform")}) == []  # refused
 
 
-def test_the_spread_is_that_of_finished_seeds_or_of_pilots(tmp_path: Path) -> None:
-    plan = study(tmp_path)
-    assert power_of(plan) is None  # nothing tells
-    finish(plan, (0.2, 0.4, 0.4, 0.2))
-    power = power_of(plan)
-    assert power is not None
-    assert power.spread_from == "4 seeds of this study"
-    assert power.sd == pytest.approx(np.std([0.1, 0.2, 0.2, 0.1], ddof=1))
-    assert power.effect is None
-
-
-def test_power_of_pilots() -> None:
-    sd, _ = spread(PowerConfig(0.06, 0.12), at_end=True, kinds=3, episodes=40)
-    assert sd == pytest.approx(0.06 * 2**0.5)
-    more, _ = spread(PowerConfig(0.06, 0.12, episodes=60), at_end=True, kinds=3, episodes=300)
-    assert more < sd  # more episodes than the pilots': less noise
-    same, _ = spread(PowerConfig(0.06, 0.12, episodes=60), at_end=False, kinds=3, episodes=300)
-    assert same == pytest.approx(sd)
-    paired, _ = spread(PowerConfig(0.06, 0.12, 0.5), at_end=True, kinds=3, episodes=40)
-    assert paired == pytest.approx(0.06)
-    assert least_effect(sd, 2) == float("inf")  # two seeds show nothing
-    for seeds in (3, 5, 10, 30):
-        least = least_effect(sd, seeds)
-        assert seeds_needed(least + 1e-9, sd) == seeds
-        assert seeds_needed(least - 1e-6, sd) == seeds + 1
-    assert seeds_needed(1e-9, sd) is None
-
-
-def test_a_study_too_small_for_its_contrast_is_named_before_its_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = STUDY.replace("rare =", "power = { sd = 0.06, effect = 0.05 }\nrare =")
-    study(tmp_path, text)
-    line = ["train", str(tmp_path / "s.toml")]
-    assert main([*line, "--power"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "auc_wheel_slip of quotas against uniform, 4 seeds" in said
-    assert main([*line, "--power", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["power"] < 0.2
-    assert found["too_small"]
-    assert found["seeds_needed"] > 20
-    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert (
-        "the study is too small for its contrast: auc_wheel_slip of quotas against uniform" in said
-    )
-    assert f"{found['seeds_needed']} seeds would be enough" in said
-    (tmp_path / "s.toml").write_text(text.replace("effect = 0.05", "effect = 0.5"))
-    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
-    assert "too small" not in capsys.readouterr().err
-    (tmp_path / "s.toml").write_text(text.replace("[0, 1, 2, 3]", "[0, 1]"))
-    assert main([*line, "--power"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "Below 3 seeds there is no interval, so no difference is found." in said
-    assert main([*line, "--out", str(tmp_path / "out"), "--dry-run"]) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert "with 2 seeds; below 3 seeds there is no interval; " in said
-
-
-def test_a_study_of_two_seeds_is_too_small_whatever_pilots_say(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = ["train", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out"), "--dry-run"]
-    (tmp_path / "s.toml").write_text(STUDY.replace("[0, 1, 2, 3]", "[0, 1]"))
-    assert main(line) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert "the study is too small for its contrast: auc_wheel_slip of quotas" in said
-    assert "has 2 seeds; below 3 seeds there is no interval" in said
-    (tmp_path / "s.toml").write_text(STUDY)
-    assert main(line) == 0
-    assert "too small" not in capsys.readouterr().err
-
-
-def test_an_effect_beyond_the_range_of_a_share_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text(
-        STUDY.replace("rare =", "power = { sd = 0.06, effect = 5 }\nrare =")
-    )
-    with pytest.raises(ConfigError, match=r"power\.effect must be in \(0, 1\]"):
-        load_study(tmp_path / "s.toml")
-
-
-def test_power_needs_a_contrast_and_a_spread(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    study(tmp_path)
-    assert main(["train", str(tmp_path / "s.toml"), "--power"]) == 2
-    assert "does not give the spread" in capsys.readouterr().err
-    assert main(["train", str(tmp_path / "s.toml")]) == 2
-    assert "--out" in capsys.readouterr().err
-
-
 def driven(policy: str, success: float, time_s: float) -> pa.Table:
     rows: list[dict[str, object]] = []
     for condition, block in (("nominal", "none"), ("wheel_slip", "none")):
@@ -253,17 +156,16 @@ def test_the_page_has_contrasts_then_success_and_safety_side_by_side(tmp_path: P
     assert rows["uniform"]["bumps_per_km"][0] == pytest.approx(80.0)  # 16 in 200 m
     assert rows["quotas"]["time_lost_s"][0] == pytest.approx(2.0)
     assert rows["planner"]["success wheel_slip"] == [0.5, None, None]  # one policy: no seeds
-    page = as_markdown(found)
-    places = [
-        page.index(head)
-        for head in ("## Contrasts", "## Success and safety", "## quotas against uniform")
-    ]
-    assert places == sorted(places)
-    assert "Treatment: mixture; what differs: `replay.logs_share`." in page
-    assert "| **primary**: quotas against uniform | success_rare | 0.750 | 0.200 |" in page
-    assert "The primary contrast was named before the runs" in page
     html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
-    assert "The primary contrast was named before the runs" in html
+    page = (tmp_path / "study.md").read_text(encoding="utf-8")
+    heads = ("## Contrasts", "## Success and safety", "## quotas against uniform")
+    places = [page.index(head) for head in heads]
+    assert places == sorted(places)
+    assert "| quotas against uniform (primary) | the rare conditions, success at the end |" in page
+    assert " | 0.750 | 0.200 | 3 |" in page
+    for text in (page, html):
+        assert "Treatment: mixture; what differs: replay.logs_share." in text
+        assert "The primary contrast was named before the runs" in text
 
 
 def two_seeds(tmp_path: Path) -> dict[str, Any]:
@@ -286,13 +188,12 @@ def test_of_two_seeds_there_are_values_alone_and_the_pages_say_why(tmp_path: Pat
     for arm in found["arms"]:
         assert all(value[1:] == [None, None] for value in arm.values() if isinstance(value, list))
     html = write_study_page(found, tmp_path / "study.html").read_text(encoding="utf-8")
-    for page in (as_markdown(found), html):
+    for page in ((tmp_path / "study.md").read_text(encoding="utf-8"), html):
         assert "no interval: 2 seeds, at least 3 are needed" in page
         assert "named before the runs; p" not in page
         assert "None of these contrasts was named as primary before the runs" in page
         assert "&lt; .001" not in page
         assert "< .001" not in page
-    assert "**+0.100" not in as_markdown(found)
 
 
 def test_an_interval_of_an_arm_stays_in_the_range_of_its_measure(tmp_path: Path) -> None:

@@ -167,11 +167,8 @@ def test_arms_that_cannot_be_are_refused(tmp_path: Path, arm: str, said: str) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["processes", "ray"])
-def test_a_study_of_methods_ends_in_one_comparison(tmp_path: Path, capsys, engine: str) -> None:
+def test_a_study_of_methods_ends_in_one_comparison(tmp_path: Path, capsys) -> None:
     pytest.importorskip("stable_baselines3")
-    if engine == "ray":
-        pytest.importorskip("ray")
     settings = "\n".join((*SETTINGS, "record.tensorboard = false"))
     (tmp_path / "s.toml").write_text(f"""
 treatment = "method"
@@ -191,8 +188,7 @@ library = "sb3-ppo"
 arguments = {{ n_steps = 40, batch_size = 20, n_epochs = 2 }}
 """)
     out = tmp_path / "out"
-    argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--engine", engine, "--json"]
-    argv += ["--workers", "2"]
+    argv = ["train", str(tmp_path / "s.toml"), "--out", str(out), "--workers", "2", "--json"]
     assert main(argv) == 0
     found = json.loads(capsys.readouterr().out)
     dqn, ppo = found["comparisons"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.arrays import F64
+from restock.errors import RunError
 from restock.stats import MIN_PAIRS, holm, nothing_varies, paired_t
 from restock.train.evaluation.regression import agent_episodes
 from restock.train.run.run import Run
@@ -77,11 +79,28 @@ class RunCurve:
     """A finished run's success by cell: on the way, and of the policy that it kept."""
 
     def __init__(self, path: Path, rare: Sequence[str] = RARE) -> None:
-        run = Run.open(path)
+        self._run = Run.open(path)
         self._rare = rare
-        self._at = _by_step(run.table("evaluations"))
-        self.end = _success(agent_episodes(run))
+        self._at = _by_step(self._run.table("evaluations"))
         self.steps = np.array(sorted(self._at))
+
+    @cached_property
+    def end(self) -> dict[tuple[str, str], float]:
+        """Success of the kept policy by condition and block."""
+        return _success(agent_episodes(self._run))
+
+    @property
+    def conditions(self) -> list[tuple[str, int, float]]:
+        """Condition, environment steps and success of each evaluation on the way.
+
+        Partly and wholly blocked aisles count by half each, however many of each were drawn.
+        """
+        found = []
+        for step, cells in self._at.items():
+            for condition in sorted({condition for condition, _ in cells}):
+                blocks = [success for (name, _), success in cells.items() if name == condition]
+                found.append((condition, step, _mean(blocks)))
+        return found
 
     def value(self, measure: str, reach: tuple[float, float] | None = None) -> float:
         """The run's value of a measure, over a range of environment steps; NaN: not known."""
@@ -180,6 +199,62 @@ def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
     return found
 
 
+def learning_curves(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
+    """Return a row per arm, condition and periodic evaluation: the mean success over its runs.
+
+    The 95 % interval is Student's t over runs; its ends are None if `paired_t` has none. Runs that
+    cannot be read are left out.
+    """
+    rows = []
+    for arm, paths in arms.items():
+        values: dict[tuple[str, int], list[float]] = {}
+        for path in paths:
+            for condition, step, success in _curve_of(path):
+                values.setdefault((condition, step), []).append(success)
+        for (condition, step), found in sorted(values.items()):
+            interval = paired_t(np.array(found))[0].within(0.0, 1.0)
+            rows.append(
+                {
+                    "arm": arm,
+                    "condition": condition,
+                    "env_steps": step,
+                    "runs": len(found),
+                    "success": interval.value,
+                    "low": _known(interval.low),
+                    "high": _known(interval.high),
+                }
+            )
+    return rows
+
+
+def _curve_of(path: Path) -> list[tuple[str, int, float]]:
+    try:
+        return RunCurve(path).conditions
+    except RunError:
+        return []
+
+
+def training_cost(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
+    """Return per arm the mean environment steps, updates and seconds of a run."""
+    rows = []
+    for arm, paths in arms.items():
+        last = [row for path in paths if (row := _last_progress(path)) is not None]
+        row: dict[str, Any] = {"arm": arm, "runs": len(last)}
+        for name in ("env_steps", "gradient_steps", "wall_s"):
+            values = [one[name] for one in last]
+            row[name] = float(np.mean(values)) if values and None not in values else None
+        rows.append(row)
+    return rows
+
+
+def _last_progress(path: Path) -> dict[str, Any] | None:
+    try:
+        rows = Run.open(path).table("progress").to_pylist()
+    except RunError:
+        return None
+    return rows[-1] if rows else None
+
+
 def _by_step(table: pa.Table) -> dict[int, dict[tuple[str, str], float]]:
     """Success by cell at each evaluation; of two at one step, the later one."""
     by_step: dict[int, tuple[int, list[dict[str, Any]]]] = {}
@@ -225,6 +300,8 @@ __all__ = [
     "RunCurve",
     "area",
     "contrast",
+    "learning_curves",
+    "training_cost",
     "unknown_measure",
     "with_holm",
 ]

@@ -1,4 +1,4 @@
-"""What a study found: its comparisons, its contrasts, what each arm came to, and its power."""
+"""Collect what a study found: its comparisons, its contrasts and what each arm came to."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 
 from restock.errors import RunError
-from restock.stats import MIN_PAIRS, paired_t, paired_t_power
+from restock.stats import paired_t
 from restock.train.comparison.compare import Comparison
-from restock.train.comparison.curves import learning_curves, training_cost
 from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
 from restock.train.run.measures import cell_name
-from restock.train.study import power as study_power
-from restock.train.study.contrasts import Contrast, RunCurve, contrast, with_holm
-from restock.train.study.power import Power
+from restock.train.study.contrasts import (
+    Contrast,
+    RunCurve,
+    contrast,
+    learning_curves,
+    training_cost,
+    with_holm,
+)
 from restock.train.study.study import DONE, ArmConfig, Pair, StudyPlan
-from restock.words import counted
 
-# Columns of the table of arms, besides success by cell.
-SAFETY = ("bumps_per_km", "closest_person_m", "time_lost_s", "discounted_return")
 NOT_NEGATIVE = ("bumps_per_km", "closest_person_m")
 MAX_NAMED = 4  # checks that refuse a comparison
 
@@ -37,13 +38,11 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
         for pair, comparison in zip(plan.study.pairs, comparisons, strict=True)
     ]
     refused = {(one["arm"], one["baseline"]) for one in compared if one["verdict"] != "comparable"}
-    power = power_of(plan)
     return {
         "doc": plan.study.doc,
         "seeds": list(plan.study.seeds),
         "rare": list(plan.study.rare),
         "runs": {arm.name: [str(path) for path in plan.runs(arm)] for arm in plan.study.arms},
-        "power": None if power is None else power.as_json(),
         "contrasts": [one.as_json() for one in contrasts(plan, refused)],
         "arms": arms(plan),
         "curves": learning_curves(_finished(plan)),
@@ -117,57 +116,6 @@ def contrasts(plan: StudyPlan, refused: set[tuple[str, str]]) -> list[Contrast]:
         if (arm.name, baseline.name) not in refused
     ]
     return with_holm([one for one in found if one is not None])
-
-
-def power_of(plan: StudyPlan) -> Power | None:
-    """Of the primary contrast, from finished runs of its arms or from the study's pilots; None
-    where the study names no primary contrast, or nothing tells the spread."""
-    study = plan.study
-    if study.primary is None:
-        return None
-    arm, baseline, measure = study.primary.named
-    pair = next(p for p in study.pairs if (p.arm.name, p.baseline.name) == (arm, baseline))
-    pairs = _Curves(plan).pairs(pair.arm, pair.baseline)
-    made = contrast(arm, baseline, measure, pairs)
-    if made is not None and made.sd and made.pairs >= MIN_PAIRS:
-        sd, source = made.sd, f"{made.pairs} seeds of this study"
-    elif study.power is not None:
-        kinds = len(study.rare) if measure.endswith("_rare") else 1
-        sd, source = study_power.spread(
-            study.power,
-            at_end=measure.startswith("success_"),
-            kinds=kinds,
-            episodes=min(study.evaluation.of_kind.values()),
-        )
-    else:
-        return None
-    effect, seeds = study.power.effect if study.power is not None else None, len(study.seeds)
-    return Power(
-        arm,
-        baseline,
-        measure,
-        seeds,
-        sd,
-        source,
-        effect,
-        None if effect is None else paired_t_power(effect, sd, seeds),
-        study_power.least_effect(sd, seeds),
-        None if effect is None else study_power.seeds_needed(effect, sd),
-    )
-
-
-def too_small(plan: StudyPlan, power: Power | None) -> str | None:
-    """That a study is too small for its primary contrast, by name; `power` is its `power_of`."""
-    if power is not None:
-        return study_power.warning(power) if power.too_small else None
-    first, seeds = plan.study.primary, len(plan.study.seeds)
-    if first is None or seeds >= MIN_PAIRS:
-        return None
-    return (
-        f"the study is too small for its contrast: {first.measure} of {first.arm} against"
-        f" {first.baseline} has {counted(seeds, 'seed')}; below {MIN_PAIRS} seeds there is no"
-        " interval, so no difference is found"
-    )
 
 
 def arms(plan: StudyPlan) -> list[dict[str, Any]]:
@@ -275,4 +223,4 @@ def _mean(values: Sequence[float | None]) -> float:
     return float(np.mean(known)) if known else float("nan")
 
 
-__all__ = ["SAFETY", "arms", "contrasts", "findings", "power_of", "too_small"]
+__all__ = ["arms", "contrasts", "findings"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ import msgspec
 
 from restock.errors import ConfigError, RunError
 from restock.files import read_json
+from restock.renamed import STUDY_KEYS
 from restock.toml import Checked, read_toml, typed
 from restock.train.comparison.arms import Treatment
 from restock.train.dqn.config import (
@@ -25,7 +26,6 @@ from restock.train.dqn.config import (
 from restock.train.evaluation.references import wrong_seed
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
-from restock.train.study.power import PowerConfig
 from restock.train.twin.missions.registry import KINDS
 
 
@@ -97,14 +97,6 @@ class Primary(Checked, frozen=True):
         return self.arm, self.baseline, self.measure
 
 
-def check_seeds(seeds: Sequence[int]) -> None:
-    """Raises ValueError where there are none, one is repeated, or is out of range."""
-    if not seeds or len(set(seeds)) != len(seeds):
-        raise ValueError(f"seeds must be at least one, without repetition; got {list(seeds)}")
-    for wrong in filter(None, map(wrong_seed, seeds)):
-        raise ValueError(f"seeds {wrong}")
-
-
 @dataclass(frozen=True)
 class Pair:
     """One comparison of a study."""
@@ -126,7 +118,6 @@ class Study(Checked, frozen=True):
     settings: dict[str, Any] = msgspec.field(default_factory=dict)  # settings of all arms
     evaluation: StudyEvaluation = StudyEvaluation()
     primary: Primary | None = None
-    power: PowerConfig | None = None  # what pilots found, for the primary contrast
     # Of the other contrasts, whose p values are adjusted for their number.
     measures: tuple[str, ...] = ("auc_rare", "success_rare", "success_nominal")
     rare: tuple[str, ...] = RARE  # conditions whose mean is `rare`
@@ -146,7 +137,7 @@ class Study(Checked, frozen=True):
                 f"arm {self.base.name!r} is the study's baseline: it cannot have a treatment or a "
                 "baseline"
             )
-        check_seeds(self.seeds)
+        self._check_seeds()
         if self.store is None and any(arm.mixture for arm in self.arms):
             raise ValueError("an arm gives a mixture, but the study has no store")
         if any(
@@ -154,6 +145,14 @@ class Study(Checked, frozen=True):
         ):
             raise ValueError("the study sets the seeds: `settings` must not set seed")
         self._check_contrasts(names)
+
+    def _check_seeds(self) -> None:
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(
+                f"seeds must be at least one, without repetition; got {list(self.seeds)}"
+            )
+        for wrong in filter(None, map(wrong_seed, self.seeds)):
+            raise ValueError(f"seeds {wrong}")
 
     def _check_contrasts(self, names: list[str]) -> None:
         measures = (*self.measures, *((self.primary.measure,) if self.primary else ()))
@@ -173,8 +172,6 @@ class Study(Checked, frozen=True):
                     f"primary: {self.primary.arm!r} is not compared with "
                     f"{self.primary.baseline!r}: set that as the arm's `baseline`"
                 )
-        if self.power is not None and self.primary is None:
-            raise ValueError("power needs a primary contrast: set `primary`")
 
     @property
     def base(self) -> ArmConfig:
@@ -205,14 +202,13 @@ def load_study(path: Path | str) -> Study:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
     """
     remedy = "docs/compare.md lists every key with its meaning"
-    study = typed(read_toml(Path(path)), Study, where=str(path), remedy=remedy)
-    refuse_unknown_names(study.evaluation, str(path))
+    document = read_toml(Path(path))
+    study = typed(document, Study, where=str(path), remedy=remedy, renamed=STUDY_KEYS)
+    _refuse_unknown_names(study.evaluation, str(path))
     for arm in study.arms:
         sets = [*as_overrides(study.settings), *as_overrides(arm.settings)]
         config = parse_config(apply_overrides({}, sets), where=str(path))
-        refuse_judging_by_the_choice(
-            f"arm {arm.name!r}", config.evaluation, study.evaluation, str(path)
-        )
+        _refuse_shared_episodes(arm, config.evaluation, study.evaluation, str(path))
         _refuse_without_updates(arm, config.schedule, str(path))
         refuse_untaught(config.teacher, within=f"{path}: arm {arm.name!r}: ")
     return study
@@ -234,7 +230,7 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
     )
 
 
-def refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
+def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
     """Raises ConfigError where a run could not be evaluated, which would be found once trained."""
     from restock.train.evaluation.evaluation_plan import refuse_unknown
 
@@ -244,15 +240,15 @@ def refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
         refuse_unknown("policies", names, where=f"{where}: evaluation.references")
 
 
-def refuse_judging_by_the_choice(
-    what: str, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
+def _refuse_shared_episodes(
+    arm: ArmConfig, chosen: EvaluationConfig, evaluation: StudyEvaluation, where: str
 ) -> None:
-    """The policy that a run keeps is the best on its own fixed episodes: others must judge it."""
+    """Refuse to judge the kept policy on the episodes that chose it."""
     judged = evaluation.seed, evaluation.seed + max(evaluation.of_kind.values())
     if chosen.seed < judged[1] and judged[0] < chosen.seed + chosen.episodes:
         raise ConfigError(
-            f"{what} would be evaluated on seeds {judged[0]} to {judged[1] - 1}, which include "
-            f"those that choose its policy (from {chosen.seed})",
+            f"arm {arm.name!r} would be evaluated on seeds {judged[0]} to {judged[1] - 1}, which "
+            f"include those that choose its policy (from {chosen.seed})",
             where=where,
             remedy="set evaluation.seed of the study to another range than the evaluation.seed of "
             "the settings",
@@ -338,10 +334,6 @@ def check_jobs(plan: StudyPlan) -> None:
             continue
         made = read_json(job.done, error=RunError, remedy=f"remove {job.path}")
         requested = json.loads(plan.fingerprint(job))
-        if made.get("panel") and requested["panel"]:  # an earlier Restock wrote the whole path
-            parts = Path(requested["panel"]).parts
-            if Path(made["panel"]).parts[-len(parts) :] == parts:
-                made["panel"] = requested["panel"]
         if made != requested:
             raise RunError(
                 "was made otherwise than the study now asks: then "
@@ -371,6 +363,5 @@ __all__ = [
     "StudyJob",
     "StudyPlan",
     "check_jobs",
-    "check_seeds",
     "load_study",
 ]

@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from threading import Event
-from typing import Literal
 
 import msgspec
 
@@ -35,24 +34,19 @@ from restock.train.study.study import (
 )
 
 Say = Callable[[str], None]
-Engine = Literal["processes", "ray"]
 
 
 def run_study(
-    plan: StudyPlan,
-    *,
-    workers: int = 1,
-    engine: Engine = "processes",
-    say: Say = lambda line: None,
+    plan: StudyPlan, *, workers: int = 1, say: Say = lambda line: None
 ) -> list[Comparison | RunError]:
     """Do what is not done yet, then compare every arm with its baseline, in the order of the arms.
 
-    `engine` "ray" gives each run to a Ray cluster. A comparison that cannot be made is its error:
+    A comparison that cannot be made is its error:
     the others of a study that has run count all the same.
 
     Raises:
         RunError: a run failed (its log says why), or was made by another version of the study.
-        ConfigError: a library that an arm trains with, or Ray, is not installed.
+        ConfigError: a library that an arm trains with is not installed.
     """
     for arm in plan.study.arms:
         if arm.library is not None:
@@ -63,10 +57,7 @@ def run_study(
         _build(plan, arm, say)
     todo = [job for job in plan.jobs if not job.done.exists()]
     say(f"{len(plan.jobs) - len(todo)} of {len(plan.jobs)} runs already exist")
-    if engine == "ray":
-        _run_on_ray(plan, todo, workers, say)
-    else:
-        _run_here(plan, todo, workers, say)
+    _run_all(plan, todo, workers, say)
     _drive_references(plan, say)
     return [_compare(plan, pair) for pair in plan.study.pairs]
 
@@ -78,7 +69,7 @@ def _compare(plan: StudyPlan, pair: Pair) -> Comparison | RunError:
         return error
 
 
-def _run_here(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
+def _run_all(plan: StudyPlan, todo: Sequence[StudyJob], workers: int, say: Say) -> None:
     """Train and evaluate; after a failure nothing more is begun, and what runs is waited for."""
     failed = Event()
 
@@ -120,90 +111,43 @@ def _wait(pool: ThreadPoolExecutor) -> None:
         raise
 
 
-def _run_on_ray(plan: StudyPlan, jobs: Sequence[StudyJob], workers: int, say: Say) -> None:
-    """Train and evaluate every run; the first failure is raised when all others have ended."""
-    from restock.ingest.on_ray import cluster
-
-    with cluster(workers) as ray:
-        task = ray.remote(_ray_task).options(num_cpus=1, max_retries=0)
-        running = {task.remote(plan, job, str(Path.cwd())): job for job in jobs}
-        failed: RestockError | None = None
-        while running:
-            (ended, *_), _ = ray.wait(list(running), num_returns=1)
-            job = running.pop(ended)
-            try:
-                error = ray.get(ended)
-            except ray.exceptions.RayError as died:
-                error = RunError(
-                    f"the process that made it died ({type(died).__name__})",
-                    where=str(job.path),
-                    remedy="run the study again: finished runs are kept",
-                )
-            if error is None:
-                say(f"{job.path.name}: trained and evaluated")
-            else:
-                failed = failed or error
-        if failed is not None:
-            raise failed
-
-
-def _ray_task(plan: StudyPlan, job: StudyJob, folder: str) -> RestockError | None:
-    """One run, on whatever machine."""
-    try:
-        os.chdir(folder)
-    except OSError:
-        return RunError(
-            f"the worker machine has no folder {folder}",
-            where=str(job.path),
-            remedy="put the study in a folder that all machines of the cluster can read",
-        )
-    try:
-        run_job(plan, job, lambda line: None)
-    except RestockError as error:
-        return error
-    return None
-
-
 def _build(plan: StudyPlan, arm: ArmConfig, say: Say) -> None:
-    """An arm's panel, if it is a mixture that has not been packed yet."""
+    """Pack an arm's panel, if it is a mixture that has not been packed yet."""
     out = plan.panel(arm)
-    if out is not None and arm.mixture is not None and plan.study.store is not None:
-        log = plan.out / "logs" / "mix.log"
-        pack(
-            plan.study.store,
-            arm.mixture,
-            plan.folder,
-            out,
-            log,
-            lambda n: say(f"{n} for {arm.name}"),
-        )
-
-
-def pack(store: str, mixture: str, folder: Path, out: Path, log: Path, say: Say) -> None:
-    """A panel of a mixture, unless it is there; paths are relative to `folder`."""
-    if out.exists():
+    if out is None or out.exists() or arm.mixture is None or plan.study.store is None:
         return
-    store, name = packed_from(store, mixture, folder)
-    say(f"packing {name}")
+    store, mixture = _packed_from(plan, arm.mixture)
+    say(f"packing {mixture} for {arm.name}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    restock_verb(["mix", store, "--mixture", name, "--out", str(out)], log)
+    words = ["mix", store, "--mixture", mixture, "--out", str(out)]
+    restock_verb(words, plan.out / "logs" / "mix.log")
 
 
-def packed_from(store: str, mixture: str, folder: Path) -> tuple[str, str]:
-    """A store and a mixture as `restock mix` takes them: as the study names them, from `folder`."""
+def _packed_from(plan: StudyPlan, mixture: str) -> tuple[str, str]:
+    """Return the store and a mixture as `restock mix` takes them; paths start at the study."""
+    store = str(plan.study.store)
     if "://" not in store:
-        store = str(folder / store)
-    return store, str(folder / mixture) if (folder / mixture).is_file() else mixture
+        store = str(plan.folder / store)
+    file = plan.folder / mixture
+    return store, str(file) if file.is_file() else mixture
 
 
-def check_mixtures(store: str | None, mixtures: Sequence[str], folder: Path) -> None:
-    """Plan every mixture, as `restock mix --dry-run` does.
+def check_mixtures(plan: StudyPlan) -> None:
+    """Plan every mixture that is still to pack, as `restock mix --dry-run` does.
 
     Raises:
         RestockError: there is no such store or mixture, or a mixture does not fit the store.
     """
-    for mixture in dict.fromkeys(mixtures if store is not None else ()):
-        plan_only(*packed_from(str(store), mixture, folder))
+    to_pack = [
+        job.arm.mixture
+        for job in plan.jobs
+        if job.arm.mixture is not None
+        and not job.done.exists()
+        and (panel := plan.panel(job.arm)) is not None
+        and not panel.exists()
+    ]
+    for mixture in dict.fromkeys(to_pack):
+        plan_only(*_packed_from(plan, mixture))
 
 
 def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
@@ -219,14 +163,14 @@ def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
     restock_verb(
         [
             *("eval", str(job.path), "--policies", "agent", "--perturbations", perturbations),
-            *episodes_flags(evaluation),
+            *_episodes_flags(evaluation),
         ],
         log,
     )
     write_text(job.done, plan.fingerprint(job))
 
 
-def episodes_flags(evaluation: StudyEvaluation) -> list[str]:
+def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
     """What `restock eval` is told to drive."""
     given = evaluation.episodes
     if isinstance(given, dict):
@@ -247,7 +191,7 @@ def _drive_references(plan: StudyPlan, say: Say) -> None:
     say(f"driving {', '.join(evaluation.references)}")
     policies = ",".join(evaluation.references)
     arguments = ["eval", str(path), "--policies", policies, "--perturbations", "none"]
-    restock_verb([*arguments, *episodes_flags(evaluation)], plan.out / "logs" / "references.log")
+    restock_verb([*arguments, *_episodes_flags(evaluation)], plan.out / "logs" / "references.log")
     write_text(done, requested)
 
 
@@ -315,4 +259,4 @@ def _command(module: str, arguments: Sequence[str], log: Path) -> None:
         )
 
 
-__all__ = ["Engine", "Say", "check_mixtures", "run_job", "run_study", "train_words"]
+__all__ = ["Say", "check_mixtures", "run_job", "run_study", "train_words"]

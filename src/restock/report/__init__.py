@@ -15,6 +15,7 @@ from restock.replay.fleet.drift import Drift
 from restock.replay.store.store import Store
 from restock.report.fleet.coverage import coverage_facts, coverage_page
 from restock.report.fleet.drift import drift_page
+from restock.report.look.write import as_markdown as markdown
 from restock.report.look.write import write_page
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import gather
@@ -77,8 +78,13 @@ def write_coverage_page(
 def write_study_page(
     study: dict[str, Any], out: Path | str, name: str = "", figures: Path | str | None = None
 ) -> Path:
-    """Write the page of a study from its findings (`study.json`); returns its path."""
-    return write_page(study_page(study, name), out, figures)
+    """Write the page of a study from its findings (`study.json`); returns its path.
+
+    The same words and tables are written beside it as Markdown.
+    """
+    content = study_page(study, name)
+    write_text(Path(out).with_suffix(".md"), markdown(content))
+    return write_page(content, out, figures)
 
 
 def write_comparison_page(

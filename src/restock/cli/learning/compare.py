@@ -82,7 +82,7 @@ def _write(
     """The page, with what the comparison itself does not need: curves and cost."""
     from restock.cli.output import plain
     from restock.report import write_comparison_page
-    from restock.train.comparison.curves import learning_curves, training_cost
+    from restock.train.study.contrasts import learning_curves, training_cost
 
     names = _names(first, second)
     arms = dict(zip(names, (first, second), strict=True))

@@ -17,7 +17,6 @@ CONFIGS: Mapping[str, str] = {
     "mixture": "`restock mix --mixture`",
     "profile": "`restock ingest --profile`: a robot's topics and task",
     "study": "`restock train`: arms to compare",
-    "search": "`restock train`: a search over a [space]",
     "layout": "`--layouts`: a floor",
     "perturbation": "`restock twin record --perturbation`: effective parameters",
     "schedule": "the same: effective parameters, drawn per episode from `ranges`",
@@ -80,7 +79,6 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
     from restock.replay.fleet.missions_file import MissionsFile
     from restock.replay.mixture.mixture import Mixture
     from restock.train.dqn.config import TrainConfig
-    from restock.train.study.space import Search
     from restock.train.study.study import Study
     from restock.train.twin.floors.floor_file import FloorFile
     from restock.train.twin.physics.perturbation import Perturbation, Schedule
@@ -93,7 +91,6 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
         "mixture": (Mixture, as_it_is),
         "profile": (Profile, _conditions_in_files),
         "study": (Study, as_it_is),
-        "search": (Search, as_it_is),
         "layout": (FloorFile, as_it_is),
         "perturbation": (Perturbation, as_it_is),
         "schedule": (Schedule, as_it_is),

@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from restock.files import write_bytes, write_text
 from restock.report.look import live
-from restock.report.look.blocks import Figure, Section
+from restock.report.look.blocks import Figure, Section, Table
 from restock.report.look.charts import CONFIG
 from restock.report.look.theme import dark_rules
 
@@ -47,6 +47,28 @@ def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | N
     if figures is not None:
         write_figures(content["sections"], Path(figures))
     return out
+
+
+def as_markdown(content: dict[str, Any]) -> str:
+    """Return a page's words and tables as Markdown, without its figures."""
+    lines = [f"# {content['title']}", "", f"{content['headline']}.", "", content["lead"]]
+    for section in content["sections"]:
+        lines += ["", f"## {section.title}"]
+        for text in filter(None, (section.intro, section.callout)):
+            lines += ["", text]
+        for table in section.tables:
+            lines += _table_lines(table)
+    return "\n".join(lines) + "\n"
+
+
+def _table_lines(table: Table) -> list[str]:
+    if not table.rows:
+        return []
+    rows = [table.columns, *([row[name] for name in table.columns] for row in table.rows)]
+    head, *body = [" | ".join(str(cell).replace("|", "\\|") for cell in row) for row in rows]
+    lines = ["", f"**{table.title}**"] if table.title else []
+    lines += ["", f"| {head} |", f"| {' | '.join('---' for _ in table.columns)} |"]
+    return lines + [f"| {row} |" for row in body]
 
 
 def write_figures(sections: Sequence[Section], folder: Path) -> list[Path]:
@@ -89,4 +111,4 @@ def _code(text: str) -> Markup:
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
-__all__ = ["write_figures", "write_page"]
+__all__ = ["as_markdown", "write_figures", "write_page"]

@@ -12,6 +12,9 @@ from restock.stats import MIN_PAIRS, interval_text
 from restock.words import counted, verdict_said
 
 MAX_NAMED = 3
+MAX_SETTINGS = 4  # that differ, to be named in a line
+FREE_KINDS = ("free", "software")
+HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
 _INTERVALS = (
     "Intervals are 95 %, over seeds and episodes; with fewer than three seeds or ten episodes, "
@@ -111,13 +114,14 @@ def outcome_sections(
     found: dict[str, Any], first: str, second: str, prefix: str = ""
 ) -> list[Section | None]:
     """The outcomes, or why there are none."""
-    title = f"{second} against {first}"
+    title, treatment = f"{second} against {first}", _treatment(found)
     if found["verdict"] != "comparable":
         text = f"{verdict(found)['text'].capitalize()}: {why_refused(found)}."
-        return [Section(f"{prefix}outcomes", title, callout=text)]
+        return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
     rows = found["outcomes"]
     if not rows:
-        return [Section(f"{prefix}outcomes", title, callout="No condition was driven by both.")]
+        text = "No condition was driven by both."
+        return [Section(f"{prefix}outcomes", title, intro=treatment, callout=text)]
     reasons = list(dict.fromkeys(row["no_interval"] for row in rows if row["no_interval"]))
     table = [
         {
@@ -162,13 +166,37 @@ def outcome_sections(
         Section(
             f"{prefix}outcomes",
             title,
-            intro=f"On the same episodes, from {found['outcomes_from']}. {_INTERVALS}"
-            + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
+            intro=f"{treatment} Both drove the same episodes, from {found['outcomes_from']}."
+            f" {_INTERVALS}" + (f" No interval: {'; '.join(reasons)}." if reasons else ""),
             figures=figures,
             two=True,
             tables=[Table(table, numbers)],
         )
     ]
+
+
+def _treatment(found: dict[str, Any]) -> str:
+    """Say what was to differ, and what a comparison of methods holds fixed."""
+    names: dict[str, list[str]] = {}  # by kind
+    for row in found["differences"]:
+        name = row["setting"].removeprefix("config.")
+        if name.startswith("library.arguments."):
+            name = "library.arguments"
+        kind = names.setdefault(row["kind"], [])
+        if name not in kind:
+            kind.append(name)
+    if found["treatment"] != "method":
+        named = [one for kind, of in names.items() if kind not in FREE_KINDS for one in of]
+        few = f"; what differs: {', '.join(named)}" if 0 < len(named) <= MAX_SETTINGS else ""
+        return f"Treatment: {found['treatment']}{few}."
+    varied = [
+        f"{words} ({', '.join(names[kind])})" for kind, words in HELD.items() if kind in names
+    ]
+    fixed = ["environment steps", *(HELD[kind] for kind in ("feed", "target") if kind not in names)]
+    return (
+        "Treatment: method. Held fixed: the environment and its conditions,"
+        f" {', '.join(fixed)} and the evaluation. Not held: {'; '.join(varied) or 'nothing'}."
+    )
 
 
 def _share(value: float | None) -> str:
