@@ -85,7 +85,7 @@ MAY_IMPORT = {
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn evaluation libraries run replay/panel ingest twin/missions",
+    "train/study": "comparison dqn evaluation libraries run replay/panel twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "",
