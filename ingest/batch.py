@@ -6,30 +6,37 @@ them, several at once, so that a fleet's recordings are not two commits each. Pr
 from a server that has imported what they need once: forking this process, with its threads, would
 not be safe. It imports that while this process does, so nothing here is imported before it is
 needed.
+
+On a Ray cluster (of RAY_ADDRESS, or one started on this machine) every machine must have Restock
+installed, and see recordings and store by the same paths: a shared file system, or a store on S3.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import signal
+import socket
 import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union
 
-from restock.errors import TRACEBACK, RecordingError, RestockError, print_traceback
+from restock.errors import TRACEBACK, ConfigError, RecordingError, RestockError, print_traceback
+from restock.imports import import_extra
 
 if TYPE_CHECKING:
-    from restock.ingest.containers.storage import Watch
+    from restock.errors import RestockError
+    from restock.ingest.containers.formats.storage import Watch
     from restock.ingest.prepared import CommitGroup, IngestResult, OnRepeat, Prepared
     from restock.ingest.profile.profile import Profile
 
@@ -116,8 +123,6 @@ def ingest_all(
     group = CommitGroup(StoreWriter(job.store) if job.store is not None else None)
     some = min(workers, len(taken))
     if engine == "ray":
-        from restock.ingest.on_ray import prepare_on_ray
-
         read = prepare_on_ray(job, taken, workers=workers, patience_s=group.due_in_s)
     elif some <= 1:
         read = _one_by_one(job, taken, group, watch)
@@ -249,7 +254,7 @@ def warm_up() -> None:
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
     """A worker: one recording after the other, until there are no more, or the parent is gone."""
-    from restock.ingest.containers.mcap_group import ChunkReader
+    from restock.ingest.containers.formats.mcap_file import ChunkReader
 
     ChunkReader.ahead = False  # the other workers have the other cores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
@@ -287,3 +292,113 @@ def _size(path: Path) -> int:
     """Bytes of a recording, a folder's files together; 0 where it is gone."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())
+
+
+CONNECT_S = 5
+ENVIRONMENT = "AWS_"  # what the tasks are given of this process's environment
+
+
+def prepare_on_ray(
+    job: IngestJob,
+    paths: Sequence[Path],
+    *,
+    workers: int = 1,
+    patience_s: Callable[[], float | None] = lambda: None,
+) -> Generator[tuple[int, Prepared | RestockError] | None]:
+    """What was made of each recording, with its place in `paths`, as it comes; None where nothing
+    came for `patience_s()` seconds. Nothing of it is committed.
+
+    Raises:
+        ConfigError: Ray is not installed, or the cluster does not answer.
+    """
+    with cluster(workers) as ray:
+        # A task that died may have written files: it is not tried again unasked.
+        task = ray.remote(_task).options(num_cpus=1, max_retries=0)
+        aws = {name: value for name, value in os.environ.items() if name.startswith(ENVIRONMENT)}
+        begun = {
+            task.remote(job, path, str(Path.cwd()), aws): place for place, path in enumerate(paths)
+        }
+        while begun:
+            ready, _ = ray.wait(list(begun), timeout=patience_s())
+            if not ready:
+                yield None
+            for result in ready:
+                place = begun.pop(result)
+                yield place, _answer(ray, result, paths[place])
+
+
+def _answer(ray: Any, result: Any, path: Path) -> Prepared | RestockError:
+    try:
+        answer: Prepared | RestockError = ray.get(result)
+    except ray.exceptions.OutOfMemoryError:
+        return out_of_memory(path)
+    except ray.exceptions.RayError as error:
+        return RecordingError(
+            f"the process that read it died ({type(error).__name__})",
+            where=str(path),
+            remedy=AGAIN,
+        )
+    return answer
+
+
+@contextmanager
+def cluster(workers: int) -> Iterator[Any]:
+    """Ray, with a cluster to give tasks to."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of it
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage reports
+    ray = import_extra("ray", "ray", "--engine ray needs Ray")
+    if ray.is_initialized():  # by the caller
+        yield ray
+        return
+    address = os.environ.get("RAY_ADDRESS")
+    _expect(address)
+    quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
+    try:
+        if address:
+            ray.init(address=address, **quiet)
+        else:
+            ray.init(address="local", num_cpus=max(workers, 1), include_dashboard=False, **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address}: {str(error).splitlines()[0]}"
+            if address
+            else f"Ray does not start: {str(error).splitlines()[0]}",
+            remedy="check RAY_ADDRESS, or unset it to start one here" if address else None,
+        ) from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _expect(address: str | None) -> None:
+    """Knock at a cluster's door: Ray itself would wait for minutes."""
+    match = re.fullmatch(r"(?:ray://)?([^:/]+):(\d+)", address or "")
+    if match is None:  # none, or a word like "auto"
+        return
+    try:
+        socket.create_connection((match[1], int(match[2])), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address}: {error}",
+            remedy="check RAY_ADDRESS, or unset it to start one here",
+        ) from error
+
+
+def _task(
+    job: IngestJob, path: Path, folder: str, environment: dict[str, str]
+) -> Prepared | RestockError:
+    """One recording, on whatever machine."""
+    from restock.ingest.containers.formats.mcap_file import ChunkReader
+
+    ChunkReader.ahead = False  # the task was given one core
+    os.environ.update(environment)
+    try:
+        os.chdir(folder)
+    except OSError:
+        return RecordingError(
+            f"the worker machine has no folder {folder}",
+            where=str(path),
+            remedy="put the recordings in a folder that all machines of the cluster can read",
+        )
+    return job.prepare(path)

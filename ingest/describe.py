@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from restock.ingest.containers.formats.storage import Watch
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.storage import Watch
 from restock.ingest.containers.topic_reading import LATEST_NS
 from restock.ingest.steps.clocks import STAMP, topic_clock
 

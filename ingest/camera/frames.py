@@ -1,17 +1,120 @@
-"""The frames of one camera in a recording: which are kept, and what became of the others."""
+"""The frames of a recording's cameras: which are kept, and what became of the others.
+
+A recording's images do not fit into memory. As its topics are read, each frame becomes its layout
+and the hash of its bytes; those that steps need are read again when they are written as rows.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from restock.arrays import Bools, Ints
-from restock.ingest.camera.frame_columns import PROBLEM
-from restock.ingest.decoding.columns import TopicColumns
+from restock.ingest.camera.images import (
+    COMPRESSED,
+    ImageLayout,
+    ImageProblem,
+    compressed_layout,
+    raw_layout,
+)
+from restock.ingest.containers.recording import Recording
+from restock.ingest.containers.topic_reading import Fields, Reduction
+from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
+from restock.ingest.decoding.field_paths import DTYPES, Leaf
 from restock.ingest.profile.camera import Camera
+from restock.ingest.task.schema import frame_schema, transition_ids
+
+# Names of fields hold no space.
+ENCODING, PROBLEM, SHA256 = "frame encoding", "frame problem", "frame sha256"
+SIZE, WIDTH, HEIGHT = "frame size_bytes", "frame width", "frame height"
+CHANNELS, BITS, ROW_BYTES = "frame channels", "frame bits", "frame row_bytes"
+BIG_ENDIAN = "frame big_endian"
+_NUMBERS = (SIZE, WIDTH, HEIGHT, CHANNELS, BITS, ROW_BYTES, BIG_ENDIAN)
+_COMPRESSED_FIELDS = ("format", "data")
+_RAW_FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
+
+
+def image_fields(kind: str) -> tuple[str, ...]:
+    """The field paths of a message of one of the two types."""
+    return _COMPRESSED_FIELDS if kind == COMPRESSED else _RAW_FIELDS
+
+
+def other_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
+    """The first field that a message of this type does not have as ROS defines it, by the
+    definition that its file brings; None where it has all."""
+    found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
+    fields = image_fields(kind)
+    return next((name for name in fields if not _is_field(name, found.get(name))), None)
+
+
+def _is_field(name: str, leaf: Leaf | None) -> bool:
+    if leaf is None:
+        return False
+    if name in ("format", "encoding"):
+        return leaf.kind == "string" and not leaf.dims
+    number = DTYPES.get(leaf.kind)
+    if number is None or number.kind not in "biu":
+        return False
+    return leaf.dims == (None,) and number.itemsize == 1 if name == "data" else not leaf.dims
+
+
+def frame_reduction(kind: str) -> Reduction:
+    """What makes the columns of a camera's messages of this type."""
+
+    def apply(fields: Fields) -> dict[str, FieldColumn]:
+        payloads = image_bytes(fields)
+        layout = layouts(kind, fields)
+        count = len(payloads)
+        numbers = {name: np.zeros(count, np.int64) for name in _NUMBERS}
+        encoding, problem = np.full(count, "", object), np.full(count, "", object)
+        hashes = np.zeros((count, 32), np.uint8)
+        for row, data in enumerate(payloads):
+            numbers[SIZE][row] = len(data)
+            try:
+                one = layout(row, data)
+            except ImageProblem as reason:
+                problem[row] = str(reason)
+                continue
+            hashes[row] = np.frombuffer(hashlib.sha256(data).digest(), np.uint8)
+            encoding[row] = one.encoding
+            said = (one.width, one.height, one.channels, one.bits, one.row_bytes, one.big_endian)
+            for name, value in zip(_NUMBERS[1:], said, strict=True):
+                numbers[name][row] = value
+        return {**numbers, ENCODING: encoding, PROBLEM: problem, SHA256: hashes}
+
+    return Reduction(image_fields(kind), apply)
+
+
+def image_bytes(fields: Fields) -> list[bytes]:
+    """The bytes of each message's image."""
+    column = fields["data"]
+    assert isinstance(column, Ragged)
+    view = np.ascontiguousarray(np.asarray(column.values, np.uint8)).data
+    bounds = zip(column.offsets[:-1].tolist(), column.offsets[1:].tolist(), strict=True)
+    return [bytes(view[start:stop]) for start, stop in bounds]
+
+
+def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
+    """What gives the layout of a message's image by its row and bytes, or raises ImageProblem."""
+    if kind == COMPRESSED:
+        formats = np.asarray(fields["format"], object)
+        return lambda row, data: compressed_layout(data, str(formats[row]))
+    encodings = np.asarray(fields["encoding"], object)
+    names = ("width", "height", "step", "is_bigendian")
+    width, height, step, big = (np.asarray(fields[name], np.int64) for name in names)
+
+    def raw(row: int, data: bytes) -> ImageLayout:
+        numbers = (int(width[row]), int(height[row]), int(step[row]), bool(big[row]))
+        return raw_layout(len(data), str(encodings[row]), *numbers)
+
+    return raw
+
 
 NS = 1_000_000_000
 OFF_CLOCK = "its stamp does not fit the clock"
@@ -74,3 +177,108 @@ def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: floa
         bins = stamp_ns[fine] // max(round(NS / max_hz), 1)
         usable[fine[1:]] = bins[1:] != bins[:-1]
     return usable
+
+
+BATCH_BYTES = 32 << 20  # of images that are in memory together
+
+
+@dataclass(frozen=True)
+class KeptFrames:
+    """The frames of one camera that a step of the recording has: K of its N messages."""
+
+    name: str
+    frames: CameraFrames
+    row: Ints  # (K,) ascending
+    first: Ints  # (K,) tick
+    last: Ints  # (K,)
+    steps: int  # that have one
+
+    @classmethod
+    def of(cls, name: str, frames: CameraFrames, ticks: Ints) -> KeptFrames:
+        """`ticks` are the steps that belong to an episode, in any order."""
+        ticks = np.unique(ticks)
+        return cls(name, frames, *frames.in_force(ticks), int((frames.at_tick[ticks] >= 0).sum()))
+
+    def manifest_row(self, recording: Recording, file: str) -> dict[str, Any]:
+        """What became of its messages, as `recordings.cameras` holds it."""
+        topic = recording.topics[self.frames.camera.topic]
+        sizes = np.asarray(self.frames.columns.fields[SIZE], np.int64)
+        return {
+            "camera": self.name,
+            "topic": topic.name,
+            "type": topic.type,
+            "expected": topic.expected,
+            **self.frames.account(len(self.row), self.steps),
+            "size_bytes": int(sizes[self.row].sum()),
+            "file": file,
+        }
+
+
+def kept_frames(cameras: Mapping[str, CameraFrames], ticks: Ints) -> list[KeptFrames]:
+    """The frames of each camera that steps in episodes have."""
+    return [KeptFrames.of(name, frames, ticks) for name, frames in cameras.items()]
+
+
+def frame_rows(recording: Recording, kept: KeptFrames) -> Iterator[pa.RecordBatch]:
+    """Rows by `frame_schema`, some megabytes of images at a time.
+
+    A frame is known by its log time and its hash: a message that holds the same at the same moment
+    is the same frame.
+    """
+    columns, camera = kept.frames.columns, kept.frames.camera
+    topic = recording.topics[camera.topic]
+    hashes = np.asarray(columns.fields[SHA256], np.uint8)
+    waiting: dict[tuple[int, bytes], list[int]] = {}
+    for place, row in enumerate(kept.row.tolist()):
+        key = int(columns.log_time_ns[row]), hashes[row].tobytes()
+        waiting.setdefault(key, []).append(place)
+    wanted = {log_ns for log_ns, _ in waiting}
+    taken: list[tuple[int, bytes]] = []
+    size = 0
+    for log_ns, fields in recording.batches(topic.name, image_fields(topic.type)):
+        if wanted.isdisjoint(log_ns.tolist()):
+            continue
+        for at, data in zip(log_ns.tolist(), image_bytes(fields), strict=True):
+            if at not in wanted:
+                continue
+            for place in waiting.pop((at, hashlib.sha256(data).digest()), ()):
+                taken.append((place, data))
+                size += len(data)
+        if size >= BATCH_BYTES:
+            yield _batch(recording, kept, taken)
+            taken, size = [], 0
+    if taken:
+        yield _batch(recording, kept, taken)
+
+
+def _batch(
+    recording: Recording, kept: KeptFrames, taken: list[tuple[int, bytes]]
+) -> pa.RecordBatch:
+    taken = sorted(taken, key=lambda one: one[0])
+    place = np.array([place for place, _ in taken])
+    row, columns, camera = kept.row[place], kept.frames.columns, kept.frames.camera
+    topic, count = recording.topics[camera.topic], len(taken)
+    fields = columns.fields
+    first, last = (
+        transition_ids(recording.recording_id, ticks[place]) for ticks in (kept.first, kept.last)
+    )
+    values: dict[str, Any] = {
+        "recording_id": [recording.recording_id] * count,
+        "camera": [kept.name] * count,
+        "frame_index": row,
+        "topic": [topic.name] * count,
+        "type": [topic.type] * count,
+        "log_time_ns": columns.log_time_ns[row],
+        "stamp_ns": kept.frames.stamp_ns[row],
+        "first_transition_id": first,
+        "last_transition_id": last,
+        "encoding": np.asarray(fields[ENCODING])[row].tolist(),
+        "sha256": [one.tobytes().hex() for one in np.asarray(fields[SHA256])[row]],
+        "data": [data for _, data in taken],
+        "big_endian": np.asarray(fields[BIG_ENDIAN])[row] != 0,
+    }
+    numbers = {"width": WIDTH, "height": HEIGHT, "channels": CHANNELS, "bits": BITS}
+    numbers |= {"row_bytes": ROW_BYTES, "size_bytes": SIZE}
+    values |= {name: np.asarray(fields[column])[row] for name, column in numbers.items()}
+    schema = frame_schema()
+    return pa.record_batch([pa.array(values[f.name], f.type) for f in schema], schema=schema)

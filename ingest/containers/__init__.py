@@ -1,1 +1,1 @@
-"""Files to payloads: MCAP, rosbag2's sqlite3 and ROS 1 bags, whole, compressed or damaged."""
+"""Paths to recordings: found, opened, and read topic by topic into columns."""

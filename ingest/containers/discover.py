@@ -1,4 +1,7 @@
-"""Finding recordings: files, bag folders, folders of many, globs; and what a file is."""
+"""Find recordings: files, bag folders, folders of many, globs; and say what a file is.
+
+A new container is a file with its `Container`, and a row in CONTAINERS.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,9 @@ from typing import TypeVar
 from ruamel.yaml import YAML
 
 from restock.errors import RecordingError, visible
-from restock.ingest.containers import known
-from restock.ingest.containers.storage import (
+from restock.ingest.containers.formats import mcap_file, ros1_file, sqlite_file
+from restock.ingest.containers.formats.compression import ZSTD_MAGIC
+from restock.ingest.containers.formats.storage import (
     HEAD_BYTES,
     INVALID_YAML,
     NOT_KEPT,
@@ -23,15 +27,32 @@ from restock.ingest.containers.storage import (
     custom_data,
 )
 
+CONTAINERS: tuple[Container, ...] = (
+    mcap_file.CONTAINER,
+    sqlite_file.CONTAINER,
+    ros1_file.CONTAINER,
+)
+
+
+def claiming(head: bytes) -> Container | None:
+    """Return the container that claims a file by its first bytes, or None."""
+    return next((one for one in CONTAINERS if one.claims(head)), None)
+
+
+def endings() -> tuple[str, ...]:
+    """Return how the names of recordings' files end, without and with rosbag2's compression."""
+    plain = [ending for one in CONTAINERS for ending in one.endings]
+    return (*plain, *(ending + packed for packed in (".zstd", ".zst") for ending in plain))
+
+
 T = TypeVar("T")
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 LFS_MAGIC = b"version https://git-lfs"
 METADATA = "metadata.yaml"
 LOST_AND_FOUND = "lost+found"  # at the top of a disk, for root alone
 MAX_METADATA = 2 << 20  # real ones have some kB, and the parser is slow
 _PART = re.compile(r"(.*_)(\d{1,4})(\..+)")  # of a bag that is split; longer ones are dates
 _NAMES = (
-    f"recordings end in {', '.join(name for one in known.CONTAINERS for name in one.endings)}"
+    f"recordings end in {', '.join(name for one in CONTAINERS for name in one.endings)}"
     " or are rosbag2 folders"
 )
 _ZSTD = re.compile(r"\.zstd?$")
@@ -144,7 +165,7 @@ def _within(folder: Path) -> list[Path]:
 
 def is_storage_name(path: Path) -> bool:
     """Whether a file is named like a recording."""
-    return path.name.endswith(known.endings())
+    return path.name.endswith(endings())
 
 
 def is_bag(folder: Path) -> bool:
@@ -303,7 +324,7 @@ def container_of(path: Path) -> Container | None:
         )
     if head.startswith(ZSTD_MAGIC):
         return None
-    if container := known.claiming(head):
+    if container := claiming(head):
         return container
     raise RecordingError(
         "not a recording: neither an MCAP, a sqlite3 nor a ROS 1 bag file by its first bytes",

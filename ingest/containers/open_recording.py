@@ -14,10 +14,10 @@ from pathlib import Path
 
 from restock.errors import RecordingError, visible
 from restock.ingest.containers import discover
-from restock.ingest.containers.compression import decompress_file
 from restock.ingest.containers.discover import METADATA, BagMetadata, recordings_in
+from restock.ingest.containers.formats.compression import decompress_file
+from restock.ingest.containers.formats.storage import Container, Damage, Storage, Watch, unwatched
 from restock.ingest.containers.recording import Recording
-from restock.ingest.containers.storage import Container, Damage, Storage, Watch, unwatched
 from restock.ingest.containers.topic_reading import Account, LostMessages, TopicInfo
 from restock.ingest.decoding.columns import Ragged, TopicColumns
 from restock.ingest.decoding.decoders import READABLE

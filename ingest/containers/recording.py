@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from restock.arrays import Ints
 from restock.errors import RecordingError
-from restock.ingest.containers.compression import decompressed
-from restock.ingest.containers.storage import (
+from restock.ingest.containers.formats.compression import decompressed
+from restock.ingest.containers.formats.storage import (
     Damage,
     Extra,
     Integrity,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from restock.arrays import Ints
-from restock.ingest.containers.compression import decompressed
+from restock.ingest.containers.formats.compression import decompressed
 from restock.ingest.decoding.columns import (
     FieldColumn,
     GrowingArray,

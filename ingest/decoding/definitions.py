@@ -1,22 +1,156 @@
-"""ROS message definitions: from the text in a recording, or a named distribution's."""
+"""ROS message definitions: from the text in a recording, a named distribution, or a folder.
+
+rosbag2 keeps the text of files: with `#include` lines, comments, and the line ends of the editor.
+Bags of sqlite3 before 2023 carry no definitions: `--definitions DIR` reads those of a robot's own
+packages from their sources: `DIR/**/PACKAGE/msg/NAME.msg` (or `PACKAGE/NAME.msg`) and `.idl`.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from restock.errors import RecordingError
-from restock.ingest.decoding.definition_text import types_in
 from restock.ingest.decoding.field_paths import DTYPES, CannotDecode, FieldType, Many, MessageType
-from restock.ingest.decoding.hand_definitions import ackermann_types, folder_types
 from restock.ingest.decoding.messages import Channel
+
+# The line before each message inside another one names it, after a line of "=".
+_RULE = re.compile(r"^=+[ \t]*\n\s*(?:MSG|IDL):[ \t]*([\w/]+)[ \t]*(?:\n|\Z)", re.MULTILINE)
+# What no field depends on: strings, comments, and lines for a preprocessor. What an #include names
+# is in the definition, too, and a guard against reading it twice always lets it be read once.
+_ASIDE = re.compile(
+    r'(?P<string>"(?:\\.|[^"\\])*(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)'
+    r"|^[ \t]*#[ \t]*(?:(?:include|pragma|ifndef|endif)\b|define[ \t]+\w+[ \t]*$)[^\n]*",
+    re.DOTALL | re.MULTILINE,
+)
+_HEADER = re.compile(r"^[ \t]*Header\b", re.MULTILINE)
+# The IDL parser's time is exponential in how deep these nest; rosidl writes none of either.
+_ANNOTATION = re.compile(r"@\s*\w[\w:]*\s*\(")
+_NESTED = re.compile(r"(?:<[^<>]*){4}")
+MAX_PLACE = 60  # characters of a text that are named where it cannot be parsed
+
+
+def types_in(content: bytes, name: str, form: str) -> Typesdict:
+    """Parse the definition of a message, `name`, and of the messages inside it.
+
+    `form` is "ros2msg", "ros1msg" or "ros2idl".
+
+    Raises:
+        CannotDecode: it cannot be parsed, and where.
+    """
+    types: Typesdict = {}
+    try:
+        text = re.sub(r"\r\n?", "\n", content.decode("utf-8-sig"))
+        first, *rest = _RULE.split(text)
+        parts = {normalize_msgtype(name): first}  # rosbag2 has no rule before it in .msg texts
+        parts |= zip(map(normalize_msgtype, rest[::2]), rest[1::2], strict=True)
+        for part, lines in parts.items():
+            if form == "ros2idl":
+                types.update(_idl_types(lines))
+                continue
+            own = f"{part.rpartition('/')[0]}/Header"  # ROS 1 and rosbags mean that of std_msgs
+            if form == "ros2msg" and own in parts.keys() - {part}:
+                lines = own.join(_HEADER.split(lines))
+            types.update(get_types_from_msg(lines, part))
+    except (TypesysError, RecursionError, ValueError, LookupError) as error:
+        raise CannotDecode(f"cannot be parsed{_where(error)}") from error
+    return types
+
+
+def _idl_types(text: str) -> Typesdict:
+    text = _ASIDE.sub(lambda found: '""' if found["string"] else " ", text)
+    bare = _ANNOTATION.sub(" ", text)
+    if "(" in bare or _NESTED.search(bare):
+        raise CannotDecode("nests brackets, which is not supported")
+    return get_types_from_idl(text) if text.strip() else {}
+
+
+def _where(error: Exception) -> str:
+    """Say where parsing ended: rosbags' errors have a line of the whole text, one of the place in
+    it, what is there, and perhaps a set of what was expected."""
+    lines = re.sub(r"\n\{['\"].*\Z", "", str(error) or type(error).__name__).splitlines()
+    if len(lines) < 3:
+        return f": {' '.join(lines)}"
+    rest = " ".join(" ".join(lines[3:]).split())[:MAX_PLACE]
+    return f" at {rest!r}" if rest else " at its end"
+
+
+LARGEST = 512 << 10  # bytes of one file
+MAX_FILES = 5000
+# Part of no distribution's core, and what every robot that steers is driven by (ackermann_msgs).
+ACKERMANN = {
+    "ackermann_msgs/msg/AckermannDrive": (
+        "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+        "float32 acceleration\nfloat32 jerk\n"
+    ),
+    "ackermann_msgs/msg/AckermannDriveStamped": (
+        "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+    ),
+}
+
+
+@cache
+def ackermann_types() -> Typesdict:
+    """The types of ackermann_msgs."""
+    types: Typesdict = {}
+    for name, text in ACKERMANN.items():
+        types.update(get_types_from_msg(text, name))
+    return types
+
+
+@cache
+def folder_types(folder: str) -> Typesdict:
+    """Every type that the `.msg` and `.idl` files of a folder define.
+
+    Raises:
+        RecordingError: no such folder, no definition in it or too many, or one that cannot be read;
+            names it.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise _refused(folder, "no such folder of definitions")
+    files = sorted([*root.rglob("*.msg"), *root.rglob("*.idl")])
+    if len(files) > MAX_FILES:
+        raise _refused(folder, f"it holds {len(files):,} definitions, more than {MAX_FILES:,}")
+    types: Typesdict = {}
+    for file in files:
+        parts = [part for part in file.relative_to(root).parts[:-1] if part != "msg"]
+        package = parts[-1] if parts else root.name if root.name != "msg" else root.parent.name
+        try:
+            if file.stat().st_size > LARGEST:
+                raise ValueError("too long for a definition")
+            form = "ros2idl" if file.suffix == ".idl" else "ros2msg"
+            types.update(types_in(file.read_bytes(), f"{package}/msg/{file.stem}", form))
+        except (CannotDecode, ValueError, OSError) as error:
+            raise RecordingError(
+                f"a definition that cannot be read: {error}",
+                where=str(file),
+                remedy="correct the file, or remove it from the folder",
+            ) from error
+    if not types:
+        raise _refused(folder, "it contains no .msg and no .idl file")
+    return types
+
+
+def _refused(folder: str, why: str) -> RecordingError:
+    remedy = "--definitions needs a folder that contains PACKAGE/msg/NAME.msg (or .idl)"
+    return RecordingError(why, where=folder, remedy=remedy)
+
 
 DEFAULT_DISTRO = "humble"
 _STORES = {store.value.removeprefix("ros2_"): store for store in Stores}

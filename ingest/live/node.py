@@ -13,7 +13,9 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +34,72 @@ from restock.ingest.live.node_topics import (
 )
 from restock.ingest.live.pilot import Decision, Pilot
 from restock.ingest.live.policy_file import PolicyFile
-from restock.ingest.live.ros import Ros
 from restock.ingest.task.limiter import Limiter, Limits
+
+
+@dataclass(frozen=True)
+class Ros:
+    """rclpy of a sourced ROS 2: Jazzy or later, whose Python is 3.12."""
+
+    rclpy: Any  # the module
+    LifecycleNode: Any
+    TransitionCallbackReturn: Any
+    QoSProfile: Any
+    ReliabilityPolicy: Any
+    DurabilityPolicy: Any
+    MutuallyExclusiveCallbackGroup: Any
+    MultiThreadedExecutor: Any
+    Clock: Any
+    ClockType: Any
+    SignalHandlerOptions: Any
+    get_message: Any  # "std_msgs/msg/Bool" -> its class
+
+    def sensor_qos(self) -> Any:
+        """Matches whatever a publisher offers."""
+        return self._qos(10, self.ReliabilityPolicy.BEST_EFFORT, self.DurabilityPolicy.VOLATILE)
+
+    def command_qos(self) -> Any:
+        """The newest alone, surely."""
+        return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.VOLATILE)
+
+    def latched_qos(self) -> Any:
+        """What was said last, to those who come later too."""
+        return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def _qos(self, depth: int, reliability: Any, durability: Any) -> Any:
+        return self.QoSProfile(depth=depth, reliability=reliability, durability=durability)
+
+
+def load_ros() -> Ros:
+    """The ROS 2 that is sourced.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    names = {
+        "rclpy.lifecycle": ("LifecycleNode", "TransitionCallbackReturn"),
+        "rclpy.qos": ("QoSProfile", "ReliabilityPolicy", "DurabilityPolicy"),
+        "rclpy.callback_groups": ("MutuallyExclusiveCallbackGroup",),
+        "rclpy.executors": ("MultiThreadedExecutor",),
+        "rclpy.clock": ("Clock", "ClockType"),
+        "rclpy.signals": ("SignalHandlerOptions",),
+        "rosidl_runtime_py.utilities": ("get_message",),
+    }
+    try:
+        found = {
+            name: getattr(import_module(module), name)
+            for module, each in names.items()
+            for name in each
+        }
+        return Ros(rclpy=import_module("rclpy"), **found)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"needs ROS 2, whose rclpy cannot be imported: {error}",
+            where="restock-node",
+            remedy="source /opt/ros/DISTRO/setup.bash (Jazzy or later), in an environment made"
+            " with --system-site-packages; without ROS, --on RECORDING plays a recording to it",
+        ) from error
+
 
 DIAGNOSTICS_S = 1.0
 NAME = "restock_policy"
@@ -390,6 +456,3 @@ def run_node(ros: Ros, policy: Path, *, drive: bool = False, activate: bool = Fa
         node.destroy_node()
         ros.rclpy.try_shutdown()
     return 0
-
-
-__all__ = ["PolicyNode", "lifecycle_node", "run_node"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from restock.errors import RecordingError
-from restock.ingest.camera.frame_columns import frame_reduction, other_field
+from restock.ingest.camera.frames import frame_reduction, other_field
 from restock.ingest.camera.images import TYPES
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction

@@ -19,7 +19,7 @@ import numpy as np
 from restock.arrays import Ints
 from restock.errors import LabelError
 from restock.files import first_line
-from restock.ingest.correct import RecordingCorrections
+from restock.ingest.relabel import RecordingCorrections
 from restock.ingest.store.corrections import Correction
 from restock.replay.review.doubtful import VERDICT
 from restock.replay.store.store import Store

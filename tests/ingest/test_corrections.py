@@ -20,13 +20,13 @@ from support.stores import CONDITIONS, one, recording_transitions
 
 from restock.cli import main
 from restock.errors import StoreError
-from restock.ingest.correct import (
+from restock.ingest.profile.profile import load_profile
+from restock.ingest.relabel import (
     RecordingCorrections,
     correct_store,
+    relabel_store,
     remove_corrections,
 )
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.relabel import relabel_store
 from restock.ingest.store.corrections import (
     Correction,
     Moments,

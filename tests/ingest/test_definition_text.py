@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.hand_definitions import folder_types
+from restock.ingest.decoding.definitions import folder_types
 
 RULE = "=" * 80 + "\n"
 STORE = get_typestore(Stores.EMPTY)

@@ -12,7 +12,7 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.errors import RecordingError
 from restock.ingest.containers.open_recording import open_recording, with_definitions
-from restock.ingest.decoding.hand_definitions import folder_types
+from restock.ingest.decoding.definitions import folder_types
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import steps_of
@@ -47,7 +47,7 @@ def test_a_folder_of_no_use_is_refused(text, what, tmp_path):
 
 
 def test_more_definitions_than_are_read_are_refused_and_not_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("restock.ingest.decoding.hand_definitions.MAX_FILES", 1)
+    monkeypatch.setattr("restock.ingest.decoding.definitions.MAX_FILES", 1)
     with pytest.raises(RecordingError, match="it holds 2 definitions, more than 1"):
         folder_types(str(package(tmp_path)))
 

@@ -11,7 +11,7 @@ from support.paths import SHARED
 
 from restock.arrays import Ints
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.live.clock import LiveClock
+from restock.ingest.live.observer import LiveClock
 from restock.ingest.profile.tables import Clock
 from restock.ingest.steps.align import NS, align
 from restock.ingest.steps.clocks import STAMP

@@ -14,8 +14,7 @@ from support.paths import ROOT
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.batch import IngestJob, ingest_all
-from restock.ingest.on_ray import prepare_on_ray
+from restock.ingest.batch import IngestJob, ingest_all, prepare_on_ray
 from restock.ingest.profile.profile import load_profile
 from restock.replay.store.store import Store
 

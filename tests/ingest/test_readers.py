@@ -381,7 +381,7 @@ def test_a_cut_sqlite_bag_is_refused_and_salvaged(tmp_path: Path) -> None:
 
 
 def test_a_bad_chunk_loses_only_itself(mcap: Path, tmp_path: Path) -> None:
-    from restock.ingest.containers.mcap_file import McapFile
+    from restock.ingest.containers.formats.mcap_file import McapFile
 
     chunks = McapFile(mcap)._contents.chunks
     assert len(chunks) > 3

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.paths import SHARED
 
 from restock.errors import RecordingError
-from restock.ingest.containers import ros1_bag, ros1_file
+from restock.ingest.containers.formats import ros1_file
 from restock.ingest.containers.open_recording import open_recording
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -152,18 +152,18 @@ def test_a_chunk_of_bz2_that_is_read_again_is_kept(
         flag = writer.add_connection("/flag", "std_msgs/msg/Bool", typestore=TYPES)
         writer.write(flag, 1, b"\x01")
     unpacked: list[int] = []
-    original = ros1_bag.Bag._inflated
+    original = ros1_file.Bag._inflated
 
-    def inflated(self: ros1_bag.Bag, position: int) -> bytes:
+    def inflated(self: ros1_file.Bag, position: int) -> bytes:
         unpacked.append(position)
         return original(self, position)
 
-    monkeypatch.setattr(ros1_bag.Bag, "_inflated", inflated)
+    monkeypatch.setattr(ros1_file.Bag, "_inflated", inflated)
     with open_recording(path) as recording:
         for _ in range(5):
             assert len(recording.read({"/flag": []})["/flag"]) == 1
     assert len(unpacked) == 2
-    monkeypatch.setattr(ros1_bag, "KEPT_BYTES", 0)
+    monkeypatch.setattr(ros1_file, "KEPT_BYTES", 0)
     with open_recording(path) as recording:
         for _ in range(5):
             recording.read({"/flag": []})

@@ -23,7 +23,7 @@ SHARED = {
     *("renamed", "state", "stats", "toml", "words"),
 }
 MAY_IMPORT = {
-    "ingest": "camera containers decoding profile steps store task urdf",
+    "ingest": "camera containers containers/formats decoding profile steps store task urdf",
     "ingest/decoding": "",
     "ingest/containers": "containers/formats decoding",
     "ingest/containers/formats": "decoding",
@@ -116,9 +116,9 @@ MAY_IMPORT = {
     "report/study": "look",
     "cli": "ingest/live ingest/profile ingest/steps ingest/task replay/store",
     "cli/data": (
-        "cli ingest ingest/containers ingest/profile ingest/propose ingest/propose/evidence"
-        " ingest/steps ingest/store ingest/task replay replay/export replay/mixture replay/panel"
-        " replay/plan replay/store train/dqn train/evaluation"
+        "cli ingest ingest/containers ingest/containers/formats ingest/profile ingest/propose"
+        " ingest/propose/evidence ingest/steps ingest/store ingest/task replay replay/export"
+        " replay/mixture replay/panel replay/plan replay/store train/dqn train/evaluation"
     ),
     "cli/fleet": (
         "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"

@@ -17,7 +17,7 @@ from support.stores import one, recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import LabelError
-from restock.ingest.correct import correct_store
+from restock.ingest.relabel import correct_store
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.label_scores import true_names
 from restock.replay.review.doubtful import DoubtfulEvent, doubtful_events, review_csv, review_rows

@@ -229,7 +229,7 @@ def _humble() -> Any:
     those of ackermann_msgs and move_base_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from restock.ingest.decoding.hand_definitions import ackermann_types
+    from restock.ingest.decoding.definitions import ackermann_types
 
     types = get_typestore(Stores.ROS2_HUMBLE)
     types.register(ackermann_types())

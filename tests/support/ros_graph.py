@@ -1,6 +1,6 @@
 """A ROS graph in one process: rclpy stubbed at its API's edge, for a node that runs without ROS.
 
-It has what `restock.ingest.live.ros` imports and nothing else, written after rclpy's own source:
+It has what `restock.ingest.live.node` imports and nothing else, written after rclpy's own source:
 the transitions and what their callbacks return, lifecycle publishers that are silent until they are
 enabled, which requests of QoS match which offers, timers by the node's clock or a steady one. It is
 no proof that rclpy does the same; no test here has rclpy.
@@ -15,7 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from restock.ingest.live.ros import Ros
+from restock.ingest.live.node import Ros
 from restock.train.twin.recording.messages import build, serialise, stamp, typestore
 
 Reliability = Enum("Reliability", "RELIABLE BEST_EFFORT")

@@ -1,1 +1,1 @@
-"""How recordings lie in bytes: the records and chunks of MCAP, the pages of SQLite."""
+"""How recordings lie in bytes: MCAP, rosbag2's sqlite3 and ROS 1 bags, whole or damaged."""

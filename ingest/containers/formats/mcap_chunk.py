@@ -14,6 +14,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from restock.arrays import Ints
+from restock.ingest.containers.formats.compression import most_bytes
 from restock.ingest.containers.formats.mcap_records import (
     PREFIX,
     Buffer,
@@ -23,7 +24,6 @@ from restock.ingest.containers.formats.mcap_records import (
     parse,
     walk,
 )
-from restock.ingest.containers.formats.plausible import most_bytes
 from restock.ingest.decoding.columns import gather
 from restock.ingest.decoding.messages import Channel
 

@@ -10,7 +10,7 @@ import json
 import re
 from dataclasses import dataclass
 
-from restock.ingest.camera.frame_columns import image_bytes, image_fields, layouts
+from restock.ingest.camera.frames import image_bytes, image_fields, layouts
 from restock.ingest.camera.images import TYPES, ImageProblem
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo

@@ -55,8 +55,7 @@ class NodeCommand:
             )
         if self.write_profile is not None:
             return self._write(PolicyFile(self.policy, self.profile).profile, self.write_profile)
-        from restock.ingest.live.node import run_node
-        from restock.ingest.live.ros import load_ros
+        from restock.ingest.live.node import load_ros, run_node
 
         ros = load_ros()
         PolicyFile(self.policy)  # refused before anything is on the graph
@@ -64,8 +63,7 @@ class NodeCommand:
 
     def _play(self, recording: Path) -> int:
         from restock.cli.output import print_json
-        from restock.ingest.live.pilot import Pilot
-        from restock.ingest.live.played import play, summary
+        from restock.ingest.live.pilot import Pilot, play, summary
         from restock.ingest.live.policy_file import PolicyFile
         from restock.ingest.task.limiter import Limits
 

@@ -127,7 +127,7 @@ def _file_sizes(file: Path) -> tuple[int, int]:
     That was done once, to describe it: it is not implausibly large."""
     import zstandard
 
-    from restock.ingest.containers.compression import BLOCK
+    from restock.ingest.containers.formats.compression import BLOCK
 
     with file.open("rb") as content:
         size = _plain_size(content.read(HEAD))
@@ -143,7 +143,7 @@ def _file_sizes(file: Path) -> tuple[int, int]:
 def _message_sizes(file: Path, salvage: bool) -> Iterator[tuple[int, int | None]]:
     """The compressed messages of a file; none where there is none among the first that are read."""
     from restock.ingest.containers.discover import ZSTD_MAGIC, container_of
-    from restock.ingest.containers.storage import unwatched
+    from restock.ingest.containers.formats.storage import unwatched
 
     container = container_of(file)
     if container is None:

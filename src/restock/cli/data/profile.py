@@ -218,8 +218,8 @@ class ProfileCommand:
 
     def _open(self, path: Path | str) -> Recording:
         from restock.cli import output
+        from restock.ingest.containers.formats.storage import unwatched
         from restock.ingest.containers.open_recording import open_recording
-        from restock.ingest.containers.storage import unwatched
         from restock.ingest.propose.evidence.roles import choose_robot
 
         with output.progress(f"opening {Path(path).name}", None) as advance:

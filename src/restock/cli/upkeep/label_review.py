@@ -11,7 +11,7 @@ from restock.errors import ExitCode, LabelError
 from restock.words import quoted
 
 if TYPE_CHECKING:
-    from restock.ingest.correct import Corrected
+    from restock.ingest.relabel import Corrected
     from restock.ingest.store.writer import StoreWriter
 
 NONE = "none"  # in place of a file: takes all corrections out
@@ -86,7 +86,7 @@ def _line(row: dict[str, Any]) -> dict[str, Any]:
 def correct(store: StoreWriter, path: Path, file: str, *, dry_run: bool, json: bool) -> int:
     """Take a file's verdicts into the store, or all corrections out of it."""
     from restock.cli import output
-    from restock.ingest.correct import correct_store, remove_corrections
+    from restock.ingest.relabel import correct_store, remove_corrections
     from restock.replay.review.verdicts import read_verdicts
     from restock.replay.store.store import Store
 

@@ -169,7 +169,7 @@ class Opener(Protocol):
 
 @dataclass(frozen=True)
 class Container:
-    """A file format of recordings: a row of `containers.known.CONTAINERS`."""
+    """A file format of recordings: a row of `containers.discover.CONTAINERS`."""
 
     name: str
     endings: tuple[str, ...]  # of its files' names

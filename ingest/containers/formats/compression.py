@@ -9,13 +9,20 @@ import numpy as np
 import zstandard
 
 from restock.errors import RecordingError
-from restock.ingest.containers.discover import ZSTD_MAGIC
-from restock.ingest.containers.formats.plausible import FILE, most_bytes
 from restock.ingest.decoding.messages import MessageBatch
 
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_MESSAGE = 1 << 30
 PIECE = 32 << 20  # of messages decompressed at a time
 BLOCK = 1 << 12  # bytes given to zstd at a time: at its most that makes 128 MiB of them
+RATIO = 1000  # bytes that a stored one may hold: what claims more is an attack, or an accident
+CHUNK = 64 << 20  # of a few bytes: as much is nothing to fear
+FILE = 256 << 20
+
+
+def most_bytes(stored: int, at_least: int = CHUNK) -> int:
+    """The most that `stored` compressed bytes may hold."""
+    return max(at_least, RATIO * stored)
 
 
 def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:

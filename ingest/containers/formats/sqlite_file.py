@@ -22,8 +22,8 @@ from urllib.parse import quote
 import numpy as np
 
 from restock.errors import RecordingError
-from restock.ingest.containers.sqlite_salvage import SalvagedSqliteFile
-from restock.ingest.containers.storage import (
+from restock.ingest.containers.formats.sqlite_salvage import SalvagedSqliteFile
+from restock.ingest.containers.formats.storage import (
     NOT_KEPT,
     Container,
     Damage,
