@@ -155,9 +155,16 @@ def test_a_recording_without_them_is_of_unknown_drivers_and_keeps_its_hash(tmp_p
 
 
 MUX, STEP = "/chosen", np.array([0.025, 0.06])
+THROUGH = """
+[command_through]
+topic = "/chosen"
+type = "geometry_msgs/msg/Twist"
+fields = { speed_mps = "linear.x", yaw_rate_radps = "angular.z" }
+max_age_s = 0.4
+"""
 
 
-def smoothed(limit: float = 1.0, *, mux: bool = True) -> dict[str, tuple[str, TopicColumns]]:
+def smoothed(limit: float = 1.0) -> dict[str, tuple[str, TopicColumns]]:
     """The same drive, the multiplexer's output republished at 20 Hz by a smoother, as /cmd_vel.
 
     `limit` is what a collision monitor leaves of it between 9 and 10 s.
@@ -172,72 +179,40 @@ def smoothed(limit: float = 1.0, *, mux: bool = True) -> dict[str, tuple[str, To
         now = now + np.clip(target - now, -STEP, STEP)
         out.append(now * (limit if 9 < at < 10 else 1.0))
     topics[OUT] = (TWIST, twists(out_s, *np.transpose(out)))
-    if mux:
-        topics[MUX] = (TWIST, chosen)
+    topics[MUX] = (TWIST, chosen)
     return topics
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.4])
-def test_the_source_is_followed_through_a_smoother(limit, tmp_path):
-    """By topics and timing: no smoothed command is one of any source."""
-    bag, file = write_topics(smoothed(limit), tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    profile = load_profile(file)
-    assert profile.inputs.command.topic == OUT
-    assert profile.command_through is not None
-    assert profile.command_through.topic == MUX
-    sources = {name: one.topic for name, one in profile.command_sources.items()}
-    assert sources == {"navigation": NAV, "teleop": TELEOP}
-    rows = policies(bag, file, tmp_path / "s")
+def test_a_source_is_followed_through_a_smoother(limit, tmp_path):
+    """No smoothed command equals one of any source."""
+    bag = write_topics(smoothed(limit), tmp_path / "bag")
+    profile = profile_of(bag, tmp_path, SOURCES + THROUGH)
+    assert load_profile(profile).inputs.command.topic == OUT
+    rows = policies(bag, profile, tmp_path / "s")
     assert len(rows) > 50
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
 
 
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_commands_that_are_no_numbers_follow_nothing(tmp_path, capsys):
-    topics = smoothed()
-    for name in (OUT, NAV):
-        topics[name][1].fields["linear.x"][::7] = np.nan
-        topics[name][1].fields["angular.z"][::5] = 1e300
-    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert load_profile(file).command_through is None
-
-
-def test_without_the_multiplexers_output_nobody_is_named(tmp_path):
-    bag, file = write_topics(smoothed(mux=False), tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    assert load_profile(file).command_through is None
-
-
-def test_a_source_is_unknown_where_the_multiplexer_was_silent(tmp_path, capsys):
+def test_a_source_is_unknown_where_the_multiplexer_was_silent(tmp_path):
     topics = smoothed()
     chosen = topics[MUX][1]
     kept = (chosen.log_time_ns < START_NS + 8 * 10**9) | (
         chosen.log_time_ns > START_NS + 10 * 10**9
     )
     topics[MUX] = (TWIST, without(chosen, kept))
-    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    rows = policies(bag, file, tmp_path / "s")
+    bag = write_topics(topics, tmp_path / "bag")
+    rows = policies(bag, profile_of(bag, tmp_path, SOURCES + THROUGH), tmp_path / "s")
     assert {policy for s, policy in rows if 8.6 < s < 9.8} == {"unknown"}
     assert {policy for s, policy in rows if s > 10.2} == {"navigation"}
 
 
-@pytest.mark.parametrize("silent", [True, False])
-def test_a_recording_without_the_multiplexers_output_is_of_unknown_drivers(silent, tmp_path):
-    """The topic is there without a message, or is not there."""
-    file, topics = tmp_path / "p.toml", smoothed()
-    assert (
-        main(["profile", "new", str(write_topics(topics, tmp_path / "a")), "--out", str(file)]) == 0
-    )
-    if silent:
-        chosen = topics[MUX][1]
-        topics[MUX] = (TWIST, without(chosen, np.zeros(len(chosen), np.bool_)))
-    else:
-        del topics[MUX]
-    rows = policies(write_topics(topics, tmp_path / "b"), file, tmp_path / "s")
+def test_drivers_are_unknown_without_the_multiplexer(tmp_path):
+    topics = smoothed()
+    del topics[MUX]
+    bag = write_topics(topics, tmp_path / "b")
+    rows = policies(bag, profile_of(bag, tmp_path, SOURCES + THROUGH), tmp_path / "s")
     assert len(rows) > 50
     assert {policy for _, policy in rows} == {"unknown"}
 
@@ -299,26 +274,6 @@ def test_a_proposal_takes_the_output_and_names_its_inputs_by_what_they_say(tmp_p
     rows = policies(bag, file, tmp_path / "s")
     assert {policy for s, policy in rows if 4.2 < s < 6.8} == {"teleop"}
     assert {policy for s, policy in rows if s < 3.8 or s > 7.2} == {"navigation"}
-
-
-def test_a_proposal_finds_the_button_that_is_held(tmp_path, capsys):
-    topics = taken_over()
-    del topics[TELEOP], topics[NAV]
-    out, joy = topics[OUT][1], topics[JOY][1]
-    seconds = (joy.log_time_ns - START_NS) * 1e-9
-    stick = np.sin(seconds * 3)
-    axes = np.zeros((len(seconds), 4), np.float32)
-    axes[:, 1] = stick
-    each = offsets_of(np.full(len(seconds), 4))
-    joy.fields["axes"] = Ragged(axes.reshape(-1), each)
-    last = np.searchsorted(joy.log_time_ns, out.log_time_ns, "right") - 1
-    said = (out.log_time_ns - START_NS) * 1e-9
-    by_hand = (said > TAKEN_OVER_S[0]) & (said < TAKEN_OVER_S[1])
-    out.fields["linear.x"] = np.where(by_hand, 0.5 * axes[last, 1], out.fields["linear.x"])
-    bag, file = write_topics(topics, tmp_path / "bag"), tmp_path / "p.toml"
-    assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
-    source = load_profile(file).command_sources["teleop"]
-    assert (source.topic, source.fields) == (JOY, {"pressed": "buttons[4]"})
 
 
 def test_a_command_that_is_only_a_persons_is_teleop(tmp_path, capsys):

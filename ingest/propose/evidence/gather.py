@@ -147,7 +147,7 @@ def gather(
     else:
         if len(roles["command"]) > 1:  # an arm on the robot may have its own
             roles["command"].sort(key=lambda fit: leaves_the_floor(recording, fit))
-        roles["command"], chosen = choose_command(recording, topics, roles["command"])
+        roles["command"], chosen = choose_command(recording, roles["command"])
     driven = {topic.name for topic, _ in roles["command"][:1]}
     roles["nav_command"] = [fit for fit in roles["nav_command"] if fit[0].name not in driven]
     if not (roles["goal"] and roles["plan"]):
@@ -197,7 +197,7 @@ def gather(
     robot = wheelbase_of(recording, roles, poses, robot)
     turns = read_turns(recording, roles, poses, robot, turned)
     if turns is not None and turns.is_angle:
-        roles["command"], chosen = choose_command(recording, topics, as_angles(roles["command"]))
+        roles["command"], chosen = choose_command(recording, as_angles(roles["command"]))
         if turns.wheelbase_m is not None:
             robot = robot.with_wheelbase(turns.wheelbase_m)
     wheelbase_m = robot.values.get("wheelbase_m")
