@@ -194,22 +194,15 @@ def _topic_lines(seen: Evidence) -> list[str]:
 
 
 def steered_by(seen: Evidence) -> str:
-    """What is done with the Twists of a robot that steers, and why."""
-    assert seen.turns is not None
-    topic, kind = seen.roles["command"][0]
-    if seen.turns.problem:
-        return (
-            f"{topic.name} drives a robot that steers as a car, and {seen.turns.problem}: set in "
-            "[inputs.command] which one it is, yaw_rate_radps, or steering_rad with wheelbase_m"
-        )
-    path = kind.fields["steering_rad" if seen.turns.is_angle else "yaw_rate_radps"]
-    if seen.turns.is_angle:
-        return f"the robot steers as a car: {path} is read as its steering angle, {seen.turns.why}"
+    """Say how the Twists of a robot that steers as a car are read; "" of other robots."""
+    steers = seen.robot.values.get("drive") == "ackermann"
+    if not (steers and seen.roles["command"]) or seen.commands.steered or seen.commands.measured:
+        return ""
+    path = seen.roles["command"][0][1].fields["yaw_rate_radps"]
     return (
-        f"the robot steers as a car: {path} is read as a yaw rate, {seen.turns.why};"
-        f" {seen.turns.too_tight:,} of its commands turn tighter than the"
-        f" {seen.turns.least_m:.2g} m that its steering allows, and count as the nearest action"
-        " that it can drive"
+        f"the robot steers as a car, and {path} is read as a yaw rate, as the message defines it."
+        " If it is the angle of the front wheels, write steering_rad in place of yaw_rate_radps,"
+        " and add wheelbase_m"
     )
 
 
@@ -331,7 +324,7 @@ def _input_lines(
     ]
     if role == "pose" and kind.by_fix:
         lines += fix_lines(seen.recording, topic.name, kind.fields)
-    if role == "command" and seen.turns is not None:
+    if role == "command":
         lines += [f"# {line}" for line in textwrap.wrap(steered_by(seen), 96)]
     if "steering_rad" in kind.fields:
         lines += [

@@ -126,8 +126,6 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         problems = [other]
     elif seen.motion is not None and seen.motion.problem:
         problems.append(seen.motion.problem)
-    elif seen.turns is not None and seen.turns.problem:
-        problems.append(steered_by(seen))
     text = "\n".join(profile_lines(seen, name, problems))
     trial = Trial()
     if not problems:
@@ -147,8 +145,8 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
     advice = [*trial.advice]
     if robots := robots_in(recording):
         advice.append(Advice("inputs", in_one_recording(robots)))
-    if seen.turns is not None and not seen.turns.problem:
-        advice.append(Advice("inputs.command", steered_by(seen)))
+    if steered := steered_by(seen):
+        advice.append(Advice("inputs.command", steered))
     if seen.robot.guessed_steering and not seen.commands.steered:
         advice.append(Advice("robot.drive", f"it seems to steer like a car: {seen.turned.why}"))
     advice += [*_seldom_poses(seen), *_odd_commands(seen)]

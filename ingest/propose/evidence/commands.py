@@ -1,6 +1,6 @@
 """What the commands of a recording say of its robot: how fast, which way, how long each holds.
 
-And whether the robot turned by them as a car does, and what a turn is to it.
+And whether the robot turned by them as a car does.
 """
 
 from __future__ import annotations
@@ -22,21 +22,17 @@ from restock.ingest.propose.driven.command_hold import (
 )
 from restock.ingest.propose.driven.steering import (
     DriveEvidence,
-    TurnReading,
     drive_evidence,
     shown_wheelbase_m,
-    turn_reading,
 )
 from restock.ingest.propose.evidence.clock_choice import Gaps
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Kind, Roles
 from restock.ingest.steps.motion import PoseSeries
-from restock.ingest.task.robot import USUAL_STEERING_RAD
 
 MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
 APART = 0.25  # of the fastest command; a command that is further from every action is far off it
 SLIGHT = 0.05  # of the largest speed of commands: noise, or what was rounded
-_ANGLES = {"yaw_rate_radps": "steering_rad"}
 
 
 @dataclass(frozen=True)
@@ -202,33 +198,6 @@ def how_it_turned(
     return drive_evidence(*_since(recording, roles, poses)), None
 
 
-def read_turns(
-    recording: Recording,
-    roles: Roles,
-    poses: PoseSeries | None,
-    robot: RobotProposal,
-    turned: DriveEvidence,
-) -> TurnReading | None:
-    """What the turns of Twists are to a robot that steers; None where it does not, or is driven
-    by steering angles."""
-    steers = robot.values.get("drive") == "ackermann"
-    if not (steers and roles["command"]):
-        return None
-    topic, kind = roles["command"][0]
-    if is_motion(topic.type) or "steering_rad" in kind.fields:
-        return None
-    if poses is None or len(poses) < 2:
-        return TurnReading()
-    reported, most = _since(recording, roles, poses), robot.values.get("max_steering_rad")
-    wheelbase_m = robot.values["wheelbase_m"]
-    if not robot.guessed_steering:
-        return turn_reading(*reported, wheelbase_m, most)
-    least_m = turned.turning_m or wheelbase_m / float(np.tan(most or USUAL_STEERING_RAD))
-    reading = turn_reading(*reported, None, least_m=least_m)
-    # That it steers is only a guess: that it is told in no known way is no reason to refuse it.
-    return reading if not reading.problem else TurnReading(least_m=least_m)
-
-
 def wheelbase_of(
     recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
 ) -> RobotProposal:
@@ -240,14 +209,6 @@ def wheelbase_of(
     told_s, _, told_rad, since = _since(recording, roles, poses, angles=True)
     wheelbase_m = shown_wheelbase_m(told_s, told_rad, since, robot.values.get("max_steering_rad"))
     return robot if wheelbase_m is None else robot.with_wheelbase(wheelbase_m)
-
-
-def as_angles(fitting: list[tuple[TopicInfo, Kind]]) -> list[tuple[TopicInfo, Kind]]:
-    """The same topics, their turns read as steering angles."""
-    return [
-        (topic, replace(kind, fields={_ANGLES.get(k, k): v for k, v in kind.fields.items()}))
-        for topic, kind in fitting
-    ]
 
 
 def _since(

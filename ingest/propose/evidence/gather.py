@@ -11,13 +11,8 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.conventions import conventions_of
 from restock.ingest.profile.inputs import Input, is_motion
-from restock.ingest.propose.driven.command_hold import (
-    CommandHold,
-)
-from restock.ingest.propose.driven.steering import (
-    DriveEvidence,
-    TurnReading,
-)
+from restock.ingest.propose.driven.command_hold import CommandHold
+from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.cameras import CameraTopic, camera_topics
 from restock.ingest.propose.evidence.candidates import Candidate, candidates
 from restock.ingest.propose.evidence.clock_choice import (
@@ -29,11 +24,9 @@ from restock.ingest.propose.evidence.clock_choice import (
 from restock.ingest.propose.evidence.command_choice import CommandChoice, choose_command
 from restock.ingest.propose.evidence.commands import (
     Commands,
-    as_angles,
     how_it_turned,
     leaves_the_floor,
     read_commands,
-    read_turns,
     wheelbase_of,
 )
 from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
@@ -103,7 +96,6 @@ class Evidence:
     chosen: CommandChoice
     hold: CommandHold
     turned: DriveEvidence  # whether it steers as a car, where nothing describes it
-    turns: TurnReading | None  # of Twists, where the robot steers as a car
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
@@ -195,11 +187,6 @@ def gather(
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
     robot = wheelbase_of(recording, roles, poses, robot)
-    turns = read_turns(recording, roles, poses, robot, turned)
-    if turns is not None and turns.is_angle:
-        roles["command"], chosen = choose_command(recording, as_angles(roles["command"]))
-        if turns.wheelbase_m is not None:
-            robot = robot.with_wheelbase(turns.wheelbase_m)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)
     if wheelbase_m is not None and robot.wheelbase_from:
@@ -221,7 +208,6 @@ def gather(
         chosen,
         hold,
         turned,
-        turns,
         paces,
         choose_clock(
             recording,

@@ -72,8 +72,8 @@ class RobotProposal:
             sharpest = max(sharpest, told_rad)
         else:
             why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
-            if shown.turning_m is not None:
-                sharpest = math.atan(wheelbase_m / shown.turning_m)
+            if shown.tightest_m is not None:
+                sharpest = math.atan(wheelbase_m / shown.tightest_m)
         if sharpest != USUAL_STEERING_RAD:
             values["max_steering_rad"] = round(min(max(sharpest, 0.05), 1.3), 3)
             origin["max_steering_rad"] = "logs"
