@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from restock.train.twin.calibration.fitted_twin import write_fit as write_fit
     from restock.train.twin.calibration.gap import measure_gap as measure_gap
     from restock.train.twin.calibration.logged_steps import logged_steps as logged_steps
+    from restock.train.twin.calibration.open_loop import log_segments as log_segments
     from restock.train.twin.calibration.open_loop import replay_segments as replay_segments
-    from restock.train.twin.calibration.segments import log_segments as log_segments
     from restock.train.twin.calibration.twin_gap import GapConfig as GapConfig
     from restock.train.twin.calibration.twin_gap import write_gap as write_gap
     from restock.train.twin.drivers.policies import PlannerFollower as PlannerFollower
@@ -38,8 +38,7 @@ else:
             "restock.train.twin.calibration.fitted_twin": ["write_fit"],
             "restock.train.twin.calibration.gap": ["measure_gap"],
             "restock.train.twin.calibration.logged_steps": ["logged_steps"],
-            "restock.train.twin.calibration.open_loop": ["replay_segments"],
-            "restock.train.twin.calibration.segments": ["log_segments"],
+            "restock.train.twin.calibration.open_loop": ["log_segments", "replay_segments"],
             "restock.train.twin.calibration.twin_gap": ["GapConfig", "write_gap"],
             "restock.train.twin.drivers.policies": ["PlannerFollower", "RandomPolicy"],
             "restock.train.twin.env.single_env": ["WarehouseEnv"],

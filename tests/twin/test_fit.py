@@ -25,20 +25,21 @@ from restock.train.twin.calibration.fit_parameters import (
     Coordinates,
 )
 from restock.train.twin.calibration.fit_solver import ReplayResiduals, position_gap_m
-from restock.train.twin.calibration.fit_uncertainty import measure_uncertainty, unidentified
 from restock.train.twin.calibration.fitted_twin import (
     FittedTwin,
     ParameterEstimate,
     fleet_schedule,
+    measure_uncertainty,
+    unidentified,
     write_fit,
 )
 from restock.train.twin.calibration.logged_steps import logged_steps
-from restock.train.twin.calibration.open_loop import replay_segments
-from restock.train.twin.calibration.segments import (
+from restock.train.twin.calibration.open_loop import (
     LoggedSegments,
     held_out_from,
     log_segments,
     ordinary_driving,
+    replay_segments,
     split_at,
 )
 from restock.train.twin.physics.perturbation import (

@@ -25,14 +25,21 @@ from restock.stats import (
     ConfidenceInterval,
 )
 from restock.train.diagnosis.evidence_needed import twin_evidence
-from restock.train.twin.calibration.gap import AFTER, BEFORE, measure_gap
+from restock.train.twin.calibration.gap import (
+    AFTER,
+    AGREES,
+    BEFORE,
+    agreement,
+    measure_gap,
+    one_step,
+    rebuild_plans,
+)
 from restock.train.twin.calibration.logged_steps import (
     logged_steps,
     observations,
     previous_action,
     sector_clearance,
 )
-from restock.train.twin.calibration.one_step import AGREES, agreement, one_step, rebuild_plans
 from restock.train.twin.calibration.open_loop import empty_floor
 from restock.train.twin.calibration.path_gap import FLOOR, measured_noise
 from restock.train.twin.calibration.twin_gap import (

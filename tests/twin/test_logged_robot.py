@@ -11,7 +11,7 @@ from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
-from restock.train.twin.calibration.logged_robot import robot_of_store
+from restock.train.twin.calibration.logged_steps import robot_of_store
 
 
 def test_a_changed_robot_reaches_the_store_without_reading_again(tmp_path: Path) -> None:

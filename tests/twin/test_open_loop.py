@@ -17,12 +17,13 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
 from restock.train.twin.calibration.open_loop import (
+    POSE,
     SENSED,
     OpenLoopStart,
     drive_open_loop,
+    log_segments,
     replay_segments,
 )
-from restock.train.twin.calibration.segments import POSE, log_segments
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.physics.perturbation import Perturbation
 

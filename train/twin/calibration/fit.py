@@ -41,7 +41,10 @@ from restock.train.twin.calibration.fit_solver import (
     search,
     solve,
 )
-from restock.train.twin.calibration.fit_uncertainty import (
+from restock.train.twin.calibration.fitted_twin import (
+    FittedTwin,
+    HeldOutGap,
+    ParameterEstimate,
     Uncertainty,
     as_in_base,
     estimates,
@@ -49,15 +52,13 @@ from restock.train.twin.calibration.fit_uncertainty import (
     measure_uncertainty,
     unidentified,
 )
-from restock.train.twin.calibration.fitted_twin import FittedTwin, HeldOutGap, ParameterEstimate
-from restock.train.twin.calibration.logged_robot import robot_of_store
-from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps
-from restock.train.twin.calibration.open_loop import replay_segments
-from restock.train.twin.calibration.segments import (
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, robot_of_store
+from restock.train.twin.calibration.open_loop import (
     LoggedSegments,
     held_out_from,
     log_segments,
     ordinary_driving,
+    replay_segments,
     split_at,
     whole_periods_s,
 )

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from restock.arrays import F64
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.fit_parameters import CHANNELS, Coordinates
-from restock.train.twin.calibration.open_loop import OpenLoopResult, replay_segments
-from restock.train.twin.calibration.segments import LoggedSegments
+from restock.train.twin.calibration.open_loop import LoggedSegments, OpenLoopResult, replay_segments
 from restock.train.twin.physics.perturbation import Perturbation
 
 _KEPT = 512  # replays of single perturbations that are kept

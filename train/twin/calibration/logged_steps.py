@@ -21,20 +21,22 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
+from restock.ingest.profile.profile_text import read_profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals
 from restock.ingest.task.task import Task
 from restock.replay.store.parquet_views import passed_in
-from restock.replay.store.store import Store
-from restock.train.twin.calibration.logged_robot import robot_of_store
+from restock.replay.store.store import Store, profiles_of
 from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.robot_trial import robot_model
 
 Strings = NDArray[np.str_]
 
 NOMINAL = "nominal"
+
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
+
 SIGNALS = tuple(column.name for column in SIGNAL_COLUMNS)
 
 
@@ -255,3 +257,17 @@ def _text(column: pa.ChunkedArray) -> Strings:
 def _vectors(column: pa.ChunkedArray, size: int) -> F32:
     flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
     return np.ascontiguousarray(flat, np.float32).reshape(-1, size)
+
+
+def robot_of_store(store: Store, task_hash: str) -> Robot | None:
+    """The robot of the newest profile that read the rows of a task; None where it has none, or
+    where an older Restock kept no profile."""
+    for stored in profiles_of(store.connection, task_hash):
+        if not stored.toml:
+            continue
+        try:
+            profile = read_profile_toml(stored.toml, where=str(store.path))
+        except ConfigError:  # of another version: as if it were not there
+            continue
+        return profile.robot
+    return None

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from restock.arrays import F64, Bools
 from restock.ingest.task.signals import wrap_angle
 from restock.train.twin.calibration.logged_steps import NOMINAL, LoggedSteps
-from restock.train.twin.calibration.open_loop import lay_onto, replay_segments
-from restock.train.twin.calibration.segments import (
+from restock.train.twin.calibration.open_loop import (
     LoggedSegments,
+    lay_onto,
     log_segments,
+    replay_segments,
     whole_periods_s,
 )
 from restock.train.twin.calibration.twin_gap import GapConfig
