@@ -11,8 +11,13 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.twin.drivers.policies import PlannerFollower
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.placed import Drive, from_walls_m, on_free_ground, placed_on
-from restock.train.twin.survey.logged_drives import drive_of
+from restock.train.twin.floors.placed import (
+    Drive,
+    drive_of,
+    from_walls_m,
+    on_free_ground,
+    placed_on,
+)
 
 TASK = load_profile("warehouse_amr").task
 (FLOOR,) = open_floors("default")

@@ -28,10 +28,9 @@ from restock.replay.store.parquet_views import passed_in
 from restock.train.evaluation.off_policy.dataset import held_out_of, panel_store
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
-from restock.train.twin.floors.placed import placed_on
+from restock.train.twin.floors.placed import logged_drives, placed_on
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.physics.episode import EpisodeSpec, Way, draw_episode
-from restock.train.twin.survey.logged_drives import logged_drives
 
 HELD_OUT, EVERY = "logged", "logged:all"
 AGREE_M = 0.3  # a goal by the waypoint must be as far as the row says

@@ -160,17 +160,11 @@ def _schedule_toml(fits: Sequence[FittedTwin]) -> str:
 
 
 RESAMPLES = 1000
-
 FEW_CLUSTERS = 8
-
 PROFILE_POINTS = 12
-
 CHI_SQUARE_95 = 3.84  # of one degree of freedom
-
 SLIDES_MPS = 0.05  # a wheel faster than this over the floor slides
-
 CONFOUNDED = 0.95  # correlation of two estimates
-
 ILL_CONDITIONED = 1e6  # condition number of the information
 
 

@@ -61,13 +61,9 @@ from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.simulation import Simulation
 
 PAST = 5  # control periods of commands before the step: longer than any latency and ramp
-
 AGREES = 0.05  # of a clearance entry: about what noise and a pallet here and there make
-
 SAME_M = 1e-3  # what remains of a plan is stored as float32
-
 SPACING_M = 0.02  # points nearer to each other than this give no direction
-
 ROUTE = (
     *("waypoint_near_x_m", "waypoint_near_y_m", "waypoint_far_x_m", "waypoint_far_y_m"),
     "route_remaining_m",
@@ -285,7 +281,6 @@ def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
 
 
 BEFORE, AFTER, PERSISTENCE = "nominal", "calibrated", "persistence"
-
 _FLOOR_ROWS = 200  # nominal rows whose lidar says whether the floor is the twin's
 
 

@@ -32,11 +32,8 @@ from restock.train.twin.physics.robot_model import RobotModel
 from restock.train.twin.physics.robot_trial import robot_model
 
 Strings = NDArray[np.str_]
-
 NOMINAL = "nominal"
-
 COMMAND = ("command_speed_mps", "command_yaw_rate_radps")
-
 SIGNALS = tuple(column.name for column in SIGNAL_COLUMNS)
 
 

@@ -35,15 +35,10 @@ from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import Simulation
 
 WARMUP_S = 1.0  # longer than any latency, and than a stop on friction .2
-
 STILL_MPS = 0.02  # slower than this a robot stands
-
 TOUCHING_M = 0.05  # nearer to something than this a robot may be touching it
-
 EVEN = 0.25  # of a control period: how far a tick or a pose may be from where it should be
-
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
-
 MOTION = (
     *("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2"),
     *("localised_speed_mps", "localised_lateral_mps"),
@@ -275,11 +270,8 @@ def _periods(task: Task, seconds: float, name: str) -> int:
 
 
 ROBOTS = 512  # simulated at a time
-
 SLIP_MPS = 0.2  # wheels and localisation this far apart: ground speed is the localised one
-
 EMPTY_M = 60.0  # the side of an empty floor; who comes near its wall is put back in its middle
-
 SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "accel_x_mps2")
 
 

@@ -7,15 +7,20 @@ the floor's own, but walls are then elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import duckdb
 import numpy as np
 
 from restock.arrays import F64, Bools
+from restock.ingest.task.surroundings import sector_returns
+from restock.ingest.task.task import Task, clearances_of
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.occupancy_grid import into_frame
 
 PLACED = 0.8  # of the poses, on free ground
+
 # Of the returns, that near to a wall. Measured on real drives and the sample logs: on the floors
 # that were made of them .78 to .98, on those of other frames up to .61.
 SEEN, NEAR_M = 0.7, 0.25
@@ -64,4 +69,51 @@ def placed_on(floor: Warehouse, drive: Drive) -> bool:
     return float((from_walls_m(floor, returns) < NEAR_M).mean()) >= SEEN
 
 
-__all__ = ["PLACED", "Drive", "from_walls_m", "on_free_ground", "placed_on"]
+COMPARED = 64  # recordings whose frames are looked at where there may be thousands
+ROWS = 2000  # of a recording, at most about so many
+WITHIN_M = 3.0  # of the lidar: farther off, a sector is wide
+RETURNS = 4000  # at most so many
+_COUNTS = (
+    "SELECT recording_id, count(*) FROM transitions WHERE list_contains(?, recording_id)"
+    " GROUP BY recording_id"
+)
+
+_ROWS = (
+    "SELECT pose_x_m, pose_y_m, pose_yaw_rad{} FROM transitions"
+    " WHERE recording_id = ? AND step_index % ? = 0"
+)
+
+
+def logged_drives(
+    connection: duckdb.DuckDBPyConnection, task: Task | None, recordings: Sequence[str]
+) -> dict[str, Drive]:
+    """Of each of these recordings, by its id, from rows of this task; None: poses alone."""
+    counts = connection.execute(_COUNTS, [list(recordings)]).fetchall()
+    lidar = task is not None and task.lidar
+    query = _ROWS.format(", observation" if lidar else "")  # large: only where it is looked at
+    drives = {}
+    for recording, count in counts:
+        x, y, yaw, *seen = (
+            connection.execute(query, [recording, count // ROWS + 1]).fetchnumpy().values()
+        )
+        poses = np.column_stack([x, y, yaw]).astype(np.float64)
+        if task is None or not task.lidar:
+            drives[recording] = Drive(_known(poses)[:, :2], np.empty((0, 2)))
+        else:
+            clearance_m = clearances_of(task, np.stack(list(seen[0])))
+            drives[recording] = drive_of(task, poses, clearance_m)
+    return drives
+
+
+def drive_of(task: Task, poses: F64, clearance_m: F64) -> Drive:
+    """A drive by its poses (N, 3), where known, and the clearances (N, K) that were seen there."""
+    clearance_m, poses = clearance_m[np.isfinite(poses).all(axis=1)], _known(poses)
+    x, y = sector_returns(task, clearance_m)
+    cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    returns = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1) + poses[:, None, :2]
+    seen = returns[clearance_m < min(task.range_max_m * (1 - 1e-6), WITHIN_M)]
+    return Drive(poses[:, :2], seen[:: len(seen) // RETURNS + 1])
+
+
+def _known(poses: F64) -> F64:
+    return poses[np.isfinite(poses).all(axis=1)]

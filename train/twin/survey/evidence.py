@@ -1,32 +1,215 @@
-"""What a recording or store has that a floor can be made from: a map, poses, scans, its robot."""
+"""What a recording or store has that a floor can be made from: a map, poses, scans, its robot.
+
+The map is a recording's last `nav_msgs/OccupancyGrid` that is no costmap. Map servers write 0, 100
+or -1; some SLAM (Cartographer) writes how likely each cell is occupied. Below 25 percent counts as
+free and above 65 as occupied, as when `map_saver` writes a `map.yaml`.
+
+A store keeps no maps, and of scans only the clearance in a few sectors: both are read from the
+recording that the rows came from, if it still exists.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from restock.arrays import F64, Bools
-from restock.errors import RestockError
+from restock.errors import RecordingError, RestockError, StoreError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
-from restock.ingest.profile.profile import Profile
+from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.decoding.columns import Ragged
+from restock.ingest.profile.profile import Profile, parse_profile
 from restock.ingest.propose.evidence.footprint import Footprint, footprint_of
-from restock.replay.store.store import is_store
-from restock.train.twin.floors.occupancy_grid import FREE, OccupancyGrid
-from restock.train.twin.floors.occupancy_map import read_grid
-from restock.train.twin.floors.placed import Drive
+from restock.ingest.task.signals import yaw_of
+from restock.replay.store.store import Store, is_store
+from restock.train.twin.floors.occupancy_grid import (
+    FREE,
+    MAX_CELLS,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+)
+from restock.train.twin.floors.occupancy_map import FURTHEST_M, read_grid
+from restock.train.twin.floors.placed import COMPARED, Drive, logged_drives
 from restock.train.twin.survey.poses import (
     WELL_PLACED,
     Poses,
+    Times,
     candidate_poses,
     choose_poses,
 )
-from restock.train.twin.survey.recorded_map import recorded_map
 from restock.train.twin.survey.scans import PlacedScans, placed_scans
-from restock.train.twin.survey.stored_drive import stored_drive
+from restock.words import counted
+
+TYPE = "nav_msgs/msg/OccupancyGrid"
+FREE_BELOW, OCCUPIED_ABOVE = 25, 65  # percent
+_OTHERS = ("costmap", "cost_map", "transformed", "local", "_updates")  # in the topic's name
+_INFO = (
+    "info.resolution",
+    "info.width",
+    "info.height",
+    "info.origin.position.x",
+    "info.origin.position.y",
+    *(f"info.origin.orientation.{axis}" for axis in "xyzw"),
+)
+
+_FRAME = "header.frame_id"
+
+
+def map_topic(recording: Recording) -> TopicInfo | None:
+    """The topic of the recording's map: `/map` before any other."""
+    found = [
+        topic
+        for topic in recording.topics.values()
+        if topic.type == TYPE and topic.expected and not topic.skipped
+        if not any(word in topic.name.lower() for word in _OTHERS)
+    ]
+    return min(found, key=lambda t: (t.name.split("/")[-1] != "map", t.name), default=None)
+
+
+def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
+    """The last map of the recording and where it is from, in words; None where it has none.
+
+    Raises:
+        RecordingError: the message is not a map: its size, resolution or origin are not.
+    """
+    topic = map_topic(recording)
+    if topic is None:
+        return None
+    columns = recording.read({topic.name: [*_INFO, _FRAME, "data"]}).get(topic.name)
+    if columns is None or not len(columns):
+        return None
+    fields = columns.fields
+    values: list[Any] = [np.asarray(fields[path])[-1] for path in _INFO]
+    cell_m, width, height, x, y = (float(value) for value in values[:5])
+    yaw = float(yaw_of(*(np.array([float(value)]) for value in values[5:]))[0])
+    data = fields["data"]
+    cells = np.asarray(data[len(data) - 1] if isinstance(data, Ragged) else data[-1]).ravel()
+    where = f"{recording.path}, {topic.name}"
+    wrong = ""
+    if width < 1 or height < 1:
+        wrong = f"an empty map of {width:.0f} x {height:.0f} cells"
+    elif width * height > MAX_CELLS:
+        wrong = f"{width:,.0f} x {height:,.0f} cells, more than the {MAX_CELLS:,} that can be read"
+    elif len(cells) != width * height:
+        wrong = f"{len(cells):,} cells of data for {width:.0f} x {height:.0f}"
+    elif not 0.001 <= cell_m <= 1:
+        wrong = f"a resolution of {cell_m:g} m, which must be from .001 to 1 m"
+    elif not (np.abs([x, y, yaw]) <= FURTHEST_M).all():
+        wrong = f"an origin at {x:g}, {y:g}, turned by {yaw:g} rad"
+    if wrong:
+        raise RecordingError(
+            f"its map has {wrong}",
+            where=where,
+            remedy="give the map as a file (--map map.yaml), or --by scans, or --by corridor",
+        )
+    percent = cells.astype(np.int16).reshape(int(height), int(width)).T
+    occupancy = np.full(percent.shape, UNKNOWN, np.int8)
+    occupancy[(percent >= 0) & (percent < FREE_BELOW)] = FREE
+    occupancy[(percent > OCCUPIED_ABOVE) & (percent <= 100)] = OCCUPIED
+    frame = str(np.asarray(fields[_FRAME], object)[-1]).strip("/")
+    grid = OccupancyGrid(np.ascontiguousarray(occupancy), cell_m, (x, y, yaw), frame)
+    count = f", the last of {len(columns)}" if len(columns) > 1 else ""
+    return grid, f"{topic.name} of {recording.path.name}{count}"
+
+
+_POSES = (
+    "SELECT stamp_ns, logged_ns, pose_x_m, pose_y_m, pose_yaw_rad FROM transitions"
+    " WHERE list_contains(?, recording_id) ORDER BY recording_id, logged_ns"
+)
+
+
+@dataclass(frozen=True)
+class StoredDrive:
+    """The drive of one recording of a store, and whose poses they are."""
+
+    poses: Poses
+    everywhere: (
+        Poses  # of all recordings by the same profile: places of one map, where there is one
+    )
+    recording: Path | None  # where it lies; None where it is no longer there
+    profile: Profile | None  # that its rows were made by
+    others: Mapping[str, Drive]  # of the largest other recordings by that profile, by source
+    notes: list[str] = field(default_factory=list)
+
+
+def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
+    """The recording with the most rows, of those that are still there if any is.
+
+    Args:
+        recording: which one instead: its id, or its file's name or the end of its path.
+
+    Raises:
+        StoreError: the store is empty, cannot be read, or has no such recording or several.
+    """
+    sql = (files("restock.train.twin.survey") / "stored_drive.sql").read_text(encoding="utf-8")
+    with Store(str(path)) as store:
+        rows = store.connection.sql(sql).fetchall()
+        if not rows:
+            raise StoreError("no transitions", where=str(path), remedy="ingest recordings into it")
+        there = [row for row in rows if row[1] and Path(row[1]).exists()]
+        if recording is not None:
+            there = [_named(recording, rows, str(path))]
+        identity, source, toml, _ = (there or rows)[0]
+        alike = [row for row in rows if row[2] == toml]
+        said = f"poses of the rows of {counted(len(alike), 'recording')}"
+        everywhere = _poses(store, [row[0] for row in alike], said)
+        profile = _stored_profile(toml, source)
+        names = {row[0]: row[1] or row[0] for row in alike[:COMPARED] if row[0] != identity}
+        task = None if profile is None else profile.task
+        drives = logged_drives(store.connection, task, list(names))
+        others = {name: drives[one] for one, name in names.items()}
+        poses = _poses(store, [identity], f"poses of the rows of {source}")
+    file = Path(source) if source and Path(source).exists() else None
+    notes = []
+    if file is None:
+        notes.append(f"{source} no longer exists: its map and its scans cannot be read")
+    if len(rows) > 1:
+        notes.append(f"by {source}, of {len(rows)} recordings in the store")
+    return StoredDrive(poses, everywhere, file, profile, others, notes)
+
+
+def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
+    """The one row of the recordings that this names.
+
+    Raises:
+        StoreError: none, or several.
+    """
+    end = Path(recording).parts
+    found = [
+        row
+        for row in rows
+        if row[0] == recording or (row[1] and Path(row[1]).parts[-len(end) :] == end)
+    ]
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(str(row[1] or row[0]) for row in (found or rows)[:8])
+    raise StoreError(
+        f"{'several recordings are' if found else 'no recording is'} {recording!r}",
+        where=where,
+        remedy=f"give the path or the id of one of {names}",
+    )
+
+
+def _poses(store: Store, recordings: list[str], source: str) -> Poses:
+    columns = store.connection.execute(_POSES, [recordings]).fetchnumpy()
+    stamp, log, *numbers = columns.values()
+    x, y, yaw = (np.asarray(number, np.float64) for number in numbers)
+    times = Times(np.asarray(stamp, np.int64), np.asarray(log, np.int64))
+    return Poses(times, x, y, np.unwrap(yaw), "", source)
+
+
+def _stored_profile(toml: str | None, source: str) -> Profile | None:
+    try:
+        return parse_profile(toml, where=f"the profile of {source}") if toml else None
+    except RestockError:  # of another version: what it said of topics is guessed again
+        return None
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,14 @@ that was driven.
 
     surveyed = survey(Path("logs/run.mcap"))
     surveyed.floor, surveyed.source, surveyed.notes
+
+Its zones (aisles and crossings, or quarters if it has none) are the same as `[[zone]]` of a
+profile: logs of the same map and episodes in the twin then name the same places.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +21,8 @@ from restock.errors import ConfigError, RecordingError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.replay.store.store import is_store
-from restock.train.twin.floors.layout import Warehouse
+from restock.toml import toml_value
+from restock.train.twin.floors.layout import Rect, Warehouse
 from restock.train.twin.floors.occupancy_grid import (
     FREE,
     UNKNOWN,
@@ -27,14 +31,16 @@ from restock.train.twin.floors.occupancy_grid import (
     out_of_frame,
 )
 from restock.train.twin.floors.placed import SEEN, placed_on
-from restock.train.twin.survey.directions import along_walls
-from restock.train.twin.survey.driven_corridor import driven_corridor
 from restock.train.twin.survey.evidence import Evidence, gather
-from restock.train.twin.survey.map_agreement import returns_on_walls, walls_agreement
+from restock.train.twin.survey.mapping import (
+    along_walls,
+    driven_corridor,
+    returns_on_walls,
+    scan_map,
+    walls_agreement,
+)
 from restock.train.twin.survey.poses import Poses
-from restock.train.twin.survey.scan_map import scan_map
 from restock.train.twin.survey.scans import PlacedScans
-from restock.train.twin.survey.zones import with_zones
 
 Source = Literal["map", "scans", "corridor"]
 MARGIN_M = 0.05  # beyond half the body, when it drives along a wall
@@ -46,6 +52,7 @@ MIN_SCANS = 8
 AGREEING, WELL_AGREEING = 0.5, 0.8  # of the ends of scans, on walls that they made together
 CLOCKS_APART = 0.1  # more of them by another clock: that one is right
 MAX_OFF = 0.5  # of the poses: a map that fewer lie on is not theirs
+
 # Of a lidar's returns: on the walls of a map that fewer lie on, the poses are not in its frame.
 # Measured on other people's robots with their own maps: .58 (badly localised) to 1.0.
 MIN_ON_WALLS = 0.5
@@ -325,3 +332,36 @@ def _check_walls(
         )
     if agree < SEEN:
         notes.append(f"only {said}: the poses are imprecise, or the place has changed since")
+
+
+MIN_SIDE_M = 2.0  # of a floor that is worth quartering
+_QUARTERS = (("south", "west"), ("south", "east"), ("north", "west"), ("north", "east"))
+
+
+def with_zones(floor: Warehouse) -> Warehouse:
+    """The floor with its crossings as zones beside its aisles, or its quarters without aisles."""
+    if floor.segments:
+        named = ((f"crossing_{k + 1}", area) for k, area in enumerate(floor.crossings))
+        return replace(floor, cross_zones=tuple(named))
+    if min(floor.width_m, floor.depth_m) < MIN_SIDE_M:
+        return floor
+    half_x, half_y = floor.width_m / 2, floor.depth_m / 2
+    quarters = []
+    for north, east in _QUARTERS:
+        x, y = half_x * (east == "east"), half_y * (north == "north")
+        quarters.append((f"{north}_{east}", Rect(x, y, x + half_x, y + half_y)))
+    return replace(floor, cross_zones=tuple(quarters))
+
+
+def profile_zones(floor: Warehouse) -> str:
+    """The floor's zones as TOML for a profile: boxes in the map's frame, turned by `yaw_rad`."""
+    yaw = float((floor.map_origin[2] + np.pi) % (2 * np.pi) - np.pi)
+    lines: list[str] = []
+    for name, area in floor.zones.items():
+        x, y = out_of_frame(np.array([area.center]), floor.map_origin)[0].tolist()
+        half_x, half_y = area.half_size
+        box = [round(edge, 3) for edge in (x - half_x, y - half_y, x + half_x, y + half_y)]
+        lines += ["[[zone]]", f"name = {toml_value(name)}", f"box_m = {toml_value(box)}"]
+        lines += [f"yaw_rad = {round(yaw, 4)}"] if abs(yaw) > 1e-3 else []
+        lines.append("")
+    return "\n".join(lines)

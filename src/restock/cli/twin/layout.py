@@ -74,7 +74,7 @@ class LayoutCommand:
         from restock.train.twin.floors.floor_file import write_floor
         from restock.train.twin.floors.occupancy_map import write_map
         from restock.train.twin.survey.picture import write_picture
-        from restock.train.twin.survey.zones import profile_zones
+        from restock.train.twin.survey.survey import profile_zones
 
         maps = self.out is not None and self.out.suffix in (".yaml", ".yml")
         written = self._to_write(maps)

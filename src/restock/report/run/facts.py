@@ -25,8 +25,7 @@ from restock.train.run.measures import measures
 from restock.train.run.run import Run
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
-from restock.train.twin.floors.placed import placed_on
-from restock.train.twin.survey.logged_drives import COMPARED, logged_drives
+from restock.train.twin.floors.placed import COMPARED, logged_drives, placed_on
 
 PACKAGE = "restock.report.run"
 CELL_M = 0.25

@@ -1,0 +1,286 @@
+"""Occupancy grids made from drives: of scans, or of the corridor that a robot drove in.
+
+Scans are traced ray by ray: each makes the cells that its beams pass less likely occupied, and
+those they end in more (log-odds, Elfes 1989); a cell counts once a scan. Poses are taken as they
+are: nothing is matched, and loops are not closed. How well scans agree is the share of beams that
+end within one cell of a wall of the map that all of them made.
+
+Without a lidar all that is known is that the robot fitted where it was: its outline and a margin
+around its way are free, and everything beyond counts as a wall.
+
+Floors and boxes are straight along their axes, maps need not be, so grids are turned along their
+walls. Directions that differ by a right angle count as one: of angles a_i with weights w_i, the
+main one is the argument of the sum of w_i exp(4 i a_i), divided by four.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from restock.arrays import F64, Bools, Ints
+from restock.train.twin.floors.occupancy_grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    into_frame,
+    out_of_frame,
+)
+from restock.train.twin.floors.placed import MIN_RETURNS, NEAR_M, RETURNS, WITHIN_M
+from restock.train.twin.survey.poses import JUMP_M, Poses
+from restock.train.twin.survey.scans import PlacedScans
+
+AGREEING = 0.25  # of the weight, less than this says nothing
+MIN_TURN_RAD = np.deg2rad(3.0)
+_SUB = 3  # points a cell and axis that a turned cell is looked up at
+
+
+def main_direction(angles_rad: F64, weights: F64) -> float:
+    """The main direction in (-pi/4, pi/4], 0 where they do not agree on one."""
+    total = float(weights.sum())
+    if total <= 0:
+        return 0.0
+    sum_ = complex((weights * np.exp(4j * angles_rad)).sum())
+    return float(np.angle(sum_) / 4) if abs(sum_) >= AGREEING * total else 0.0
+
+
+def walls_direction(grid: OccupancyGrid) -> float:
+    """The direction of a grid's walls against its axes."""
+    walls = ndimage.gaussian_filter((grid.occupancy == OCCUPIED).astype(np.float32), 1.5)
+    across_x, across_y = np.gradient(walls)
+    return main_direction(np.arctan2(across_y, across_x), np.hypot(across_x, across_y))
+
+
+def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
+    """The grid with its axes along its walls, and by how much it was turned (rad).
+
+    A turned cell is occupied where any part of it was, so that no wall gets a hole.
+    """
+    known = grid.occupancy != UNKNOWN
+    if not known.any():
+        return grid, 0.0
+    columns, rows = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    part = grid.cut(int(columns[0]), int(columns[-1]) + 1, int(rows[0]), int(rows[-1]) + 1)
+    turn = walls_direction(part)
+    if abs(turn) < MIN_TURN_RAD:
+        return grid, 0.0
+    cell_m, size = part.cell_m, np.array(part.occupancy.shape) * part.cell_m
+    corners = np.array([[0.0, 0.0], [1, 0], [0, 1], [1, 1]]) * size
+    turned = into_frame(corners, (0.0, 0.0, turn))
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    shape = np.ceil((high - low) / cell_m).astype(int)
+    occupied, free = np.zeros((2, *shape), np.int16)
+    indices = np.indices(tuple(shape), sparse=True)
+    for dx in range(_SUB):
+        for dy in range(_SUB):
+            x, y = (
+                np.broadcast_to(low[axis] + (indices[axis] + (d + 0.5) / _SUB) * cell_m, shape)
+                for axis, d in enumerate((dx, dy))
+            )
+            places = out_of_frame(np.stack([x.ravel(), y.ravel()], axis=-1), (0.0, 0.0, turn))
+            cells = np.floor(places / cell_m).astype(np.int64)
+            inside = ((cells >= 0) & (cells < part.occupancy.shape)).all(axis=1)
+            found = np.full(len(cells), UNKNOWN, np.int8)
+            found[inside] = part.occupancy[tuple(cells[inside].T)]
+            occupied += (found == OCCUPIED).reshape(shape)
+            free += (found == FREE).reshape(shape)
+    occupancy = np.full(tuple(shape), UNKNOWN, np.int8)
+    occupancy[free > _SUB * _SUB / 2] = FREE
+    occupancy[occupied > 0] = OCCUPIED
+    corner = out_of_frame(out_of_frame(low[None], (0.0, 0.0, turn)), part.origin)[0]
+    origin = (float(corner[0]), float(corner[1]), part.origin[2] + turn)
+    return OccupancyGrid(occupancy, cell_m, origin, grid.frame), turn
+
+
+CORRIDOR_CELL_M = 0.05
+MARGIN_M = 0.25  # around the circle in which the robot turns
+
+
+def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
+    """The corridor, along the directions that were mostly driven.
+
+    `turn_m` is what the robot needs around its middle to turn.
+    """
+    step = np.diff(poses.places_m, axis=0)
+    length = np.hypot(*step.T)
+    yaw = main_direction(np.arctan2(step[:, 1], step[:, 0]), length * (length <= JUMP_M))
+    places = into_frame(poses.places_m, (0.0, 0.0, yaw))
+    way = way_between(places)
+    reach = turn_m + MARGIN_M
+    low = way.min(axis=0) - reach - 2 * CORRIDOR_CELL_M
+    cells = np.floor((way - low) / CORRIDOR_CELL_M).astype(np.int64)
+    shape = cells.max(axis=0) + 2 + int(reach / CORRIDOR_CELL_M) + 2
+    seen = np.zeros(tuple(shape), np.bool_)
+    seen[tuple(cells.T)] = True
+    free = ndimage.distance_transform_edt(~seen) * CORRIDOR_CELL_M <= reach
+    corner = out_of_frame(low[None], (0.0, 0.0, yaw))[0]
+    occupancy = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
+    return OccupancyGrid(
+        occupancy, CORRIDOR_CELL_M, (float(corner[0]), float(corner[1]), yaw), poses.frame
+    )
+
+
+def way_between(places_m: F64) -> F64:
+    """Places (N, 2) with points in between, no cell apart, where one drove from one to the next."""
+    parts = [places_m]
+    length = np.hypot(*np.diff(places_m, axis=0).T)
+    for index in np.flatnonzero((length > CORRIDOR_CELL_M / 2) & (length <= JUMP_M)):
+        start, end = places_m[index], places_m[index + 1]
+        count = int(length[index] / (CORRIDOR_CELL_M / 2)) + 1
+        share = np.arange(1, count)[:, None] / count
+        parts.append(start + share * (end - start))
+    return np.concatenate(parts)
+
+
+def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
+    """Intersection over union of the occupied cells of two maps, within one cell.
+
+    A cell counts as shared where the other map has an occupied cell within one cell (of the coarser
+    of both, diagonals too). Of `known` only what lies where `made` knows something, or next to it,
+    counts. None where one of them has no walls there.
+    """
+    near_m = 1.5 * max(made.cell_m, known.cell_m)
+    mine, theirs = _wall_middles(made), _wall_middles(known)
+    seen = ndimage.binary_dilation(made.occupancy != UNKNOWN, np.ones((3, 3), np.bool_))
+    cells, inside = made.cells_at(theirs)
+    inside[inside] = seen[tuple(cells[inside].T)]
+    theirs = theirs[inside]
+    if not len(mine) or not len(theirs):
+        return None
+    # Cells may differ in size, and walls are lines: each counts by its length.
+    a, b = made.cell_m, known.cell_m
+    shared_mine = float((cKDTree(theirs).query(mine)[0] <= near_m).sum()) * a
+    shared_theirs = float((cKDTree(mine).query(theirs)[0] <= near_m).sum()) * b
+    shared = (shared_mine + shared_theirs) / 2
+    alone = len(mine) * a - shared_mine + len(theirs) * b - shared_theirs
+    return shared / (shared + alone)
+
+
+def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
+    """The share of a lidar's returns that lie within NEAR_M of an occupied cell of a map.
+
+    Returns farther than `WITHIN_M` from the lidar do not count: an error of the pose's yaw moves
+    them. None where there are too few to say.
+    """
+    nearby = [
+        hit[np.hypot(*(hit - origin).T) < WITHIN_M]
+        for origin, hit in zip(scans.origin_m, scans.hit_m, strict=True)
+    ]
+    returns = np.concatenate([np.zeros((0, 2)), *nearby])
+    walls = _wall_middles(grid)
+    if len(returns) < MIN_RETURNS or not len(walls):
+        return None
+    apart = cKDTree(walls).query(returns[:: len(returns) // RETURNS + 1])[0]
+    return float((apart <= NEAR_M + grid.cell_m / 2).mean())
+
+
+def _wall_middles(grid: OccupancyGrid) -> F64:
+    """The middles (N, 2) of the occupied cells, in the map's frame."""
+    cells = np.argwhere(grid.occupancy == OCCUPIED)
+    return out_of_frame(np.asarray((cells + 0.5) * grid.cell_m, np.float64), grid.origin)
+
+
+CELL_M = 0.05
+REACH_M = 8.0  # of a beam: what is further is less well known than a cell
+HIT, MISS = 0.9, -0.5  # log-odds
+MOST = 4.0  # of the log-odds either way
+FREE_BELOW, OCCUPIED_ABOVE = -0.9, 0.6
+_APART = 4  # beams, of two whose ends show which way a wall runs: neighbours' are mostly noise
+_WALL_STEP_M = 0.6  # between their ends, on one wall
+
+
+def scan_map(
+    scans: PlacedScans, driven_m: F64, room_m: float, frame: str, notes: list[str]
+) -> tuple[OccupancyGrid, float]:
+    """The map that scans show, its axes along the walls, and how well they agree on it (a share).
+
+    `driven_m` (N, 2) are the robot's places, which are free, `room_m` is how far around them.
+    """
+    yaw = main_direction(*_walls(scans))
+    turned = (0.0, 0.0, yaw)
+    origins = into_frame(scans.origin_m, turned)
+    hits = [into_frame(hit, turned) for hit in scans.hit_m]
+    driven = into_frame(way_between(driven_m), turned)
+    ends = [_cut(origin, hit)[0] for origin, hit in zip(origins, hits, strict=True)]
+    every = np.concatenate([origins, driven, *ends])
+    low = every.min(axis=0) - 3 * CELL_M
+    shape = tuple(np.ceil((every.max(axis=0) - low) / CELL_M).astype(int) + 3)
+    odds, ended = _traced(origins, hits, low, shape)
+    occupancy = np.full(shape, UNKNOWN, np.int8)
+    occupancy[odds <= FREE_BELOW] = FREE
+    walls = odds >= OCCUPIED_ABOVE
+    walls &= ~_speckles(walls, occupancy, notes)
+    occupancy[walls] = OCCUPIED
+    way = np.zeros(shape, np.bool_)
+    way[tuple(_cells(driven, low).T)] = True
+    occupancy[ndimage.distance_transform_edt(~way) * CELL_M <= room_m + CELL_M] = FREE
+    wide = ndimage.binary_dilation(occupancy == OCCUPIED, np.ones((3, 3), np.bool_))
+    share = float(ended[wide].sum() / max(ended.sum(), 1))
+    corner = out_of_frame(low[None], turned)[0]
+    origin = (float(corner[0]), float(corner[1]), yaw)
+    return OccupancyGrid(occupancy, CELL_M, origin, frame), share
+
+
+def _walls(scans: PlacedScans) -> tuple[F64, F64]:
+    """Directions and lengths of the pieces of wall between the ends of beams."""
+    steps = []
+    for hit, beam in zip(scans.hit_m, scans.order, strict=True):
+        if len(hit) > _APART:
+            beams = beam[_APART:] - beam[:-_APART]
+            steps.append((hit[_APART:] - hit[:-_APART])[beams == beams.min()])
+    step = np.concatenate([np.zeros((0, 2)), *steps])
+    length = np.hypot(*step.T)
+    on_wall = (length > 0) & (length < _WALL_STEP_M)
+    return np.arctan2(step[on_wall, 1], step[on_wall, 0]), length[on_wall]
+
+
+def _cut(origin: F64, hit: F64) -> tuple[F64, F64, Bools]:
+    """The ends of beams (B, 2) within REACH_M, their lengths (B,), and which are hits (B,)."""
+    along = hit - origin
+    length = np.hypot(*along.T)
+    share = np.minimum(1.0, REACH_M / np.maximum(length, 1e-9))
+    return origin + along * share[:, None], length * share, np.asarray(length <= REACH_M)
+
+
+def _cells(places: F64, low: F64) -> Ints:
+    return np.floor((places - low) / CELL_M).astype(np.int64)
+
+
+def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> tuple[F64, Ints]:
+    """Log-odds (X, Y) of being occupied, and how many scans ended in each cell (X, Y)."""
+    odds = np.zeros(shape)
+    flat, ended = odds.reshape(-1), np.zeros(odds.size, np.int64)
+    passed, stopped = np.zeros((2, odds.size), np.bool_)  # of one scan
+    for origin, hit in zip(origins, hits, strict=True):
+        if not len(hit):
+            continue
+        ends, length, stops = _cut(origin, hit)
+        at = np.arange(0.0, float(length.max()), 0.7 * CELL_M)
+        beam, step = np.nonzero(at[None, :] < length[:, None] - CELL_M / 2)
+        way = origin + (ends - origin)[beam] * (at[step] / length[beam])[:, None]
+        stopped[np.ravel_multi_index(tuple(_cells(ends[stops], low).T), shape)] = True
+        passed[np.ravel_multi_index(tuple(_cells(way, low).T), shape)] = True
+        stop = np.flatnonzero(stopped)
+        passed[stop] = False
+        pass_ = np.flatnonzero(passed)
+        flat[pass_] = np.maximum(flat[pass_] + MISS, -MOST)
+        flat[stop] = np.minimum(flat[stop] + HIT, MOST)
+        ended[stop] += 1
+        stopped[stop] = passed[pass_] = False
+    return odds, ended.reshape(shape)
+
+
+def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
+    """Single cells of wall within free floor: a person's legs, or one beam gone wrong. Free."""
+    neighbours = ndimage.convolve(walls.astype(np.int8), np.ones((3, 3), np.int8), mode="constant")
+    alone = walls & (neighbours == 1)
+    surrounded = ndimage.convolve(
+        (occupancy == FREE).astype(np.int8), np.ones((3, 3), np.int8), mode="constant"
+    )
+    alone &= surrounded >= 7
+    if alone.any():
+        occupancy[alone] = FREE
+        notes.append(f"{int(alone.sum()):,} single cells of wall on free floor: left out")
+    return np.asarray(alone, np.bool_)
