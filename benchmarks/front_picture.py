@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from restock.cli import main as restock
-from restock.train.twin.env.camera import Camera
+from restock.train.twin.env.render import Camera
 from restock.twin import PlannerFollower, WarehouseVectorEnv
 
 HEIGHT_PX, SCENE_PX, CHART_PX, GAP_PX = 330, 440, 500, 10

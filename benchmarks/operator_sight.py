@@ -23,7 +23,7 @@ from restock.arrays import F64, Bools, Ints
 from restock.stats import interval_text, wilson
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.obstacles import PARKED_M
+from restock.train.twin.floors.layout import PARKED_M
 
 EVALUATION_SEED = 20_000  # that of targets.py
 RAY_POINTS = 41

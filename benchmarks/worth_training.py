@@ -41,7 +41,7 @@ from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.obstacles import PEOPLE
+from restock.train.twin.floors.layout import PEOPLE
 from restock.train.twin.missions.registry import KINDS
 from restock.train.twin.physics.episode import Episode, EpisodeSpec, draw_episode
 

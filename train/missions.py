@@ -16,9 +16,8 @@ from restock.train.evaluation.references import reference
 from restock.train.feed.logs import Coded
 from restock.train.feed.practice import Practice
 from restock.train.feed.practice_shares import logged_shares
+from restock.train.twin.env.episode_queue import MissionArms, MissionOrders
 from restock.train.twin.env.interface import Twin
-from restock.train.twin.env.mission_arms import MissionArms
-from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec

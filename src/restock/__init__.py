@@ -35,7 +35,7 @@ def _register() -> None:
 
     gymnasium.register(
         id="restock/Warehouse-v0",
-        entry_point="restock.train.twin.env.single_env:WarehouseEnv",
+        entry_point="restock.train.twin.env.vector_env:WarehouseEnv",
         vector_entry_point="restock.train.twin.env.vector_env:WarehouseVectorEnv",
     )
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from restock.train.twin.calibration.twin_gap import write_gap as write_gap
     from restock.train.twin.drivers.policies import PlannerFollower as PlannerFollower
     from restock.train.twin.drivers.policies import RandomPolicy as RandomPolicy
-    from restock.train.twin.env.single_env import WarehouseEnv as WarehouseEnv
+    from restock.train.twin.env.vector_env import WarehouseEnv as WarehouseEnv
     from restock.train.twin.env.vector_env import WarehouseVectorEnv as WarehouseVectorEnv
     from restock.train.twin.floors.floors import open_floors as open_floors
     from restock.train.twin.physics.episode import EpisodeSpec as EpisodeSpec
@@ -41,8 +41,7 @@ else:
             "restock.train.twin.calibration.open_loop": ["log_segments", "replay_segments"],
             "restock.train.twin.calibration.twin_gap": ["GapConfig", "write_gap"],
             "restock.train.twin.drivers.policies": ["PlannerFollower", "RandomPolicy"],
-            "restock.train.twin.env.single_env": ["WarehouseEnv"],
-            "restock.train.twin.env.vector_env": ["WarehouseVectorEnv"],
+            "restock.train.twin.env.vector_env": ["WarehouseEnv", "WarehouseVectorEnv"],
             "restock.train.twin.floors.floors": ["open_floors"],
             "restock.train.twin.physics.episode": ["EpisodeSpec", "draw_episode"],
             "restock.train.twin.physics.perturbation": [

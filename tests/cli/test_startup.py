@@ -103,7 +103,7 @@ def test_what_few_runs_use_is_not_imported_by_all(module: str, slow: set[str]) -
 def test_the_environment_is_registered_whichever_is_imported_first(order: str) -> None:
     code = f"{order}; print(gymnasium.spec('restock/Warehouse-v0').entry_point)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.strip() == "restock.train.twin.env.single_env:WarehouseEnv", done.stderr
+    assert done.stdout.strip() == "restock.train.twin.env.vector_env:WarehouseEnv", done.stderr
 
 
 def test_pandas_that_a_command_did_not_look_for_works_once_it_is_imported() -> None:

@@ -43,8 +43,12 @@ from restock.replay.store.store import Store
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.recording.bag_writer import Format
-from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
-from restock.train.twin.recording.fleet import DrivenMission, Fleet
+from restock.train.twin.recording.fleet import (
+    BehaviourPolicies,
+    DrivenMission,
+    ExternalPolicy,
+    Fleet,
+)
 from restock.train.twin.recording.missions import HANDOVER, VERSIONS, Mission, schedule
 from restock.train.twin.recording.publish import ACCEL_LSB_MPS2, GYRO_LSB_RADPS, LIDAR_LSB_M
 from restock.train.twin.recording.recorder import HARDWARE, NOISELESS, RecordingPlan, record

@@ -71,7 +71,7 @@ MAY_IMPORT = {
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
         "dqn evaluation/off_policy feed run twin/drivers twin/missions twin/env twin/floors"
-        " twin/physics twin/survey replay/panel replay/ring replay/store ingest/live"
+        " twin/physics replay/panel replay/ring replay/store ingest/live"
         " ingest/profile ingest/task"
     ),
     "train/comparison": (
@@ -88,7 +88,7 @@ MAY_IMPORT = {
     "train/study": "comparison dqn evaluation libraries run replay/panel twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
-    "train/twin/floors": "",
+    "train/twin/floors": "ingest/task",
     "train/twin/missions": "twin/floors",
     "train/twin/physics": "twin/floors twin/missions ingest/task",
     "train/twin/env": (
@@ -110,7 +110,7 @@ MAY_IMPORT = {
     "report/look": "train/twin/missions",
     "report/run": (
         "look replay/panel replay/plan replay/store train/evaluation train/run"
-        " train/twin/calibration train/twin/floors train/twin/survey"
+        " train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",
     "report/study": "look",

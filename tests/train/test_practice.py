@@ -30,7 +30,7 @@ from restock.train.loop import train
 from restock.train.missions import reference_success
 from restock.train.prepare import make_twin, prepare_new, prepare_resumed
 from restock.train.run.run import Run
-from restock.train.twin.env.mission_arms import MissionArm
+from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.perturbation import Schedule
 

@@ -11,7 +11,7 @@ import pytest
 
 from restock.errors import ConfigError
 from restock.train.twin.env import camera as camera_module
-from restock.train.twin.env.camera import Camera
+from restock.train.twin.env.render import Camera
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 

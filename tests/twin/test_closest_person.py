@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.obstacles import FORKLIFT_HALF_M, PARKED_M, PEOPLE, PERSON_RADIUS_M
+from restock.train.twin.floors.layout import FORKLIFT_HALF_M, PARKED_M, PEOPLE, PERSON_RADIUS_M
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.traffic import HIDDEN, WALKING, Traffic
+from restock.train.twin.physics.scenery import HIDDEN, WALKING, Traffic
 
 ROBOT_HALF_M = (0.35, 0.25)
 places = st.floats(-4.0, 4.0)

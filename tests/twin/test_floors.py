@@ -27,8 +27,8 @@ from restock.ingest.profile.profile import load_profile
 from restock.train.describe import describe_run
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.floor_report import describe_floor
+from restock.train.twin.env.navigation import BlockFinder
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.floor_file import read_floor, write_floor
 from restock.train.twin.floors.floors import (
     RECIPES,

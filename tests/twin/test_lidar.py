@@ -19,7 +19,7 @@ from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.robot import Lidar as LidarLimits
 from restock.ingest.task.robot import Robot
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.obstacles import pallet_half_m
+from restock.train.twin.floors.layout import pallet_half_m
 from restock.train.twin.physics.model import passed_over
 
 needs_native = pytest.mark.skipif(not native.IS_THERE, reason=native.state())

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 KIND = '''
-from restock.train.twin.floors.obstacles import Walk
+from restock.train.twin.floors.layout import Walk
 from restock.train.twin.missions.mission import Mission, Staged
 import numpy as np
 

@@ -10,13 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from restock.ingest.profile.profile import load_profile
-from restock.train.twin.floors.layout import default_warehouse
-from restock.train.twin.floors.obstacles import NO_PATCH, PATCHES, no_pallets
+from restock.train.twin.floors.layout import NO_PATCH, PATCHES, default_warehouse, no_pallets
 from restock.train.twin.physics.contact import friction_at
 from restock.train.twin.physics.episode import Episode, EpisodeSpec
 from restock.train.twin.physics.model import build_model
 from restock.train.twin.physics.perturbation import RANGES, Perturbation
-from restock.train.twin.physics.robot import base_controller
 from restock.train.twin.physics.robot_model import (
     ACCEL_LIMIT,
     CASTER_RADIUS_M,
@@ -26,7 +24,7 @@ from restock.train.twin.physics.robot_model import (
     WHEEL_RADIUS_M,
     stand_in,
 )
-from restock.train.twin.physics.simulation import BLOCK_S, Simulation
+from restock.train.twin.physics.simulation import BLOCK_S, Simulation, base_controller
 
 TASK = load_profile("warehouse_amr").task
 GRAVITY = 9.81

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from restock.train.twin.env.navigation import BlockFinder
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
-from restock.train.twin.floors.block_finder import BlockFinder
 from restock.train.twin.floors.layout import default_warehouse
 from restock.train.twin.floors.planner import CELL_M, PLAN_POINTS, Planner
 from restock.train.twin.missions.mission import length_m

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from support.long import one_in
 from support.paths import ROOT
 
-from restock.train.twin.floors.obstacles import PARKED_M
+from restock.train.twin.floors.layout import PARKED_M
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.recording.bag_writer import Format
 from restock.train.twin.recording.messages import typestore

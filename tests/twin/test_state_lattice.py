@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from restock.train.twin.floors.floors import open_floors
-from restock.train.twin.floors.layout import Warehouse, default_warehouse
-from restock.train.twin.floors.obstacles import PALLET_HALF_M
+from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, default_warehouse
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import (
     Motion,

@@ -26,9 +26,9 @@ from restock.train.evaluation.evaluate import EpisodeResult, Stepper, run_episod
 from restock.train.evaluation.evaluation_plan import CLEAN, EvaluationPlan, make_policy
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
-from restock.train.twin.env.draw import draw_map
 from restock.train.twin.env.interface import Step
-from restock.train.twin.floors.obstacles import PEOPLE
+from restock.train.twin.env.render import draw_map
+from restock.train.twin.floors.layout import PEOPLE
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.words import policy_words, quoted
 

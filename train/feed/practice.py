@@ -1,6 +1,6 @@
 """Practice: which missions the twin gives next, by arm, and a record of what it gave.
 
-An arm is a kind of missions (`restock.train.twin.env.mission_arms`). The rules:
+An arm is a kind of missions (`restock.train.twin.env.episode_queue`). The rules:
 
 - natural: as `env.conditions`, `env.missions` and the floors say; the twin is left as it is;
 - even: every arm alike; shares: as given; logs: the kinds as often as the logs' episodes met them;
@@ -32,8 +32,8 @@ from restock.train.dqn.config import PracticeConfig
 from restock.train.feed.collector import EndedEpisode
 from restock.train.feed.logs import Logs
 from restock.train.feed.practice_shares import logged_shares, moved, unordered, with_floors
+from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.interface import ArmedTwin, KindsTwin, Twin
-from restock.train.twin.env.mission_arms import MissionArm
 
 MOVING = ("success", "regret")  # rules whose shares follow what happens
 FLOOR = 0.05  # of an arm under those, unless the config says otherwise

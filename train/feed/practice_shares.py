@@ -9,7 +9,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.train.feed.logs import Coded
-from restock.train.twin.env.mission_arms import MissionArm
+from restock.train.twin.env.episode_queue import MissionArm
 
 
 def with_floors(weights: F64, floors: F64) -> F64:

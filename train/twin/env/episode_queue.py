@@ -6,20 +6,336 @@ Fixed episodes come in their order, then drawn ones.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError, expect
+from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
-from restock.train.twin.env.mission_arms import MissionArm, MissionArms, floor_place, perturbed
-from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.env.floor_report import refuse_unfit
 from restock.train.twin.floors.layout import Warehouse
 from restock.train.twin.floors.planner import Planner
-from restock.train.twin.missions.registry import KINDS
-from restock.train.twin.physics.episode import EpisodeSpec
+from restock.train.twin.missions.registry import KINDS, MISSIONS
+from restock.train.twin.physics.episode import EpisodeSpec, draw_episode
 from restock.train.twin.physics.perturbation import Schedule
+
+TRIES = 300  # seeds that are tried for a way through a zone
+WAY_POINTS = 24  # along each leg of a plan at which zones are looked up
+
+
+@dataclass(frozen=True)
+class _Floor:
+    """A floor that an order can be driven on, and the zone there."""
+
+    place: int  # among the floors
+    zone: str | None
+
+
+class MissionOrders:
+    """Orders that the given floors can hold.
+
+    `shares` (K,) are their parts of all missions.
+
+    Raises:
+        ConfigError: a kind, floor or zone that is not there, a floor without room for a kind, or
+            hours in place of missions; names it.
+    """
+
+    def __init__(
+        self,
+        orders: Sequence[MissionOrder],
+        floors: Sequence[Warehouse],
+        planners: Sequence[Planner],
+        *,
+        where: str,
+    ) -> None:
+        self.orders, self._floors, self._planners = list(orders), list(floors), list(planners)
+        self._where = where
+        self._on = [self._fitting(number, order) for number, order in enumerate(orders)]
+        amounts = np.array([float(order.missions or 0) for order in orders])
+        self.shares = amounts / amounts.sum()
+
+    def spec(self, number: int, seed: int) -> EpisodeSpec:
+        """An episode of an order: the same for the same seed.
+
+        Raises:
+            ConfigError: no way came through its zone.
+        """
+        order, on = self.orders[number], self._on[number]
+        kind = str(order.kind)
+        rng = np.random.default_rng([seed, number])
+        for _ in range(TRIES):
+            floor = on[int(rng.integers(len(on)))]
+            drawn = int(rng.integers(1 << 31))
+            # With one floor it goes without saying, and the episode is called as it always was.
+            named = self._floors[floor.place].name if len(self._floors) > 1 else None
+            spec = EpisodeSpec(kind, drawn, layout=named)
+            if floor.zone is None or self._comes_through(spec, floor):
+                return spec
+        raise ConfigError(
+            f"none of {TRIES} routes of a {kind} mission passes through {order.zone}",
+            where=f"{self._where}, missions[{number}]",
+            remedy="leave out `zone`, or choose one on a robot's route",
+        )
+
+    def _comes_through(self, spec: EpisodeSpec, floor: _Floor) -> bool:
+        warehouse = self._floors[floor.place]
+        plan = draw_episode(spec, warehouse, self._planners[floor.place]).plan_m  # (P, 2)
+        along = np.linspace(0.0, 1.0, WAY_POINTS)[:, None, None]
+        points = (plan[:-1] + along * (plan[1:] - plan[:-1])).reshape(-1, 2)
+        return floor.zone in warehouse.zone_of(points[:, 0], points[:, 1])
+
+    def _fitting(self, number: int, order: MissionOrder) -> list[_Floor]:
+        where = f"{self._where}, missions[{number}]"
+        if order.kind is None or order.missions is None:
+            raise ConfigError(
+                "asks for hours of logging, but the twin drives a number of missions",
+                where=where,
+                remedy=f"give `kind` ({', '.join(KINDS)}) and `missions`",
+            )
+        if order.kind not in KINDS:
+            raise ConfigError(
+                f"the twin has no missions of kind {order.kind!r}",
+                where=where,
+                remedy=f"it has {', '.join(KINDS)}",
+            )
+        names = [floor.name for floor in self._floors]
+        if order.layout is not None and order.layout not in names:
+            raise ConfigError(
+                f"the floor {order.layout!r} is not among the floors of this run",
+                where=where,
+                remedy=f"they are {_some(names)}: choose one of these, or add that floor "
+                "(`layouts`)",
+            )
+        chosen = [
+            (place, floor)
+            for place, floor in enumerate(self._floors)
+            if order.layout in (None, floor.name)
+        ]
+        if order.zone is not None:
+            fitting = [_Floor(place, _zone_on(floor, order.zone)) for place, floor in chosen]
+            fitting = [one for one in fitting if one.zone is not None]
+            if not fitting:
+                zones = dict.fromkeys(zone for _, floor in chosen for zone in floor.zones)
+                raise ConfigError(
+                    f"no floor of this run has a zone {order.zone!r}",
+                    where=where,
+                    remedy=f"the zones are {_some(list(zones))}",
+                )
+        else:
+            fitting = [_Floor(place, None) for place, _ in chosen]
+        refuse_unfit([self._floors[one.place] for one in fitting], [order.kind])
+        return fitting
+
+
+def _zone_on(floor: Warehouse, zone: str) -> str | None:
+    """A zone's name on a floor; rows of other floors than the default say `FLOOR/ZONE`."""
+    bare = zone.removeprefix(f"{floor.name}/")
+    return bare if bare in floor.zones else None
+
+
+def _some(names: list[Any]) -> str:
+    return ", ".join(map(str, names[:12])) + (", …" if len(names) > 12 else "")
+
+
+BLOCK, LAYOUT = "block", "layout"
+PARTS = ("low", "high")  # halves of a range of the perturbation
+BLOCK_TRIES = 300  # seeds that are tried for a block
+_PROBES = 24  # seeds that show which blocks a floor has room for
+
+
+@dataclass(frozen=True)
+class MissionArm:
+    """A kind of missions; "" and () where the seed decides."""
+
+    name: str
+    kind: str
+    share: float  # natural: of the missions, where nothing is practised
+    block: str = ""  # partial | full
+    layout: str = ""
+    ranges: tuple[tuple[str, float, float], ...] = ()  # of the schedule: field, low, high
+    order: int = -1  # of the ordered missions
+
+    def holds(self, kind: str, block: str, layout: str, values: Mapping[str, float]) -> bool:
+        """Whether an episode is of this arm; `values` are those of its perturbation."""
+        return (
+            self.order < 0
+            and kind == self.kind
+            and self.block in ("", block)
+            and self.layout in ("", layout)
+            and all(low <= values.get(name, low) <= high for name, low, high in self.ranges)
+        )
+
+
+class MissionArms:
+    """The arms of a twin's floors, shares of kinds, orders and schedule, split `by` what is asked.
+
+    `by` holds "block", "layout" and fields of the schedule's ranges, each split in two halves.
+
+    Raises:
+        ConfigError: `by` names something else.
+    """
+
+    def __init__(
+        self,
+        floors: Sequence[Warehouse],
+        planners: Sequence[Planner],
+        conditions: Mapping[str, float],
+        *,
+        by: Sequence[str],
+        schedule: Schedule | None = None,
+        orders: MissionOrders | None = None,
+        orders_share: float = 0.0,
+    ) -> None:
+        self._floors, self._planners = list(floors), list(planners)
+        self._place = {floor.name: place for place, floor in enumerate(floors)}
+        self._schedule, self._orders = schedule, orders
+        ranges = {} if schedule is None else schedule.ranges
+        unknown = [name for name in by if name not in (BLOCK, LAYOUT, *ranges)]
+        if unknown:
+            raise ConfigError(
+                f"missions cannot be distinguished by {', '.join(map(repr, unknown))}",
+                where="practice.by",
+                remedy=f"give {', '.join((BLOCK, LAYOUT, *ranges))}"
+                + ("" if ranges else "; fields of env.perturbation, where it is a schedule"),
+            )
+        left = 1.0 if orders is None else 1.0 - orders_share
+        total = sum(conditions.values())
+        arms = [
+            MissionArm(kind, kind, left * part / total)
+            for kind, part in conditions.items()
+            if left * part  # a kind without a share is evaluated, and never practised
+        ]
+        if LAYOUT in by:
+            arms = [one for arm in arms for one in self._by_layout(arm)]
+        if BLOCK in by:
+            arms = [one for arm in arms for one in self._by_block(arm)]
+        for field in by:
+            if field in ranges:
+                arms = [one for arm in arms for one in _by_range(arm, field, ranges[field])]
+        if orders is not None:
+            arms += [
+                MissionArm(
+                    f"missions[{number}] {order.kind}"
+                    + "".join(f" {part}" for part in (order.zone, order.layout) if part),
+                    str(order.kind),
+                    orders_share * float(orders.shares[number]),
+                    order=number,
+                )
+                for number, order in enumerate(orders.orders)
+            ]
+        self.arms: list[MissionArm] = arms
+
+    def spec(self, number: int, seed: int) -> EpisodeSpec:
+        """A mission of an arm, with its perturbation: the same for the same seed.
+
+        Raises:
+            ConfigError: none of many seeds had the arm's block.
+        """
+        arm = self.arms[number]
+        if arm.order >= 0 and self._orders is not None:
+            return perturbed(self._orders.spec(arm.order, seed), self._schedule)
+        layout, rng = arm.layout or None, np.random.default_rng([seed, 3])
+        for _ in range(BLOCK_TRIES):
+            spec = EpisodeSpec(arm.kind, seed, layout=layout)
+            if not arm.block or self._block(spec) == arm.block:
+                return perturbed(spec, self._narrowed(arm))
+            seed = int(rng.integers(1 << 31))
+        raise ConfigError(
+            f"none of {BLOCK_TRIES} seeds gave a mission of {arm.name}",
+            where="practice",
+            remedy="its floor hardly has room for it: leave `block` out of practice.by",
+        )
+
+    def _narrowed(self, arm: MissionArm) -> Schedule | None:
+        """What draws an arm's perturbations: the schedule, in the arm's part of its ranges."""
+        ranges = {name: (low, high) for name, low, high in arm.ranges}
+        if self._schedule is None or not ranges:
+            return self._schedule
+        return msgspec.structs.replace(self._schedule, ranges=self._schedule.ranges | ranges)
+
+    def _block(self, spec: EpisodeSpec) -> str:
+        place = floor_place(spec, self._place)
+        return draw_episode(spec, self._floors[place], self._planners[place]).block
+
+    def _by_layout(self, arm: MissionArm) -> list[MissionArm]:
+        names = list(self._place)
+        if len(names) == 1:
+            return [arm]
+        share = arm.share / len(names)
+        return [
+            replace(arm, name=f"{arm.name} on {name}", layout=name, share=share) for name in names
+        ]
+
+    def _by_block(self, arm: MissionArm) -> list[MissionArm]:
+        if not MISSIONS[arm.kind].blocks:
+            return [arm]
+        found = self._blocks(arm)
+        name, _, floor = arm.name.partition(" on ")
+        floor = f" on {floor}" if floor else ""
+        return [
+            replace(arm, name=f"{name} ({block}){floor}", block=block, share=arm.share / len(found))
+            for block in found
+        ]
+
+    def _blocks(self, arm: MissionArm) -> list[str]:
+        """The blocks that an arm's floors have room for."""
+        found: set[str] = set()
+        blocks = list(MISSIONS[arm.kind].blocks)
+        for seed in range(_PROBES):
+            try:
+                found.add(self._block(EpisodeSpec(arm.kind, seed, layout=arm.layout or None)))
+            except ConfigError:  # no room at all: the floors are asked about kinds elsewhere
+                break
+            if len(found) == len(blocks):
+                break
+        return [block for block in blocks if block in found] or [""]
+
+
+def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[MissionArm]:
+    low, high = ends
+    edges: F64 = np.linspace(low, high, len(PARTS) + 1)
+    return [
+        replace(
+            arm,
+            name=f"{arm.name}, {field} {part}",
+            share=arm.share / len(PARTS),
+            ranges=(*arm.ranges, (field, float(edges[number]), float(edges[number + 1]))),
+        )
+        for number, part in enumerate(PARTS)
+    ]
+
+
+def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
+    """An episode with what a schedule draws by its seed; as it is without a schedule."""
+    if schedule is None:
+        return spec
+    rng = np.random.default_rng([spec.seed, 1])
+    return msgspec.structs.replace(spec, perturbation=schedule.draw(rng))
+
+
+def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
+    """Which floor an episode is on, among those named: by name, or by its seed.
+
+    Raises:
+        ConfigError: there is no floor of that name.
+    """
+    if spec.layout is None:
+        if len(places) == 1:
+            return 0
+        return int(np.random.default_rng([spec.seed, 2]).integers(len(places)))
+    if spec.layout not in places:
+        raise ConfigError(
+            f"an episode needs layout {spec.layout!r}, which is not among the environment's"
+            f" {len(places)}",
+            where=f"episode {spec.condition}/{spec.seed}",
+            remedy="make the environment with that layout",
+        )
+    return places[spec.layout]
 
 
 class EpisodeQueue(Stateful):

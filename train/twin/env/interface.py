@@ -19,7 +19,7 @@ from restock.ingest.task.signals import Signals
 from restock.toml import Checked
 
 if TYPE_CHECKING:  # an episode needs MuJoCo; a run's config does not
-    from restock.train.twin.env.mission_arms import MissionArm
+    from restock.train.twin.env.episode_queue import MissionArm
     from restock.train.twin.physics.episode import EpisodeSpec
 
 AFTER_LOGS = 0.2  # the offline phase has learnt to drive: more exploration would only undo that

@@ -21,18 +21,26 @@ Several may hold at once: the text of a step names all of them, sorted, with com
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.ingest.task.label_scores import truth_text
 from restock.ingest.task.route import view_route
-from restock.ingest.task.task import Task
+from restock.ingest.task.signals import Signals
+from restock.ingest.task.task import Task, reached_goal
 from restock.state import Stateful
-from restock.train.twin.floors.obstacles import AGENTS, pallet_half_m
+from restock.train.twin.env.interface import Info
+from restock.train.twin.floors.layout import AGENTS, pallet_half_m
 from restock.train.twin.missions.mission import Situation
 from restock.train.twin.missions.registry import MISSIONS
 from restock.train.twin.physics.simulation import Simulation
+
+if TYPE_CHECKING:
+    from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
 
 AFTERMATH = "recovery"
 SCORED = {one.name: one.is_true for one in MISSIONS.values() if one.is_true is not None}
@@ -122,3 +130,44 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
     half = pallet_half_m(pallets[:, None, :, 2]) + margin_m
     return np.asarray((gap <= half).all(axis=-1).any(axis=-1), np.bool_)
+
+
+def info_now(env: WarehouseVectorEnv) -> Info:
+    """What runs in each environment, and the signals that are there."""
+    return {
+        "signals": {name: column.copy() for name, column in env.signals.items()},
+        "episode_condition": env.episode_condition.copy(),
+        "block": env.block.copy(),
+        "episode_seed": env.episode_seed.copy(),
+        "perturbation": env.perturbation_name.copy(),
+        "perturbation_values": env.perturbation_values.copy(),
+        "layout": env.layout_names[env.layout],
+        "floor": env.floor_objects[env.layout],
+        "episode_number": env.episode_number.copy(),
+        "mission_arm": env.mission_arm.copy(),
+        "episode_steps": env.steps.copy(),
+        "bumps": env.bumps.copy(),
+        "true_pose": env.simulation.pose(),
+    }
+
+
+def info_after(
+    env: WarehouseVectorEnv,
+    after: Signals,
+    progress_m: F64,
+    condition: NDArray[np.str_],
+    ended: Bools,
+) -> Info:
+    """Of a step that led to the signals `after`; `condition` (N,) is what was so over it."""
+    sim = env.simulation
+    return info_now(env) | {
+        "signals": after,
+        "progress_m": progress_m,
+        "true_condition": condition,
+        "true_exposure": env.truth.exposure(),
+        "success": ended & reached_goal(env.task, after) & (env.bumps == 0),
+        "invalid": sim.diverged.copy(),
+        "travelled_m": sim.travelled_m,
+        # Not NaN, which Gymnasium's checker takes for two different values.
+        "closest_person_m": np.nan_to_num(sim.traffic.closest_m, nan=np.inf, posinf=np.inf),
+    }

@@ -5,20 +5,20 @@
     observation, reward, terminated, truncated, info = env.step(actions)
 
 Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
-rates in rad/s over the same task: see `restock.train.twin.env.action_space`.
+rates in rad/s over the same task: see `restock.train.twin.env.vector_env`.
 
 Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
 
-`info` is told of in `restock.train.twin.env.info`.
+`info` is told of in `restock.train.twin.env.truth`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import msgspec
@@ -27,31 +27,27 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from restock.arrays import F32, Ints
+from restock.arrays import F32, F64, Ints
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
-from restock.ingest.task.limiter import Limits
+from restock.ingest.task.limiter import Limits, limit
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Signals
-from restock.ingest.task.task import Task, observe, reward
+from restock.ingest.task.task import Task, nearest_action, observe, reward
 from restock.ingest.task.task import terminated as is_terminated
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.state import Stateful
-from restock.train.twin.env.action_space import ActionKind, action_space, behind_limiter
-from restock.train.twin.env.camera import Renderer, View
-from restock.train.twin.env.episode_queue import EpisodeQueue
+from restock.train.twin.env.episode_queue import EpisodeQueue, MissionArm, MissionOrders
 from restock.train.twin.env.floor_report import (
     names_and_hashes,
     refuse_other_floors,
     refuse_too_large,
     refuse_unfit,
 )
-from restock.train.twin.env.info import info_after, info_now
 from restock.train.twin.env.interface import Info, MadeAgain, Step, refuse_other_type
-from restock.train.twin.env.mission_arms import MissionArm
-from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.env.navigation import Navigation
-from restock.train.twin.env.truth import Truth
+from restock.train.twin.env.render import Renderer, View
+from restock.train.twin.env.truth import Truth, info_after, info_now
 from restock.train.twin.floors.floors import floors_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.missions.registry import DEFAULT_CONDITIONS, KINDS
@@ -60,6 +56,102 @@ from restock.train.twin.physics.perturbation import Perturbation, Schedule, find
 from restock.train.twin.physics.robot_trial import robot_model
 from restock.train.twin.physics.sensing import Sensing
 from restock.train.twin.physics.simulation import BodyState, Simulation
+
+ActionKind = Literal["discrete", "continuous"]
+# Task actions (N,), commands (N, 2) in m/s and rad/s, and what to add to `info`.
+Chosen = tuple[Ints, F64, dict[str, NDArray[Any]]]
+
+
+class DiscreteActions:
+    """`actions` (N,) index the task's actions."""
+
+    def __init__(self, task: Task, num_envs: int) -> None:
+        self._num_envs = num_envs
+        self._table = np.asarray(task.actions, np.float64)
+        self.space = gymnasium.spaces.Discrete(len(task.actions))
+
+    def read(self, actions: NDArray[Any]) -> Chosen:
+        """What these actions (N,) are. Raises ConfigError for one that is not in the table."""
+        given = _shaped(actions, (self._num_envs,))
+        with np.errstate(invalid="ignore"):
+            action = given.astype(np.int64)
+        wrong = (action != given) | (action < 0) | (action >= len(self._table))
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            raise ConfigError(
+                f"an action must be an index from 0 to {len(self._table) - 1}, got {given[row]}",
+                where=f"environment {row} of the twin",
+                remedy='for speeds and yaw rates make the environment with action="continuous"',
+            )
+        return action, self._table[action], {}
+
+
+class ContinuousActions:
+    """`actions` (N, 2): forward speed in m/s and yaw rate in rad/s, clipped to the space.
+
+    The space is what the table's actions span. `info["action"]` (N,) is the nearest of them, and
+    `info["action_residual"]` (N,) how far away it was, as the store's column of that name.
+    """
+
+    def __init__(self, task: Task, num_envs: int) -> None:
+        self._task, self._num_envs = task, num_envs
+        table = np.asarray(task.actions, np.float32)
+        self.space = gymnasium.spaces.Box(table.min(axis=0), table.max(axis=0), dtype=np.float32)
+
+    def read(self, actions: NDArray[Any]) -> Chosen:
+        """As for discrete ones. Raises ConfigError for an action that is not finite."""
+        requested = _shaped(actions, (self._num_envs, 2)).astype(np.float64)
+        if not np.isfinite(requested).all():
+            row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
+            raise ConfigError(
+                f"an action must be two finite numbers, got {requested[row].tolist()}",
+                where=f"environment {row} of the twin",
+                remedy="the policy that chose it has diverged, or its output is not scaled",
+            )
+        command = np.clip(requested, self.space.low, self.space.high)
+        action, residual = nearest_action(self._task, command[:, 0], command[:, 1])
+        return action, command, {"action": action, "action_residual": residual}
+
+
+def _shaped(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Numbers in this shape. Raises ConfigError for another number of them, or none at all."""
+    given = np.asarray(actions)
+    if given.size != np.prod(shape) or given.dtype.kind not in "biuf":
+        raise ConfigError(
+            f"actions must be numbers of shape {shape}, got {actions!r}",
+            where="the twin",
+            remedy="give one action for each environment, of env.action_space",
+        )
+    return given.reshape(shape)
+
+
+def action_space(
+    kind: ActionKind, task: Task, num_envs: int
+) -> DiscreteActions | ContinuousActions:
+    """The action space by name. Raises ConfigError for another name."""
+    if kind == "discrete":
+        return DiscreteActions(task, num_envs)
+    if kind == "continuous":
+        return ContinuousActions(task, num_envs)
+    raise ConfigError(
+        f"unknown action space {kind!r}", where="the twin", remedy="discrete, or continuous"
+    )
+
+
+def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
+    """What becomes of the chosen actions behind a limiter; `info["limiter"]` has the rule of each.
+
+    The action of a command that was held back is the nearest, as a log of it would have it.
+    """
+    action, command, reported = chosen
+    before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
+    limited = limit(limits, command, now["sector_clearance_m"], before)
+    held, command = limited.intervened, limited.command
+    nearest, residual = nearest_action(task, *command.T)
+    action = np.where(held, nearest, action)
+    residual = np.where(held, residual, reported.get("action_residual", 0.0))
+    return action, command, {"action": action, "action_residual": residual, "limiter": limited.rule}
+
 
 OBSERVATION_LIMIT = 20.0  # no sensor of this robot gives more; holds the space's bounds
 
@@ -412,4 +504,58 @@ def _bounded(observation: F32) -> F32:
     return np.clip(np.nan_to_num(observation), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-__all__ = ["OBSERVATION_LIMIT", "WarehouseVectorEnv"]
+class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
+    """The vector environment with N = 1; `info` holds its values without the leading axis.
+
+    Takes the vector environment's keyword arguments. The one inside is `self.vector`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it
+        "render_modes": ["rgb_array"],
+        "render_fps": 5,
+    }
+
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        self.render_mode = render_mode
+        self._seeded = arguments.get("seed") is not None
+        if not self._seeded:
+            arguments.pop("seed", None)
+        self.vector = WarehouseVectorEnv(
+            1, render_mode=render_mode, autoreset_mode=AutoresetMode.DISABLED, **arguments
+        )
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[F32, dict[str, Any]]:
+        """Begin the next episode; a seed starts its sequence of episodes again."""
+        super().reset(seed=seed)
+        if seed is None and not self._seeded:  # unseeded environments differ, as Gymnasium's do
+            seed = int(self.np_random.integers(2**31))
+        self._seeded = True
+        observation, info = self.vector.reset(seed=seed)
+        return observation[0], _first(info)
+
+    def step(self, action: Any) -> tuple[F32, float, bool, bool, dict[str, Any]]:
+        """One control period. `info["signals_before"]` are the signals that `action` answered."""
+        before = self.vector.signals
+        observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
+        info["signals_before"] = before
+        return (
+            *(observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0])),
+            _first(info),
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A top-down map, or the frame of the `camera` that was asked for, (H, W, 3) uint8."""
+        frames = self.vector.render()
+        return frames[0] if frames else None
+
+    def close(self) -> None:
+        """Release what `render` holds."""
+        self.vector.close()
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    return {k: _first(v) if isinstance(v, dict) else v[0] for k, v in info.items()}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from restock.arrays import F64
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import PALLET_HALF_M, no_pallets
+from restock.train.twin.floors.layout import PALLET_HALF_M, Warehouse, no_pallets
 from restock.train.twin.missions.mission import Mission, Staged, length_m
 
 GAP_M = (0.80, 1.00)

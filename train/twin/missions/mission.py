@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from restock.arrays import F64, Bools
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import AGENTS, NO_PATCH, PATCHES, Walk, no_pallets
+from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Warehouse, no_pallets
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from restock.arrays import F64
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import AGENTS, PEOPLE, WAY_POINTS, Walk
+from restock.train.twin.floors.layout import AGENTS, PEOPLE, WAY_POINTS, Walk, Warehouse
 from restock.train.twin.missions.mission import Mission, Staged
 
 PASSING_M = 0.6  # from a plan to the side of who stands by it: half the robot and a margin

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from restock.arrays import F64
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import NO_PATCH, PATCHES
+from restock.train.twin.floors.layout import NO_PATCH, PATCHES, Warehouse
 from restock.train.twin.missions.mission import Mission, Staged, length_m, point_along
 
 PATCH_FRICTION = (0.02, 0.045)  # oil or wet ice on sealed concrete

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from restock.arrays import F64, Bools, Ints
-from restock.train.twin.floors.obstacles import NO_PATCH, PATCHES
+from restock.train.twin.floors.layout import NO_PATCH, PATCHES
 
 FLOOR_FRICTION = 0.8
 FLOOR = [FLOOR_FRICTION, 0.005, 0.0001]  # sliding, torsion (m), rolling (m)

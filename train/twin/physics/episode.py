@@ -15,8 +15,7 @@ import numpy as np
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import AGENTS, NO_PATCH, PATCHES, Walk, no_pallets
+from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Warehouse, no_pallets
 from restock.train.twin.floors.planner import Planner
 from restock.train.twin.floors.state_lattice import floor_gap
 from restock.train.twin.missions.mission import length_m, point_along

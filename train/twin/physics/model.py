@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 
 from restock.arrays import F64
-from restock.train.twin.floors.layout import Warehouse
-from restock.train.twin.floors.obstacles import (
+from restock.train.twin.floors.layout import (
     FORKLIFT_HALF_M,
     FORKLIFTS,
     PALLET_HALF_M,
@@ -22,6 +21,7 @@ from restock.train.twin.floors.obstacles import (
     PEOPLE,
     PERSON_HALF_HEIGHT_M,
     PERSON_RADIUS_M,
+    Warehouse,
 )
 from restock.train.twin.physics.contact import (
     FLOOR,

@@ -21,9 +21,8 @@ from restock.ingest.task.robot import Lidar, Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.physics.contact import FLOOR_FRICTION
 from restock.train.twin.physics.model import build_robot_alone
-from restock.train.twin.physics.own_model import own_model
 from restock.train.twin.physics.robot_model import RobotModel, design, stand_in
-from restock.train.twin.physics.robot_parts import actuator_places, wheels_of
+from restock.train.twin.physics.robot_parts import actuator_places, own_model, wheels_of
 
 TIMESTEP_S = 0.01
 SETTLE_S, DRIVE_S = 1.0, 1.5

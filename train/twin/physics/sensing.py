@@ -26,10 +26,10 @@ from restock.ingest.task.surroundings import (
 )
 from restock.ingest.task.task import Task, clearance_ahead
 from restock.state import Stateful
-from restock.train.twin.physics.lidar import Lidar
 from restock.train.twin.physics.model import passed_over
 from restock.train.twin.physics.perturbation import Perturbation
 from restock.train.twin.physics.robot_model import LIDAR_Z_M, stand_in
+from restock.train.twin.physics.scenery import Lidar
 from restock.train.twin.physics.simulation import Simulation
 
 FIRST_STAMP_NS = 1_000_000_000  # of an episode's first step: stamps are never 0

@@ -14,7 +14,7 @@ from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionsFile, as_toml
 from restock.train.twin.drivers.operator_policy import Operator
 from restock.train.twin.drivers.policies import PlannerFollower, RandomPolicy
-from restock.train.twin.env.mission_orders import MissionOrders
+from restock.train.twin.env.episode_queue import MissionOrders
 from restock.train.twin.missions.registry import KINDS, MISSIONS
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule

@@ -24,8 +24,8 @@ from restock.ingest.task.label_scores import primary_of
 from restock.ingest.task.tags import tag_problem
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
 from restock.toml import typed
+from restock.train.twin.env.episode_queue import MissionOrders
 from restock.train.twin.env.interface import Policy
-from restock.train.twin.env.mission_orders import MissionOrders
 from restock.train.twin.floors.cells import cells_of
 from restock.train.twin.floors.layout import DEFAULT, Warehouse
 from restock.train.twin.floors.planner import Planner
@@ -34,8 +34,12 @@ from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import LIDAR_BEAMS, TRACK_M, WHEEL_RADIUS_M
 from restock.train.twin.recording.bag_writer import Format, recording_sink
 from restock.train.twin.recording.drive import Lidar, Odometer
-from restock.train.twin.recording.drivers import BehaviourPolicies, ExternalPolicy
-from restock.train.twin.recording.fleet import DrivenMission, Fleet
+from restock.train.twin.recording.fleet import (
+    BehaviourPolicies,
+    DrivenMission,
+    ExternalPolicy,
+    Fleet,
+)
 from restock.train.twin.recording.missions import (
     HANDOVER,
     SCRIPTED,

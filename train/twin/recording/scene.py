@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
-from restock.train.twin.floors.obstacles import (
+from restock.train.twin.floors.layout import (
     FORKLIFT_HALF_M,
     NO_PATCH,
     PALLET_HALF_M,

@@ -10,7 +10,10 @@ shelves and people have heads, and nothing that is drawn can touch the physics.
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import mujoco
@@ -19,14 +22,154 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 from restock.errors import ConfigError
-from restock.train.twin.env.draw import draw_map
-from restock.train.twin.floors.layout import Rect, Warehouse
-from restock.train.twin.floors.obstacles import FORKLIFT_HALF_M, PALLET_HALF_M, PARKED_M, PEOPLE
+from restock.train.twin.floors.layout import (
+    FORKLIFT_HALF_M,
+    HEADINGS,
+    PALLET_HALF_M,
+    PARKED_M,
+    PATCHES,
+    PEOPLE,
+    PERSON_RADIUS_M,
+    Rect,
+    Warehouse,
+)
 from restock.train.twin.physics.model import RACK_HALF_HEIGHT_M, building_boxes
 from restock.train.twin.physics.robot_model import RobotModel
 
 if TYPE_CHECKING:
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
+
+
+Pixel = tuple[int, int, int]
+
+FLOOR, RACK, PALLET, PERSON = (238, 238, 236), (92, 108, 132), (176, 130, 80), (45, 110, 200)
+FORKLIFT, ICE, ROUTE, ROBOT, MAP_GOAL = (
+    *((225, 180, 20), (150, 205, 235), (120, 180, 120)),
+    *((240, 130, 30), (30, 150, 60)),
+)
+AISLE, DOCK, ONE_WAY, MAP_WALL = (222, 232, 220), (250, 214, 150), (205, 70, 60), (70, 74, 80)
+FLOOR_PIXELS_PER_M, MAP_PIXELS_PER_M = 24, 40
+
+
+def draw_floor(floor: Warehouse) -> NDArray[np.uint8]:
+    """Racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, a wall around."""
+    canvas = _Canvas(floor, FLOOR_PIXELS_PER_M)
+    for color, areas in (
+        (AISLE, [segment.area for segment in floor.segments]),
+        (DOCK, [dock.area for dock in floor.docks]),
+        (RACK, floor.racks),
+        (MAP_GOAL, [Rect(x - 0.06, y - 0.06, x + 0.06, y + 0.06) for x, y in floor.goals.tolist()]),
+    ):
+        for area in areas:
+            canvas.fill(area, color)
+    for rule in floor.one_way:
+        canvas.arrow(*rule.area.center, HEADINGS[rule.heading], ONE_WAY)
+    return canvas.pixels(wall=4)
+
+
+def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
+    """One environment now, (H, W, 3) uint8, north up."""
+    floor = env.floor_of(index)
+    canvas = _Canvas(floor, MAP_PIXELS_PER_M)
+    sim = env.simulation
+    for row in range(PATCHES):
+        x, y, half_x, half_y, _ = sim.patches[index, row]
+        canvas.box(x, y, half_x, half_y, 0.0, ICE)
+    for rack in floor.racks:
+        canvas.box(*rack.center, *rack.half_size, 0.0, RACK)
+    for x, y in _dense(env.navigation.plans_m[index]):
+        canvas.disc(x, y, 0.03, ROUTE)
+    goal_x, goal_y = env.navigation.goals_m[index]
+    canvas.disc(goal_x, goal_y, env.task.goal_radius_m, MAP_GOAL)
+    for x, y, yaw in sim.pallets[index]:
+        canvas.box(x, y, *PALLET_HALF_M[:2], yaw, PALLET)
+    for agent, (x, y) in enumerate(sim.traffic.position_m[index]):
+        if agent < PEOPLE:
+            canvas.disc(x, y, PERSON_RADIUS_M, PERSON)
+        else:
+            yaw = sim.traffic.heading_rad[index, agent]
+            canvas.box(x, y, *FORKLIFT_HALF_M[:2], yaw, FORKLIFT)
+    x, y, yaw = sim.middle(sim.pose())[index]
+    body = env.task.body
+    canvas.box(x, y, body.length_m / 2, body.width_m / 2, yaw, ROBOT)
+    nose = body.length_m / 2 - 0.1
+    canvas.disc(x + nose * np.cos(yaw), y + nose * np.sin(yaw), 0.06, (60, 40, 20))
+    return canvas.pixels()
+
+
+class _Canvas:
+    """A floor's pixels, rows from the south."""
+
+    def __init__(self, floor: Warehouse, pixels_per_m: int) -> None:
+        height, width = round(floor.depth_m * pixels_per_m), round(floor.width_m * pixels_per_m)
+        self._image = np.empty((height, width, 3), np.uint8)
+        self._image[:] = FLOOR
+        self._scale = pixels_per_m
+        self._x = (np.arange(width) + 0.5) / pixels_per_m
+        self._y = (np.arange(height) + 0.5) / pixels_per_m
+
+    def fill(self, area: Rect, color: Pixel) -> None:
+        """An axis-aligned box, its edges rounded to whole pixels."""
+        x0, y0, x1, y1 = (round(edge * self._scale) for edge in area.edges)
+        self._image[y0:y1, x0:x1] = color
+
+    def box(
+        self, x: float, y: float, half_x: float, half_y: float, yaw: float, color: Pixel
+    ) -> None:
+        window, dx, dy = self._window(x, y, float(np.hypot(half_x, half_y)))
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
+        self._image[window][inside] = color
+
+    def disc(self, x: float, y: float, radius: float, color: Pixel) -> None:
+        window, dx, dy = self._window(x, y, radius)
+        self._image[window][dx * dx + dy * dy <= radius * radius] = color
+
+    def arrow(self, x: float, y: float, heading: tuple[int, int], color: Pixel) -> None:
+        """A triangle around a place that points the way."""
+        window, dx, dy = self._window(x, y, 0.4)
+        ahead = heading[0] * dx + heading[1] * dy
+        aside = np.abs(heading[1] * dx - heading[0] * dy)
+        inside = (ahead > -0.35) & (ahead < 0.35) & (aside < (0.35 - ahead) / 2)
+        self._image[window][inside] = color
+
+    def _window(self, x: float, y: float, reach: float) -> tuple[tuple[slice, slice], F64, F64]:
+        columns = slice(*np.searchsorted(self._x, [x - reach, x + reach]))
+        rows = slice(*np.searchsorted(self._y, [y - reach, y + reach]))
+        return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
+
+    def pixels(self, wall: int = 0) -> NDArray[np.uint8]:
+        """(H, W, 3), the first row in the north, with so many pixels of wall around."""
+        height, width, _ = self._image.shape
+        framed = np.empty((height + 2 * wall, width + 2 * wall, 3), np.uint8)
+        framed[:] = MAP_WALL
+        framed[wall : wall + height, wall : wall + width] = self._image[::-1]
+        return framed
+
+
+def _dense(plan_m: F64) -> F64:
+    """A polyline with three points more in every segment."""
+    share = np.arange(4)[None, :, None] / 4
+    return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write pixels (H, W, 3). Raises ConfigError where they cannot be written."""
+    height, width = image.shape[:2]
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header)
+    data += chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)) + chunk(b"IEND", b"")
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
+
 
 View = Literal["chase", "overhead"]
 
@@ -341,6 +484,3 @@ def _route(plan_m: F64) -> Iterator[Part]:
         if long > 1e-6:
             middle = (start[0] + dx / 2, start[1] + dy / 2, 0.006)
             yield _BOX, middle, (long / 2, 0.03, 0.004), float(np.arctan2(dy, dx)), PLAN
-
-
-__all__ = ["Camera", "Renderer", "View"]
