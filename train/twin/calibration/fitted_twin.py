@@ -1,6 +1,8 @@
-"""What a fit gives: effective parameters, how well each is known, and the TOML that training reads.
+"""What a fit gives: parameters, how well a log identifies each, and the TOML that training reads.
 
-One fit makes a perturbation; several, of recordings of robots that differ, a schedule over them.
+Intervals come from a bootstrap over episodes and from profiles of the cost. Of each parameter its
+value is reported with its interval, or why it stays as in the base. One fit makes a perturbation;
+several, of recordings of robots that differ, a schedule over them.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 A plan is made again when the robot strays from it, or when its lidar shows an aisle to be wholly
 blocked, which is remembered for the rest of the episode.
+
+`BlockFinder` is what the lidar adds: it finds the aisles that are wholly blocked.
 """
 
 from __future__ import annotations

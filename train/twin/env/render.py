@@ -1,6 +1,7 @@
-"""Frames of the twin by a camera: MuJoCo's renderer off screen, over EGL, with or without a GPU.
+"""Pictures of the twin: maps drawn from above, and frames by a camera.
 
-OpenGL is loaded when the first camera is made, never before. What stands on the floor (boxes,
+A camera is MuJoCo's renderer off screen, over EGL, with or without a GPU. OpenGL is loaded when the
+first camera is made, never before; drawn maps need none. What stands on the floor (boxes,
 cylinders, spheres and capsules) is made from what an environment says of itself (its floor,
 pallets, patches, traffic, plan, goal and pose), not from the physics' own model: so racks have
 shelves and people have heads, and nothing that is drawn can touch the physics.

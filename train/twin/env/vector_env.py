@@ -5,13 +5,17 @@
     observation, reward, terminated, truncated, info = env.step(actions)
 
 Actions index the task's table; with `action="continuous"` they are (N, 2) speeds in m/s and yaw
-rates in rad/s over the same task: see `restock.train.twin.env.vector_env`.
+rates in rad/s over the same task. In the continuous space the base gets the very command of the
+action, while the observation's previous action and the reward's change of action are those of the
+nearest action of the table: what `restock ingest` does to the continuous commands of a log. The
+same holds if a limiter in front changes a command.
 
 Autoreset is SAME_STEP (in the metadata): where an episode ends, `observation` is already the next
 episode's first, and the last one is in `info["final_obs"]`. Bootstrap on truncation, never on
 termination.
 
-`info` is told of in `restock.train.twin.env.truth`.
+`restock.train.twin.env.truth` lists what `info` holds. `WarehouseEnv` is one warehouse as a plain
+Gymnasium environment, without autoreset.
 """
 
 from __future__ import annotations

@@ -5,6 +5,9 @@ part of the free cells: the one that a robot drove in where its poses are known,
 What is not free, or unknown, is obstacle, merged into boxes; where that takes too many, cells are
 made coarser and never freer, which is said in the floor's notes. The floor keeps the grid's axes,
 and `Warehouse.map_origin` the way back to the map's frame.
+
+If the robot's poses are known, missions start and end at places where it really was, with room to
+turn, and connected with the others. Of each square of the floor the roomiest such place is kept.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 Odometry begins anew with each start of a robot, and so may a map that is made on the way:
 recordings may each have a frame of their own. On open ground poses of another frame lie as well as
 the floor's own, but walls are then elsewhere.
+
+`logged_drives` reads the drives of a store's recordings.
 """
 
 from __future__ import annotations

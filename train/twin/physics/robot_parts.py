@@ -4,6 +4,11 @@ Wheels collide as spheres, because a sphere's one contact point costs less than 
 are drawn as cylinders. A mecanum wheel is a sphere that is driven about one diagonal and rolls
 freely about the other, as its rollers do. A model of its own (`own_model`) gets the outline, the
 sensors and the grip that every robot has.
+
+A robot's own model is a base with a free joint, wheels on it, actuators by their names (`ROLES`),
+and a site named `lidar`. All else stays as the file has it, but for what the twin needs alike of
+every robot: its geoms touch the floor alone, the outline of `[task.body]` touches everything else,
+wheels have the floor's friction under them, and the physics steps as the twin does.
 """
 
 from __future__ import annotations

@@ -2,6 +2,17 @@
 
 Racks and walls are geoms, placed again where an episode is on another floor; pallets, people and
 forklifts are mocap bodies.
+
+Traffic walks a given way once the robot comes near, and may not look out. An attentive person or
+forklift stops .5 m off the robot. An inattentive one walks on into the way of a robot that drives
+at it, and stops only before one that stands, turns or backs off. Whoever has waited for 2 s, or was
+touched, steps back and lets the robot pass. Movement is kinematic: traffic pushes the robot, not
+the reverse.
+
+Lidar beams are level, and everything on a floor stands upright: boxes, and people, who are
+cylinders. So ranges are found in the plane, by compiled code if it is there (`restock.native`),
+which asks of each shape only the beams that may meet it. Without it MuJoCo casts the rays, all
+against all; the distances are the same, to the rounding of the last bits.
 """
 
 from __future__ import annotations

@@ -4,6 +4,9 @@ A control period is driven in blocks of .1 s, or where it is no multiple of that
 Before each block, friction is looked up under every wheel and traffic moves; within it the base
 controller's ramp and the actuators' latency act at every substep. Results do not depend on the
 number of threads.
+
+The base controller takes late commands, ramps toward them and sets the wheel speeds of the motors.
+A robot's body has a payload, wheels and the pull of a slope, as a perturbation says.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 
 from restock.arrays import F64, Bools
 from restock.ingest.task.signals import Signals
-from restock.train.twin.recording.scene import EMPTY, Scene
+from restock.train.twin.physics.perturbation import Perturbation
 
 ENCODER_LSB_RAD = 2 * np.pi / 4096
 
@@ -42,6 +42,28 @@ class Motion:
             return np.interp(time_s, self.time_s, values)
         columns = [np.interp(time_s, self.time_s, column) for column in values.T]
         return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands, lies and walks in the way of one mission of T steps."""
+
+    pallets: F64  # (P, 3) x_m, y_m, yaw_rad; parked off the floor where there is none
+    patches: F64  # (K, 5) x_m, y_m, half sizes, friction; no size where there is none
+    traffic: F64  # (T + 1, A, 3) x_m, y_m, yaw_rad, the people first; parked while out of sight
+    perturbation: Perturbation
+    goal_radius_m: float
+    body_m: tuple[float, float, float]  # length, width, height of the robot
+
+
+EMPTY = Scene(
+    pallets=np.zeros((0, 3)),
+    patches=np.zeros((0, 5)),
+    traffic=np.zeros((1, 0, 3)),
+    perturbation=Perturbation(),
+    goal_radius_m=0.4,
+    body_m=(0.7, 0.5, 0.3),
+)
 
 
 @dataclass(frozen=True)

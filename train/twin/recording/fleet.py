@@ -1,6 +1,10 @@
 """Drives missions in the twin, several robots at a time, and keeps what a recorder needs.
 
 The missions come out in the order they were given, each as a `Drive`, however long each took.
+
+A driver is a script of `restock.train.twin.drivers`, or any policy that acts on observations. Each
+is tagged with a name, a version and the probability of every action, so that what it drove is its
+own behaviour policy in the store.
 """
 
 from __future__ import annotations
@@ -31,9 +35,8 @@ from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Perturbation, Schedule
 from restock.train.twin.physics.robot_model import CHASSIS_Z_M
 from restock.train.twin.physics.simulation import BLOCK_S, BodyState
-from restock.train.twin.recording.drive import Drive, Motion
+from restock.train.twin.recording.drive import Drive, Motion, Scene
 from restock.train.twin.recording.missions import Mission
-from restock.train.twin.recording.scene import Scene
 
 _Key = tuple[str, str, bool]  # a mission's driver, its version, whether the operator takes over
 

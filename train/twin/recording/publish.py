@@ -28,14 +28,6 @@ from restock.toml import Checked
 from restock.train.twin.recording import robot_topics as topics
 from restock.train.twin.recording.bag_writer import Message
 from restock.train.twin.recording.drive import Drive, Lidar, Odometer
-from restock.train.twin.recording.scene import (
-    MARKERS,
-    PERTURBATION,
-    TRAFFIC,
-    mission_markers,
-    perturbation_text,
-    traffic_markers,
-)
 
 GYRO_LSB_RADPS = 2.0**-10
 ACCEL_LSB_MPS2 = 2.0**-8
@@ -311,9 +303,13 @@ class Robot:
         ticks, places = ticks[moved], places[moved]
         times = drive.tick_s[ticks]
         return [
-            *self._send(PERTURBATION, at, [topics.text(perturbation_text(scene.perturbation))]),
-            *self._send(MARKERS, at, [mission_markers(start_ns, scene, drive.goal_m)]),
-            *self._send(TRAFFIC, times, traffic_markers(self._stamps(times), places)),
+            *self._send(
+                topics.PERTURBATION, at, [topics.text(topics.perturbation_text(scene.perturbation))]
+            ),
+            *self._send(
+                topics.MARKERS, at, [topics.mission_markers(start_ns, scene, drive.goal_m)]
+            ),
+            *self._send(topics.TRAFFIC, times, topics.traffic_markers(self._stamps(times), places)),
         ]
 
     def _sample(self, drive: Drive, rate_hz: float) -> tuple[F64, NDArray[np.intp]]:
