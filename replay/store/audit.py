@@ -176,19 +176,10 @@ def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
     return rows
 
 
-def junit_xml(findings: Sequence[Finding], suite: str, failing: Collection[str] = ("fail",)) -> str:
-    """The findings as JUnit XML: those whose status is in `failing` fail, skipped are skipped."""
-    return _xml(_suite(findings, suite, failing))
-
-
 def junit_suites(suites: Mapping[str, Sequence[Finding]], failing: Collection[str]) -> str:
-    """Several suites of findings in one document; those whose status is in `failing` fail."""
+    """Write suites of findings as JUnit XML; those whose status is in `failing` fail."""
     root = ElementTree.Element("testsuites")
     root.extend(_suite(findings, name, failing) for name, findings in suites.items())
-    return _xml(root)
-
-
-def _xml(root: ElementTree.Element) -> str:
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 

@@ -38,6 +38,8 @@ VERBS = {  # what to type instead
     **{verb: f"it is `restock coverage {verb}` now" for verb in ("gaps", "drift", "diff")},
     "record": "it is `restock twin record` now",
     "study": "it is `restock train STUDY.toml` now",
+    "check": "`restock audit` takes its options now",
+    "doctor": "it is `restock info` now, without a recording",
     "node": "it is a command of its own now: `restock-node`",
     "schema": "it is `restock profile schema` now",
     "completion": "it is `restock --tyro-write-completion SHELL FILE` now",

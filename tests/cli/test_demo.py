@@ -100,7 +100,7 @@ def test_what_runs_beside_a_stage_ends_the_demo_where_it_fails(
     def stage(*beside: str) -> Stage:
         return Stage("x", "x", "x", ["info"], beside=beside)
 
-    assert run_demo([stage("doctor", "--help")], lambda command: 0, say=SILENT) == 0
+    assert run_demo([stage("info", "--help")], lambda command: 0, say=SILENT) == 0
     missing = stage("info", str(tmp_path / "nothing"))
     assert run_demo([missing], lambda command: 0, say=SILENT) == 2
     assert "nothing" in capfd.readouterr().err

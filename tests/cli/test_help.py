@@ -23,13 +23,13 @@ def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
     return lines
 
 
-@pytest.mark.parametrize("verb", cli.VERBS)
+@pytest.mark.parametrize("command", [name for name in cli.FOLDER_OF if name != "study"])
 def test_prose_is_wrapped_and_parted_by_single_empty_lines(
-    verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for columns in COLUMNS:
         monkeypatch.setenv("COLUMNS", str(columns))
-        lines = lines_of(capsys, verb)
+        lines = lines_of(capsys, *command.split())
         long = [line for line in lines if len(line) > columns]
         assert [line for line in long if not line.startswith("    ")] == []  # an example
         assert [line for line in lines if not line.strip("│ ") and line] == []  # in a box

@@ -84,7 +84,6 @@ def test_a_flipped_bit_is_found_or_changes_no_value(store: Path) -> None:
         ["export", "STORE", "--to", "npz", "--out", "OUT"],
         ["audit", "STORE"],
         ["audit", "STORE", "--reward"],
-        ["check", "STORE"],
         ["coverage", "gaps", "STORE"],
     ],
     ids=" ".join,

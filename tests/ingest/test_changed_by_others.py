@@ -199,7 +199,7 @@ def test_summaries_never_outvote_the_rows(store, capsys, way):
     with Store(store) as opened:
         changes = len(opened.changed_by_others)
     assert changes == (1 if way == "merged" else 2)
-    assert cli.main(["doctor", str(store), "--json"]) == 0
+    assert cli.main(["info", str(store), "--json"]) == 0
     assert f"not used: another tool may have changed {changes} recording" in capsys.readouterr().out
     StoreWriter(store).write(*one(1, "b"))  # of a file that has another recording's, too
     same_as_rows(store)

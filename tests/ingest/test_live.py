@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer
 from support.kept_run import kept_network, kept_run
 from support.paths import ROOT
 
-from restock.cli import node
+from restock.cli import run_node
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.live.pilot import Pilot, play
@@ -93,7 +93,7 @@ def test_a_recording_with_a_message_cut_short_cannot_be_played(
 def test_a_recording_is_played_at_the_shell(
     policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert node([str(policy), "--on", str(BAG)]) == 0
+    assert run_node([str(policy), "--on", str(BAG)]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["decisions"] > 700
     assert 0 < said["latency_ms"]["p50"] <= said["latency_ms"]["p99"]
@@ -101,9 +101,9 @@ def test_a_recording_is_played_at_the_shell(
     assert said["limited"]
     assert not said["unreadable"]
     # Refused in words: no recording, no policy, no ROS.
-    assert node([str(policy), "--on", str(tmp_path / "none")]) == 2
-    assert node([str(tmp_path / "none.onnx"), "--on", str(BAG)]) == 2
-    assert node([str(policy)]) == 2
+    assert run_node([str(policy), "--on", str(tmp_path / "none")]) == 2
+    assert run_node([str(tmp_path / "none.onnx"), "--on", str(BAG)]) == 2
+    assert run_node([str(policy)]) == 2
     said = capsys.readouterr().err
     assert "none: no such file or folder" in said
     assert "none.onnx: no such file" in said

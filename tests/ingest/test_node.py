@@ -17,7 +17,7 @@ import pytest
 from support.ros_graph import Graph, Returned, message_class
 from support.twin_robot import TwinRobot, follower_onnx
 
-from restock.cli import main
+from restock.cli import main, run_node
 from restock.ingest.live.node import lifecycle_node
 from restock.ingest.live.node_topics import ACTION, LIMITER, SHADOW, TAKEOVER, with_node_topics
 from restock.ingest.profile.profile import load_profile
@@ -273,7 +273,7 @@ def test_in_shadow_it_commands_nothing_and_its_log_is_compared_in_sql(
     assert len(graph.of(SHADOW)) == len(graph.of(ACTION)) == steps
     assert not graph.of("/behaviour_policy")
     profile = tmp_path / "with_node.toml"
-    assert node([str(policy), "--write-profile", str(profile)]) == 0
+    assert run_node([str(policy), "--write-profile", str(profile)]) == 0
     bag = graph.write(tmp_path / "bag")
     line = ["ingest", str(bag), "--profile", str(profile), "--store", str(tmp_path / "store")]
     assert main(line) == 0

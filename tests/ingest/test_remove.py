@@ -262,7 +262,11 @@ def test_what_names_no_recording_exits_2(tmp_path, capsys):
     three(place)
     for names in (["logs/9.mcap"], ["00000000"], []):
         assert (
-            main(["store", "remove", place, name_of(1), *names] if names else ["remove", place])
+            main(
+                ["store", "remove", place, name_of(1), *names]
+                if names
+                else ["store", "remove", place]
+            )
             == 2
         )
     assert "names no recording" in capsys.readouterr().err

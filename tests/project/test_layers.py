@@ -118,7 +118,8 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/containers/formats ingest/profile ingest/propose"
         " ingest/propose/evidence ingest/steps ingest/store ingest/task replay replay/export"
-        " replay/mixture replay/panel replay/plan replay/store train/dqn train/evaluation"
+        " replay/fleet replay/mixture replay/panel replay/plan replay/store train/dqn"
+        " train/evaluation"
     ),
     "cli/fleet": (
         "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"
@@ -129,7 +130,6 @@ MAY_IMPORT = {
         " replay/trace train train/comparison train/diagnosis train/dqn train/evaluation train/run"
         " train/study train/twin/calibration train/twin/floors train/twin/physics train/view"
     ),
-    "cli/pipeline": "cli ingest/store replay replay/fleet replay/store train/evaluation",
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
         " replay/mixture replay/panel replay/store replay/trace train/diagnosis train/dqn"

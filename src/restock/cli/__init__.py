@@ -23,12 +23,12 @@ from restock.interrupts import kill_as_interrupt, was_interrupted
 VERBS = {
     "demo": "all of the below, on sample_logs/",
     "start": "from your robot's recordings to a policy and a report, stage by stage",
-    "info": "what is in these recordings?",
+    "info": "what is in these recordings or stores; without one: does this machine do?",
     "profile": "propose a profile for an unknown robot, or check one against a recording",
     "ingest": "recordings -> labelled Parquet transitions in a store",
     "sql": "query a store (or a run) in SQL",
     "coverage": "how much of each condition a store holds; what is missing, different or changed",
-    "audit": "check that the coverage is good enough: exit 1 if not",
+    "audit": "check that the coverage is good enough and nothing got worse: exit 1 if not",
     "mix": "a pinned replay panel with quotas per stratum",
     "export": "write transitions as a data set for Minari, d3rlpy, LeRobot, Parquet or NumPy",
     "train": "offline warm-up on the panel, then online in the twin; or a study of many runs",
@@ -39,8 +39,6 @@ VERBS = {
     "report": "one HTML page with the results of a run",
     "store": "label a store again, remove recordings, join its files, or verify them",
     "twin": "drive a simulated robot and log it, or fit the twin to a robot's logs",
-    "check": "a gate for pipelines: audits, changes, regressions; exit 1 if one fails",
-    "doctor": "what is installed here, what works, and whether a store can be read",
 }
 # verb -> its jobs, each with its own options, and what they do
 JOBS = {
@@ -66,7 +64,7 @@ JOBS = {
 }
 # folder -> the verbs and jobs whose modules it holds
 FOLDERS = {
-    "data": ("info", "profile", "ingest", "sql", "audit", "mix", "export", "doctor"),
+    "data": ("info", "profile", "ingest", "sql", "audit", "mix", "export"),
     "fleet": ("coverage", *(f"coverage {job}" for job in JOBS["coverage"])),
     "upkeep": tuple(f"store {job}" for job in JOBS["store"]),
     "learning": (
@@ -75,12 +73,11 @@ FOLDERS = {
     ),
     "twin": tuple(f"twin {job}" for job in JOBS["twin"]),
     "start": ("start", "demo"),
-    "pipeline": ("check",),
 }
 # folders of verbs that multiply no large matrices
-ONE_THREAD_OF_BLAS = ("data", "fleet", "upkeep", "pipeline")
+ONE_THREAD_OF_BLAS = ("data", "fleet", "upkeep")
 PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # of work that goes on where nobody reads it
-_FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
+FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
 COMPLETION = "--tyro-write-completion"
 
 
@@ -93,10 +90,11 @@ with quotas for rare conditions, and fine-tunes a DQN in a MuJoCo twin.
 
 {_listed(VERBS)}
 
-`restock VERB --help` explains a verb. `restock-node` runs an exported policy on a robot. Exit
-codes: 0 done, 1 an audit failed or a comparison was refused, 2 any other failure: wrong usage,
-bad input, a file that cannot be read or written, 3 written but data was lost or skipped, 130
-interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
+`restock VERB --help` explains a verb. `restock-node` runs an exported policy on a robot.
+
+Exit codes: 0 done, 1 an audit failed or a comparison was refused, 2 any other failure: wrong
+usage, bad input, a file that cannot be read or written, 3 written but data was lost or skipped,
+130 interrupted. RESTOCK_TRACEBACK=1 prints tracebacks."""
 
 
 def _usage_of_jobs(verb: str) -> str:
@@ -120,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return _guarded(_dispatch, list(sys.argv[1:] if argv is None else argv))
 
 
-def node(argv: Sequence[str] | None = None) -> int:
+def run_node(argv: Sequence[str] | None = None) -> int:
     """Run one command line of `restock-node`; return the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     return _guarded(lambda given: _run("node", "restock-node", _without_ros(given)), args)
@@ -208,7 +206,7 @@ def _say_jobs(verb: str, rest: list[str]) -> int:
 def _run(name: str, prog: str, rest: list[str]) -> int:
     """Parse the arguments of a command, and run it."""
     when_imported("pyarrow", _settle_pandas)
-    if _FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
+    if FOLDER_OF.get(name) in ONE_THREAD_OF_BLAS:
         _start_no_blas_threads()
 
     import tyro
@@ -240,7 +238,7 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
 def command_of(name: str) -> type[Any]:
     """Return the dataclass that is the command line of a verb or a job, such as `store label`."""
     last = name.split()[-1]
-    folder = f"{_FOLDER_OF[name]}." if name in _FOLDER_OF else ""
+    folder = f"{FOLDER_OF[name]}." if name in FOLDER_OF else ""
     module = importlib.import_module(f"restock.cli.{folder}{last}")
     command: type[Any] = getattr(module, f"{last.capitalize()}Command")
     return command

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from restock.errors import ConfigError, ExitCode, RunError
+from restock.errors import ConfigError, ExitCode, RestockError, RunError
 
 if TYPE_CHECKING:
+    from restock.cli.data.findings import Part
     from restock.replay.reward_audit import RewardAudit
-    from restock.replay.store.audit import Finding
+    from restock.replay.store.audit import Audit, Finding
 
 
 @dataclass
@@ -24,6 +26,12 @@ class AuditCommand:
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning
     warns, an info informs. Audits of a panel or a run are skipped unless one is given.
     The thresholds are in replay/store/audits.toml; docs/audit.md lists all audits.
+
+    With --against, everything that an earlier store or version held must still be there; with
+    --baseline, the run must not be worse than another one. A comparison that is not possible fails,
+    too. docs/audit.md has a workflow to copy.
+
+    Example: `restock audit store/ --against store@41 --run runs/a --baseline nightly`
     """
 
     store: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="STORE")]
@@ -32,6 +40,13 @@ class AuditCommand:
     """Also audit this panel, which was made from the store."""
     run_dir: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
     """Also audit the evaluation of this run."""
+    against: Annotated[str | None, tyro.conf.arg(metavar="OLD")] = None
+    """The earlier store, or an earlier version (store@41): everything it held must still be
+    there."""
+    baseline: Annotated[str | None, tyro.conf.arg(metavar="RUN|NAME")] = None
+    """The run must not be worse than this: another run, or a saved baseline's name or file."""
+    margin: float = 0.05
+    """The run is worse where its success is lower by more than this, with the interval below 0."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -57,26 +72,73 @@ class AuditCommand:
     rows: int = 5
     """How many offending rows to show per audit, at most 10; `restock sql` shows all."""
     json: bool = False
-    """Print one JSON document."""
+    """Print one JSON document: {"store", "failed", "audits": [{"part", "audit", "status", …}]}."""
     junit: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Also write JUnit XML, for continuous integration."""
+    """Also write JUnit XML: one suite each for audits, difference and regression."""
+    summary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Append a Markdown summary to this file, for example $GITHUB_STEP_SUMMARY."""
 
     def run(self) -> int:
         """Run the audits, print them, and say with the exit code whether one failed."""
         from restock.cli import output
-        from restock.files import expect_file_place
+        from restock.cli.data.findings import Part
         from restock.ingest.store.version import given_version
-        from restock.replay.places import RUN_CONFIG, open_place
         from restock.replay.reward_audit import audit_reward
-        from restock.replay.store.audit import junit_xml, load_audits, load_thresholds, run_audits
-        from restock.replay.store.store import Store
+        from restock.replay.store.audit import load_audits, load_thresholds
 
-        beside = {"panel": self.panel, "run": self.run_dir}
-        given = {name: path for name, path in beside.items() if path is not None}
         if self.capacity:
             _refuse_with(self, "--capacity", "panel", "run_dir", "audits", "thresholds", "reward")
-            _refuse_with(self, "--capacity", "discount", "strict", "rows", "junit")
+            _refuse_with(self, "--capacity", "discount", "strict", "rows", "junit", "summary")
+            _refuse_with(self, "--capacity", "against", "baseline")
             return self._capacity()
+        self._check_options()
+        audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
+        reward: RewardAudit | None = None
+        if self.reward:
+            reward = audit_reward(
+                self.store,
+                audits,
+                thresholds,
+                discount=self.discount,
+                version=given_version(self.version),
+                memory_limit=self.memory_limit,
+            )
+            parts = [Part("audit", reward.findings)]
+        else:
+            parts = [Part("audit", self._run_audits(audits, thresholds)), *self._comparisons()]
+        failing = {"fail", "warn"} if self.strict else {"fail"}
+        failed = sum(one.status in failing for part in parts for one in part.findings)
+        self._write(parts, failing)
+        if self.json:
+            document: dict[str, Any] = {
+                "store": str(self.store),
+                "failed": failed,
+                "audits": [_document(part.name, one) for part in parts for one in part.findings],
+            }
+            if reward is not None:
+                document |= {
+                    "discount": reward.discount,
+                    "returns": reward.returns,
+                    "order": reward.order,
+                }
+            output.print_json(document)
+        elif reward is not None:
+            _print_reward(reward)
+        else:
+            _print([one for part in parts for one in part.findings], self.rows)
+        return int(ExitCode.FAILED if failed else ExitCode.OK)
+
+    def _check_options(self) -> None:
+        """Refuse options that do nothing or cannot be written to, before the work.
+
+        Raises:
+            ConfigError: there is one.
+            RunError: --run is not a run.
+        """
+        from restock.cli.command_line import refuse
+        from restock.files import expect_file_place
+        from restock.replay.places import RUN_CONFIG
+
         if self.apply is not None:
             raise ConfigError(
                 "--apply writes the capacity that --capacity finds",
@@ -92,7 +154,7 @@ class AuditCommand:
                 remedy="give --reward, and the discount per step, for example 0.99",
             )
         if self.reward:
-            _refuse_with(self, "--reward", "panel", "run_dir", "rows")
+            _refuse_with(self, "--reward", "panel", "run_dir", "rows", "against", "baseline")
             if (Path(self.store) / RUN_CONFIG).is_file():
                 _refuse_with(self, "the --reward of a run", "memory_limit")
         if self.rows < 0:
@@ -101,65 +163,92 @@ class AuditCommand:
                 where="--rows",
                 remedy="0 shows no rows; `restock sql` shows all",
             )
+        if self.baseline is None:
+            why = "has no effect without --baseline"
+            refuse(self, ("margin",), why, remedy="name the run or the saved baseline")
+        else:
+            from restock.train.evaluation.regression import check_margin
+
+            check_margin(self.margin)
+            if self.run_dir is None:
+                raise ConfigError(
+                    "applies only to a run", where="--baseline", remedy="also give --run RUN"
+                )
         expect_file_place(self.junit, "--junit", run=self.run_dir or Path(self.store))
+        expect_file_place(self.summary, "--summary", run=self.run_dir or Path(self.store))
         if self.run_dir is not None and not (self.run_dir / RUN_CONFIG).is_file():
             raise RunError("is not a run directory", where=str(self.run_dir))
-        audits, thresholds = load_audits(self.audits), load_thresholds(self.thresholds)
-        version = given_version(self.version)
-        reward: RewardAudit | None = None
-        if self.reward:
-            reward = audit_reward(
-                self.store,
-                audits,
-                thresholds,
-                discount=self.discount,
-                version=version,
-                memory_limit=self.memory_limit,
-            )
-            findings = reward.findings
-        else:
-            place = open_place(
-                self.store,
-                beside=given,
-                memory_limit=self.memory_limit,
-                only_store=True,
-                version=version,
-                opened=Store.verify,
-            )
-            with place as connection, output.progress("audits", len(audits)) as advance:
-                findings = run_audits(
-                    connection, audits, thresholds, beside=given, done=lambda name: advance(1, name)
-                )
-        failing = {"fail", "warn"} if self.strict else {"fail"}
-        failed = [finding for finding in findings if finding.status in failing]
-        if self.junit is not None:
-            self._write_junit(self.junit, junit_xml(findings, f"audit {self.store}", failing))
-        if self.json:
-            document: dict[str, Any] = {
-                "store": str(self.store),
-                "failed": len(failed),
-                "audits": [_document(finding) for finding in findings],
-            }
-            if reward is not None:
-                document |= {
-                    "discount": reward.discount,
-                    "returns": reward.returns,
-                    "order": reward.order,
-                }
-            output.print_json(document)
-        elif reward is not None:
-            _print_reward(reward)
-        else:
-            _print(findings, self.rows)
-        return int(ExitCode.FAILED if failed else ExitCode.OK)
 
-    def _write_junit(self, path: Path, text: str) -> None:
-        from restock.files import write_text
+    def _run_audits(self, audits: Sequence[Audit], thresholds: Mapping[str, Any]) -> list[Finding]:
+        from restock.cli import output
+        from restock.ingest.store.version import given_version
+        from restock.replay.places import open_place
+        from restock.replay.store.audit import run_audits
+        from restock.replay.store.store import Store
 
+        beside = {"panel": self.panel, "run": self.run_dir}
+        given = {name: path for name, path in beside.items() if path is not None}
+        place = open_place(
+            self.store,
+            beside=given,
+            memory_limit=self.memory_limit,
+            only_store=True,
+            version=given_version(self.version),
+            opened=Store.verify,
+        )
+        with place as connection, output.progress("audits", len(audits)) as advance:
+            return run_audits(
+                connection, audits, thresholds, beside=given, done=lambda name: advance(1, name)
+            )
+
+    def _comparisons(self) -> list[Part]:
+        """Compare the store with --against, and the run with --baseline, if they are given."""
+        from restock.cli.data.findings import Part, of_regression, refused
+
+        parts = []
+        if self.against is not None:
+            parts.append(Part("diff", self._difference(self.against)))
+        if self.run_dir is not None and self.baseline is not None:
+            from restock.train.evaluation.regression import compare_with_baseline
+
+            try:
+                rows = compare_with_baseline(self.run_dir, self.baseline, margin=self.margin)
+                found = of_regression(rows, baseline=self.baseline)
+            except RestockError as error:
+                found = refused("comparable", error, option=f"--baseline {self.baseline}")
+            parts.append(Part("regression", found))
+        return parts
+
+    def _difference(self, old: str) -> list[Finding]:
+        from restock.cli.data.findings import of_difference, refused
+        from restock.ingest.store.version import given_version, split_version
+        from restock.replay.fleet.store_difference import diff_stores
+        from restock.replay.store.store import Store
+
+        path, version = split_version(old)
         try:
-            write_text(path, text)
-        except OSError as error:
-            raise ConfigError(f"cannot be written: {error.strerror}", where=str(path)) from error
+            with (
+                Store(path, version=version) as first,
+                Store(self.store, version=given_version(self.version)) as second,
+            ):
+                first.verify()
+                return of_difference(diff_stores(first, second).document(), old=old)
+        except RestockError as error:
+            return refused("comparable", error, option=f"--against {old}")
+
+    def _write(self, parts: Sequence[Part], failing: set[str]) -> None:
+        """Write the findings as JUnit XML and as Markdown, if they are wanted."""
+        from restock.cli.data.findings import markdown
+        from restock.files import write_text
+        from restock.replay.store.audit import junit_suites
+
+        if self.junit is not None:
+            suites = {f"{part.name} {self.store}": part.findings for part in parts}
+            write_text(self.junit, junit_suites(suites, failing))
+        if self.summary is not None:
+            self.summary.parent.mkdir(parents=True, exist_ok=True)
+            with self.summary.open("a", encoding="utf-8") as file:
+                file.write(markdown(f"restock audit {self.store}", parts, failing=failing))
 
     def _capacity(self) -> int:
         from restock.cli import output
@@ -223,8 +312,9 @@ def _apply(path: Path, rows: int) -> dict[str, Any]:
     return {"config": str(path), "ring_capacity": rows, "before": before}
 
 
-def _document(finding: Finding) -> dict[str, Any]:
+def _document(part: str, finding: Finding) -> dict[str, Any]:
     return {
+        "part": part,
         "audit": finding.audit.name,
         "status": finding.status,
         "severity": finding.audit.severity,

@@ -1,20 +1,23 @@
-"""`restock info`: what is in these recordings?"""
+"""`restock info`: what is in these recordings or stores, and does this machine do?"""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from restock.errors import ExitCode, RecordingError, visible
 from restock.words import counted
+
+if TYPE_CHECKING:
+    from restock.cli.data.machine import Finding
 
 NAMED = 10  # attachments, metadata records and their entries that are listed
 HEAD = 18  # bytes: the longest head of a zstd frame
@@ -30,10 +33,14 @@ class InfoCommand:
     recordings, or a quoted glob. Nothing is written, and messages are decoded only with --clocks. A
     recording that cannot be read is reported on stderr and makes the exit code 2; the others are
     still shown.
+
+    Of a store, it shows what it holds and whether it can be read. Without a PATH, it shows what is
+    installed on this machine and what works: for a bug report. The exit code is then 2 if something
+    that every command needs is missing; a missing extra is not an error.
     """
 
-    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Recordings, folders of recordings, or globs."""
+    paths: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")] = ()
+    """Recordings, folders of recordings, globs, or stores."""
     typestore: str | None = None
     """ROS 2 distribution whose message definitions are used for recordings without their own.
     Default: humble."""
@@ -46,27 +53,54 @@ class InfoCommand:
     """Also read the header stamps and compare the clocks: how far log time is ahead of the stamps,
     and how often stamps jump, go back, repeat or are zero."""
     json: bool = False
-    """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}]}."""
+    """Print one JSON document: {"recordings": [{"path", "format", "messages", "topics", …}],
+    "findings": [{"part", "name", "state", "what", "remedy"}]}; findings are about this machine or
+    stores."""
 
     def run(self) -> int:
-        """Describe each recording; the exit code of the worst of them."""
+        """Describe the machine, each store and each recording; return the worst exit code."""
+        from restock.cli import output
+
+        stores = [path for path in self.paths if _is_store(path)]
+        findings = self._findings(stores)
+        wrong = any(one.state == "wrong" for one in findings)
+        code, entries = self._describe([path for path in self.paths if path not in stores])
+        if self.json:
+            found = [one._asdict() for one in findings]
+            output.print_json({"recordings": entries, "findings": found})
+        elif findings:
+            columns = ["part", "name", "state", "what", "remedy"]
+            shown = columns if any(one.remedy for one in findings) else columns[:-1]
+            output.print_table([one._asdict() for one in findings], shown)
+        return ExitCode.USAGE if wrong else code
+
+    def _findings(self, stores: Sequence[str]) -> list[Finding]:
+        """Look at the stores, or at the machine if no path is given."""
+        if self.paths and not stores:
+            return []
+        from restock.cli.data.machine import check_machine, check_store
+
+        if not self.paths:
+            return check_machine()
+        return [finding for path in stores for finding in check_store(path)]
+
+    def _describe(self, paths: Sequence[str]) -> tuple[ExitCode, list[dict[str, Any]]]:
+        """Describe each recording; return the exit code of the worst, and the descriptions."""
         from restock.cli import output
         from restock.ingest.containers.open_recording import recordings_in, with_definitions
         from restock.ingest.describe import describe_recording
 
-        if not self.paths:
-            raise RecordingError("no path given", remedy="restock info PATH [PATH …]")
         typestore = with_definitions(self.typestore, self.definitions)
         entries: list[dict[str, Any]] = []
         code = ExitCode.OK
-        for name in self.paths:
+        for name in paths:
             try:
-                paths = recordings_in(name)
+                found = recordings_in(name)
             except RecordingError as error:
                 sys.stderr.write(f"restock: {error}\n")
                 code = ExitCode.USAGE
                 continue
-            for path in paths:
+            for path in found:
                 try:
                     with output.progress(f"info {path.name}", None) as advance:
                         entry = describe_recording(
@@ -86,9 +120,14 @@ class InfoCommand:
                 entries.append(entry)
                 if not self.json:
                     _print(entry)
-        if self.json:
-            output.print_json({"recordings": entries})
-        return code
+        return code, entries
+
+
+def _is_store(path: str) -> bool:
+    from restock.ingest.store.location import Location
+    from restock.replay.store.store import is_store
+
+    return "://" in path or (path != "" and Path(path).is_dir() and is_store(Location.of(path)))
 
 
 def compression_of(entry: Mapping[str, Any], *, salvage: bool = False) -> dict[str, Any] | None:

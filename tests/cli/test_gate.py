@@ -1,4 +1,4 @@
-"""`restock check`: a store and a run that may go on, and those that may not."""
+"""`restock audit`: a store and a run that may go on, and those that may not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from support.driven_robot import Drive, write_bag
 
 from restock.cli import main
-from restock.cli.pipeline.findings import Part, markdown, of_regression
+from restock.cli.data.findings import Part, markdown, of_regression
 from restock.train.evaluation.regression import Evaluated, regression
 
 ONLY = "-- severity: error\n-- advice: Record more.\n-- doc: Stores of few rows.\n"
@@ -38,9 +38,9 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict[str, str]]:
     """The exit code, and each check's status."""
-    code = main(["check", *map(str, args), "--json"])
-    checks = json.loads(capsys.readouterr().out)["checks"]
-    return code, {f"{one['part']}.{one['check']}": one["status"] for one in checks}
+    code = main(["audit", *map(str, args), "--json"])
+    checks = json.loads(capsys.readouterr().out)["audits"]
+    return code, {f"{one['part']}.{one['audit']}": one["status"] for one in checks}
 
 
 def test_what_was_lost_since_the_last_store_fails(
@@ -88,16 +88,16 @@ def test_what_cannot_be_compared_fails_and_wrong_usage_is_said(
     code, found = check(capsys, stores["one"], "--against", tmp_path / "gone")
     assert code == 1
     assert found["diff.comparable"] == "fail"
-    assert main(["check", str(tmp_path / "gone")]) == 2
+    assert main(["audit", str(tmp_path / "gone")]) == 2
     assert "no such store" in capsys.readouterr().err
-    assert main(["check", str(stores["one"]), "--baseline", "released"]) == 2
+    assert main(["audit", str(stores["one"]), "--baseline", "released"]) == 2
     assert "--run" in capsys.readouterr().err
-    assert main(["check", str(stores["one"]), "--margin", "0.1"]) == 2
+    assert main(["audit", str(stores["one"]), "--margin", "0.1"]) == 2
     assert "--margin: has no effect without --baseline" in capsys.readouterr().err
-    gate = ["check", str(stores["one"]), "--run", str(tmp_path), "--baseline", "released"]
+    gate = ["audit", str(stores["one"]), "--run", str(tmp_path), "--baseline", "released"]
     assert main([*gate, "--margin", "5"]) == 2
     assert "--margin: must be from 0 to 1, got 5.0" in capsys.readouterr().err
-    assert main(["check", str(stores["one"]), "--run", str(tmp_path)]) == 2
+    assert main(["audit", str(stores["one"]), "--run", str(tmp_path)]) == 2
     assert "is not a run directory" in capsys.readouterr().err
 
 
@@ -106,18 +106,18 @@ def test_what_cannot_be_compared_names_the_option_and_its_store(
 ) -> None:
     capsys.readouterr()
     old = f"{stores['one']}@99"
-    assert main(["check", str(stores["one"]), "--against", old, "--json"]) == 1
-    checks = json.loads(capsys.readouterr().out)["checks"]
-    (found,) = (one for one in checks if one["check"] == "comparable")
-    assert found["what"].startswith(f"--against {old}: has no version 99")
+    assert main(["audit", str(stores["one"]), "--against", old, "--json"]) == 1
+    checks = json.loads(capsys.readouterr().out)["audits"]
+    (found,) = (one for one in checks if one["audit"] == "comparable")
+    assert found["doc"].startswith(f"--against {old}: has no version 99")
     assert "--against" in found["advice"]
 
 
 @pytest.mark.parametrize(
     ("verb", "option"),
     [
-        *(("check", "--junit"), ("check", "--summary"), ("audit", "--junit")),
-        *(("coverage", "--out"), ("drift", "--out"), ("report", "--out")),
+        *(("audit", "--summary"), ("audit", "--junit")),
+        *(("coverage", "--out"), ("coverage drift", "--out"), ("report", "--out")),
     ],
 )
 def test_a_folder_to_write_to_is_refused_before_the_work(
@@ -125,7 +125,7 @@ def test_a_folder_to_write_to_is_refused_before_the_work(
 ) -> None:
     """Before it is even looked whether there is a store."""
     capsys.readouterr()
-    assert main([verb, str(tmp_path / "gone"), option, str(tmp_path)]) == 2
+    assert main([*verb.split(), str(tmp_path / "gone"), option, str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"restock: {option}: {tmp_path} is a folder")
     assert ".tmp" not in error

@@ -1,4 +1,4 @@
-"""`restock doctor`: what it says of this machine, of a package that is not there, of a store."""
+"""`restock info` without a recording: this machine, its packages, a store."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 
 import pytest
 
-from restock.cli import doctor, main
+from restock.cli import main
+from restock.cli.data import machine
 from restock.errors import ConfigError
 from restock.imports import import_extra, install_command
 
 
 def reported(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
-    code = main(["doctor", *arguments, "--json"])
+    code = main(["info", *arguments, "--json"])
     found = json.loads(capsys.readouterr().out)["findings"]
     return code, {one["name"]: one for one in found}
 
@@ -26,9 +27,11 @@ def test_a_machine_on_which_the_tests_run_is_well(
 ) -> None:
     code, found = reported(capsys, str(store_path))
     assert code == 0
+    assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
+    code, found = reported(capsys)
+    assert code == 0
     assert found["duckdb"]["what"] == metadata.version("duckdb")
     assert found["torch"]["state"] == "ok"
-    assert " transitions of 3 recordings in 3 Parquet files" in found["rows"]["what"]
     assert not {"ruff", "mypy", "pytest"} & set(found)  # what developers need is no extra
 
 
@@ -39,7 +42,7 @@ def test_what_is_missing_or_too_old_is_named_with_its_remedy(
         *("duckdb>=99", "no-such-package>=1", "no-such-extra>=1; extra == 'onnx'"),
         "of-another-machine>=1; platform_machine == 'pdp11'",
     ]
-    monkeypatch.setattr(doctor, "requires", lambda _: wanted)
+    monkeypatch.setattr(machine, "requires", lambda _: wanted)
     code, found = reported(capsys)
     assert code == 2
     assert found["duckdb"]["state"] == "wrong"
@@ -71,18 +74,10 @@ def test_an_extra_is_added_to_the_restock_that_is_installed(
         import_extra("no_such_module", "onnx", "it is needed", instead="do without")
 
 
-def test_a_store_that_is_not_there_is_wrong(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, found = reported(capsys, str(tmp_path / "none"))
-    assert code == 2
-    assert "restock ingest" in found["rows"]["remedy"]
-
-
 def test_a_machine_that_cannot_draw_still_does_the_rest(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "DRAWS", "raise SystemExit('no EGL here')")
+    monkeypatch.setattr(machine, "DRAWS", "raise SystemExit('no EGL here')")
     code, found = reported(capsys)
     assert code == 0
     assert (found["pictures"]["state"], found["pictures"]["what"]) == ("missing", "no EGL here")

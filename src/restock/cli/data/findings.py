@@ -1,4 +1,4 @@
-"""Findings of a store's difference and of a run's regression, as if audits had made them.
+"""Findings of `restock audit --against` and `--baseline`, as if audits had made them.
 
 So one JUnit writer and one table serve all.
 """

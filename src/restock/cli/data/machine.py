@@ -1,4 +1,4 @@
-"""`restock doctor`: what is installed here, what works, and whether a store is well."""
+"""What `restock info` says of this machine, and of a store: for a bug report."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
-
-import tyro
+from typing import Any, NamedTuple
 
 from restock import native
 from restock.cli.failures import GL, NO_GL
-from restock.errors import ExitCode, RestockError
 from restock.files import cores
 from restock.imports import install_command
 from restock.words import counted, quoted
@@ -50,33 +46,9 @@ class Finding(NamedTuple):
     remedy: str = ""
 
 
-@dataclass
-class DoctorCommand:
-    """Check what is installed here, what works, and whether a store can be read: for a bug report.
-
-    The exit code is 2 if something that every command needs is missing, or if the store cannot be
-    read. A missing extra is not an error.
-    """
-
-    store: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[STORE]")] = None
-    """Also check this store: a folder or an s3:// address."""
-    json: bool = False
-    """Print {"findings": [{"part", "name", "state", "what", "remedy"}]}."""
-
-    def run(self) -> int:
-        """Print what was found; 2 where something is wrong."""
-        from restock.cli import output
-
-        findings = [*_machine(), *_packages(), _torch(), _native(), _drawing(), _disk(Path.cwd())]
-        if self.store is not None:
-            findings += _store(self.store)
-        if self.json:
-            output.print_json({"findings": [one._asdict() for one in findings]})
-        else:
-            columns = ["part", "name", "state", "what", "remedy"]
-            shown = columns if any(one.remedy for one in findings) else columns[:-1]
-            output.print_table([one._asdict() for one in findings], shown)
-        return int(ExitCode.USAGE if any(one.state == "wrong" for one in findings) else ExitCode.OK)
+def check_machine() -> list[Finding]:
+    """Look at what is installed here and what works."""
+    return [*_machine(), *_packages(), _torch(), _native(), _drawing(), _disk(Path.cwd())]
 
 
 def _machine() -> list[Finding]:
@@ -159,34 +131,33 @@ def _disk(folder: Path) -> Finding:
     return Finding("machine", "disk here", "ok", f"{free / 1e9:.1f} GB free")
 
 
-def _store(path: str) -> list[Finding]:
-    """What a store holds, how long opening it takes, and whether it can be read."""
+def check_store(path: str) -> list[Finding]:
+    """Look at what a store holds, how long opening it takes, and whether it can be read.
+
+    Raises:
+        StoreError: there is no store, or it cannot be read.
+    """
     from restock.replay.store.store import Store
 
     began = time.monotonic()
-    try:
-        with Store(path) as store:
-            store.verify()
-            opened = time.monotonic() - began
-            counts: dict[str, Any] = dict(
-                store.sql(
-                    "SELECT 'recordings' AS name, count(*) AS n FROM recordings"
-                    " UNION ALL SELECT 'transitions', count(*) FROM transitions"
-                ).fetchall()
-            )
-            files = len(store.files["stored_transitions"])
-            holds = f"{counts['transitions']:,} transitions of {counts['recordings']:,} recordings"
-            files_are = f"{files:,} Parquet files"
-            found = [
-                Finding("store", "version", "ok", f"{store.version}, opened in {opened:.2f} s"),
-                Finding("store", "rows", "ok", f"{holds} in {files_are}"),
-            ]
-            if changed := len(store.changed_by_others):
-                what = f"not used: another tool may have changed {counted(changed, 'recording')}"
-                remedy = (
-                    f"rows are counted instead: `restock store compact {quoted(path)}` makes new"
-                )
-                found.append(Finding("store", "summaries", "ok", what, remedy))
-            return found
-    except RestockError as error:
-        return [Finding("store", "rows", "wrong", error.what, error.remedy or "")]
+    with Store(path) as store:
+        store.verify()
+        opened = time.monotonic() - began
+        counts: dict[str, Any] = dict(
+            store.sql(
+                "SELECT 'recordings' AS name, count(*) AS n FROM recordings"
+                " UNION ALL SELECT 'transitions', count(*) FROM transitions"
+            ).fetchall()
+        )
+        files = len(store.files["stored_transitions"])
+        holds = f"{counts['transitions']:,} transitions of {counts['recordings']:,} recordings"
+        files_are = f"{files:,} Parquet files"
+        found = [
+            Finding("store", "version", "ok", f"{store.version}, opened in {opened:.2f} s"),
+            Finding("store", "rows", "ok", f"{holds} in {files_are}"),
+        ]
+        if changed := len(store.changed_by_others):
+            what = f"not used: another tool may have changed {counted(changed, 'recording')}"
+            remedy = f"rows are counted instead: `restock store compact {quoted(path)}` makes new"
+            found.append(Finding("store", "summaries", "ok", what, remedy))
+        return found
