@@ -1,4 +1,4 @@
-"""A robot's outline from its description, its costmap, or the command line."""
+"""A robot's outline from its description, or the command line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.propose.evidence.footprint import (
     footprint_of,
-    of_polygon,
-    of_text,
     of_urdf,
     parse_footprint,
 )
@@ -62,19 +60,6 @@ def test_a_description_of_no_use_is_said_to_be_one(text, why):
     found = of_urdf(text, source="/robot_description")
     assert isinstance(found, str)
     assert why in found
-
-
-def test_footprints_of_a_costmap():
-    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    box = np.array([[0.4, 0.25], [0.4, -0.25], [-0.4, -0.25], [-0.4, 0.25]])
-    found = of_polygon(box @ turn.T + [7.0, 3.0], "the polygon")
-    assert found is not None
-    assert (found.length_m, found.width_m) == pytest.approx((0.8, 0.5))
-    assert of_polygon(box[:2], "") is None
-    found = of_text("[[0.3, 0.2], [0.3, -0.2], [-0.1, -0.2], [-0.1, 0.2]]", "footprint")
-    assert found is not None
-    assert (found.length_m, found.width_m) == pytest.approx((0.4, 0.4))
-    assert of_text("[[1], 2]", "") is of_text("[" * 5000, "") is of_text("", "") is None
 
 
 def test_a_footprint_on_the_command_line():

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.driven_robot import Drive, columns, ragged, typed_topics, write_topics
+from support.driven_robot import Drive, columns, typed_topics, write_topics
 from support.paths import ROOT
 
 from restock.errors import ConfigError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.decoding.columns import FieldColumn, TopicColumns
+from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.footprint import footprint_of
 from restock.ingest.propose.evidence.robot_lines import propose_robot
@@ -274,25 +274,6 @@ def said(text: str) -> tuple[str, TopicColumns]:
     return STRING, columns(np.array([0.01]), data, stamped=False)
 
 
-def polygon(length_m: float, width_m: float) -> tuple[str, TopicColumns]:
-    x, y = np.array([[1], [1], [-1], [-1]]), np.array([[1], [-1], [-1], [1]])
-    fields: dict[str, FieldColumn] = {
-        "polygon.points[].x": ragged([*(x * length_m / 2)]),
-        "polygon.points[].y": ragged([*(y * width_m / 2)]),
-    }
-    return "geometry_msgs/msg/PolygonStamped", columns(np.array([0.02]), fields)
-
-
-def parameters(*radii_m: tuple[str, float]) -> tuple[str, TopicColumns]:
-    fields: dict[str, FieldColumn] = {
-        "node": np.array([node for node, _ in radii_m], object),
-        "new_parameters[].name": ragged([np.array(["robot_radius"] * len(radii_m), object)]),
-        "new_parameters[].value.double_value": ragged([np.array([size for _, size in radii_m])]),
-    }
-    at = np.linspace(0.01, 0.02, len(radii_m))
-    return "rcl_interfaces/msg/ParameterEvent", columns(at, fields, stamped=False)
-
-
 SHARED_BY_ALL = "; /robot2 has none of its own that can be used: CHECK THAT IT IS OF THIS ROBOT"
 
 
@@ -307,26 +288,6 @@ SHARED_BY_ALL = "; /robot2 has none of its own that can be used: CHECK THAT IT I
                 "/robot_description": said(robot()),
             },
             *(0.6, 0.64, "shapes of 3 links in /robot2/robot_description", 0.44),
-        ),
-        # Its own costmap's polygon, before a description of no robot in particular.
-        (
-            {
-                "/robot1/robot_description": said(robot(SMALL)),
-                "/robot1/footprint": polygon(0.9, 0.7),
-                "/robot2/footprint": polygon(0.7, 0.3),
-                "/robot_description": said(robot(SMALL)),
-            },
-            *(0.7, 0.3, "the polygon of /robot2/footprint; its longer side ahead", 0.44),
-        ),
-        # Parameters are of the node that announced them.
-        (
-            {
-                "/parameter_events": parameters(
-                    ("/robot1/local_costmap/local_costmap", 0.9),
-                    ("/robot2/local_costmap/local_costmap", 0.2),
-                ),
-            },
-            *(0.4, 0.4, "the parameter robot_radius in /parameter_events", None),
         ),
         # One of no robot in particular, where it has none of its own.
         (

@@ -152,22 +152,6 @@ def test_what_stands_still_beside_a_robot_that_does_not_turn_is_not_its_own(tmp_
     assert profile.task.body.length_m == pytest.approx(0.2625)
 
 
-def test_a_costmaps_footprint_comes_first(tmp_path, capsys):
-    """A square of .3 m, as it is published: in the map, turned."""
-    turned = np.deg2rad(30) + np.pi / 4 + np.arange(4) * np.pi / 2
-    points = np.stack([4 + np.cos(turned) * 0.15 * 2**0.5, 1 + np.sin(turned) * 0.15 * 2**0.5])
-    each = offsets_of(np.full(3, 4))
-    fields = {
-        f"polygon.points[].{axis}": Ragged(np.tile(row.astype(np.float32), 3), each)
-        for axis, row in zip("xy", points, strict=True)
-    }
-    name = "/local_costmap/published_footprint"
-    more = {name: columns(np.array([0.5, 1.0, 1.5]), fields)}
-    profile, text = proposed(tmp_path, capsys, Turning(12.0), **more)
-    assert profile.task.body.length_m == pytest.approx(0.3, abs=1e-3)
-    assert f"the polygon of {name}" in text
-
-
 def lidar_at(x_m: float, y_m: float, yaw_rad: float, roll_rad: float = 0.0) -> TopicColumns:
     """The transform of the scans' frame, rolled and then turned."""
     one = offsets_of(np.array([1]))

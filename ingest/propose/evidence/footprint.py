@@ -1,32 +1,27 @@
-"""How large a robot is, by what a recording says: its description, or its costmap's footprint.
+"""How large a robot is, by its description in a recording.
 
 A description (URDF, on `/robot_description`) has the boxes, cylinders and spheres of its links:
 those that move with the base as one body, and its wheels, are put where their joints say. Meshes
-have no size that is in the recording. A costmap has its footprint as a polygon on a topic, or as
-a parameter in `/parameter_events`.
+have no size that is in the recording.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.decoding.columns import Ragged
 from restock.ingest.propose.evidence.roles import own_first, shared
 from restock.ingest.urdf.description import Description, Place, extent, read_description
 
 F64 = NDArray[np.float64]
 OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arms
 SIZES_M = (0.02, 30.0)  # of a robot that this can be
-_POLYGONS = ("geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/Polygon")
 
 
 DESCRIBED = "as described"  # where a lidar's place is from
@@ -91,14 +86,15 @@ def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint 
     Of several robots in the recording, the one to propose for.
     """
     notes: list[str] = []
-    found_in_turn = chain(  # read as far as it is asked for
-        _descriptions(recording, scan_frame, notes), _polygons(recording), _parameters(recording)
-    )
-    for place, found in own_first(recording, found_in_turn):
-        if found.sane:
-            why = shared(recording, place)
+    for name, text in descriptions(recording):
+        found = of_urdf(text, scan_frame, source=name)
+        if isinstance(found, str):
+            notes.append(f"{name}: {found}")
+        elif found.sane:
+            why = shared(recording, name)
             return replace(found, source=f"{found.source}; {why}") if why else found, notes
-        notes.append(f"{found.source}: {found.length_m:.3g} x {found.width_m:.3g} m, no robot")
+        else:
+            notes.append(f"{found.source}: {found.length_m:.3g} x {found.width_m:.3g} m, no robot")
     return None, notes
 
 
@@ -115,84 +111,6 @@ def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
             continue
         texts = np.asarray(recording.read({name: ["data"]})[name].fields["data"], object)
         yield from ((name, str(text)) for text in texts[-1:])
-
-
-_Found = tuple[str, Footprint]  # by the topic that says it, or the node
-
-
-def _descriptions(recording: Recording, frame: str, notes: list[str]) -> Iterator[_Found]:
-    for name, text in descriptions(recording):
-        found = of_urdf(text, frame, source=name)
-        if isinstance(found, str):
-            notes.append(f"{name}: {found}")
-        else:
-            yield name, found
-
-
-def _polygons(recording: Recording) -> Iterator[_Found]:
-    named = [t for t in recording.topics.values() if "footprint" in t.name and not t.skipped]
-    for topic in named:
-        if topic.type not in _POLYGONS or not topic.expected:
-            continue
-        path = "polygon.points[]." if topic.type == _POLYGONS[0] else "points[]."
-        fields = recording.read({topic.name: [path + axis for axis in "xy"]})[topic.name].fields
-        x, y = (fields[path + axis][-1] for axis in "xy")
-        points = np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
-        if found := of_polygon(points, f"the polygon of {topic.name}; its longer side ahead"):
-            yield topic.name, found
-
-
-def _parameters(recording: Recording) -> Iterator[_Found]:
-    """`footprint` and `robot_radius` among the parameters that nodes announced."""
-    for topic in recording.topics.values():
-        if topic.type != "rcl_interfaces/msg/ParameterEvent" or topic.skipped:
-            continue
-        for group in ("new_parameters[].", "changed_parameters[]."):
-            paths = [group + p for p in ("name", "value.double_value", "value.string_value")]
-            if not topic.expected or not {"node", *paths} <= set(recording.leaves(topic.name)):
-                continue
-            fields = recording.read({topic.name: ["node", *paths]})[topic.name].fields
-            named = fields[paths[0]]
-            assert isinstance(named, Ragged)
-            nodes = np.repeat(np.asarray(fields["node"], object), named.lengths)
-            columns = [f.values if isinstance(f, Ragged) else f for f in map(fields.get, paths)]
-            for node, name, number, text in zip(
-                nodes, *(np.asarray(c, object) for c in columns), strict=True
-            ):
-                source = f"the parameter {name} in {topic.name}"
-                if str(name).split(".")[-1] == "robot_radius" and float(number) > 0:
-                    yield str(node), Footprint(2 * float(number), 2 * float(number), source)
-                polygon = str(name).split(".")[-1] == "footprint"
-                if polygon and (found := of_text(str(text), source)):
-                    yield str(node), found
-
-
-def of_text(text: str, source: str) -> Footprint | None:
-    """A footprint as Nav2 writes it: `[[x, y], [x, y], …]`, x ahead."""
-    try:
-        points = np.asarray(json.loads(text), np.float64)
-    except (ValueError, RecursionError):
-        return None
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
-        return None
-    length, width = np.ptp(points, axis=0).tolist()
-    return Footprint(length, width, source)
-
-
-def of_polygon(points_m: F64, source: str) -> Footprint | None:
-    """The smallest rectangle around a polygon (N, 2) that is turned in any way."""
-    if len(points_m) < 3 or not np.isfinite(points_m).all() or len(points_m) > 1000:
-        return None
-    best: tuple[float, float] | None = None
-    for along in np.diff(points_m, axis=0, append=points_m[:1]):
-        size = float(np.hypot(*along))
-        if size > 0:
-            ahead = along / size
-            turned = points_m @ np.array([ahead, [-ahead[1], ahead[0]]]).T
-            sides = sorted(np.ptp(turned, axis=0).tolist(), reverse=True)
-            if best is None or sides[0] * sides[1] < best[0] * best[1]:
-                best = (sides[0], sides[1])
-    return Footprint(*best, source) if best else None
 
 
 def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:

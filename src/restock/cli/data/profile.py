@@ -56,7 +56,7 @@ class ProfileCommand:
     shipped name), then the recording."""
     footprint: Annotated[str | None, tyro.conf.arg(metavar="LxW")] = None
     """For `new`: the robot's length and width in metres, for example 0.6x0.5. Default: from the
-    recording's /robot_description or its costmap's footprint, else a guess."""
+    recording's /robot_description, else a guess."""
     urdf: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """For `new`: the robot's URDF, for outline, wheels, mass and lidar. It replaces the recording's
     /robot_description. Convert xacro to URDF first; meshes are not read. See docs/robot.md."""
