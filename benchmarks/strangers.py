@@ -32,9 +32,10 @@ import numpy as np
 from harness import finish, markdown, option_parser
 
 from restock.errors import RestockError
-from restock.ingest import open_recording, propose_profile, recordings_in
+from restock.ingest import open_recording, recordings_in
 from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.profile import GoalRules, parse_profile
+from restock.ingest.propose.propose import propose_profile
 from restock.ingest.steps.align import NS
 from restock.ingest.steps.episodes import Split, split
 from restock.ingest.steps.needs import read_topics

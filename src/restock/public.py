@@ -7,11 +7,9 @@ private.
 from __future__ import annotations
 
 import ast
-import functools
 import importlib
-import importlib.util
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +23,12 @@ FACES = (
 )
 
 
-def lazy(
-    face: str, names: Mapping[str, Sequence[str]]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """A face's `__getattr__`, `__dir__` and `__all__` (PEP 562).
+def lazy(face: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return a face's `__getattr__`, `__dir__` and `__all__` (PEP 562).
 
-    Args:
-        face: the module's name.
-        names: module -> the names that it defines.
+    The names are those that its `if TYPE_CHECKING:` block imports as themselves.
     """
-    homes = {name: module for module, defined in names.items() for name in defined}
+    homes = {name: module for module, names in imported(face).items() for name in names}
 
     def find(name: str) -> Any:
         if name not in homes:
@@ -47,23 +41,15 @@ def lazy(
 
 
 def imported(face: str) -> dict[str, list[str]]:
-    """What type checkers see of a face: module -> names. It must be what `lazy` is given."""
+    """Return the names that a face imports as themselves, by module; nothing is imported for it."""
+    source = Path(str(sys.modules[face].__file__)).read_text(encoding="utf-8")
     names_by_module: dict[str, list[str]] = {}
-    for node in ast.walk(_tree(face)):
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("restock."):
             names = [alias.name for alias in node.names if alias.asname == alias.name]
             if names:
                 names_by_module.setdefault(node.module or "", []).extend(names)
     return names_by_module
-
-
-@functools.cache
-def _tree(module: str) -> ast.Module:
-    """A module's source: nothing is imported, for what a face names may need extras."""
-    spec = importlib.util.find_spec(module)
-    assert spec is not None
-    assert spec.origin is not None
-    return ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
 
 
 __all__ = ["FACES", "imported", "lazy"]

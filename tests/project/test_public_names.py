@@ -21,8 +21,8 @@ from restock.public import FACES, imported
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
 EXAMPLES = sorted((ROOT / "docs" / "examples").glob("*.py"))
 ROOMS = [face for face in FACES if face not in ("restock", "restock.report")]
-# Made by an `open` of their own, or by a function; and what a study's folders are.
-HOLD_PATHS = {"Panel", "Recording", "Run", "StudyPlan"}
+# Made by an `open` of their own.
+HOLD_PATHS = {"Panel", "Run"}
 ROOM_FOLDERS = ("ingest", "replay", "train")
 # What a path may begin with, and the names that may follow.
 KNOWN = {face: set(importlib.import_module(face).__all__) for face in FACES}
@@ -54,7 +54,7 @@ def test_whatever_takes_a_path_takes_its_text(face: str) -> None:
     module, only_paths = importlib.import_module(face), []
     for name in module.__all__:
         value = getattr(module, name)
-        asks = [] if name in HOLD_PATHS or name == "FeedOptions" else [value]
+        asks = [] if name in HOLD_PATHS else [value]
         asks += [getattr(value, way) for way in ("open", "create") if hasattr(value, way)]
         for ask in filter(callable, asks):
             for argument in inspect.signature(ask).parameters.values():
@@ -119,7 +119,7 @@ def test_docs_teach_public_names_only(path: Path) -> None:
 def public(parts: list[str]) -> bool:
     """`ingest`, `ingest.load_profile`, `replay.Panel.open`; `restock.json` is a file."""
     if parts[0] not in KNOWN["restock"]:
-        return parts[-1] in ("html", "json", "toml")
+        return parts[-1] in ("bash", "html", "json", "toml")
     return len(parts) == 1 or parts[0] == "errors" or parts[1] in KNOWN[f"restock.{parts[0]}"]
 
 

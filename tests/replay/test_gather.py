@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from restock import native
-from restock.replay import gather_rows
 from restock.replay.sampling import gather
+from restock.replay.sampling.gather import gather_rows
 
 TABLES = npst.arrays(
     np.float32,

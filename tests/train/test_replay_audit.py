@@ -18,7 +18,8 @@ from restock.errors import RunError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Task
 from restock.replay.store.store import Store
-from restock.train import ReplayAuditRecord, replay_audit
+from restock.train import replay_audit
+from restock.train.run.replay_audit import ReplayAuditRecord
 from restock.train.run.run_profile import profile_document
 
 FIELDS = (

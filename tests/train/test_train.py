@@ -28,6 +28,7 @@ from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
 from restock.train.describe import describe_run
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
+from restock.train.evaluation.regression import compare_with_baseline, regressed
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
 from restock.train.run.run_lock import RunLock
@@ -339,9 +340,9 @@ def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
     assert main(argv) == 0
     assert json.loads(capsys.readouterr().out)["results"] == json.loads(json.dumps(rows))
 
-    compared = restock.train.compare_with_baseline(tmp_path / "a", str(tmp_path / "a"))
+    compared = compare_with_baseline(tmp_path / "a", str(tmp_path / "a"))
     assert {row["difference"] for row in compared} == {0.0}
-    assert not restock.train.regressed(compared)
+    assert not regressed(compared)
 
 
 @pytest.mark.parametrize(
