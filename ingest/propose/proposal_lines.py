@@ -13,6 +13,7 @@ from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.inputs import FALLBACKS
 from restock.ingest.propose.evidence.cameras import camera_lines
 from restock.ingest.propose.evidence.clock_choice import ClockChoice
+from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
 from restock.ingest.propose.evidence.roles import (
@@ -332,11 +333,9 @@ def _input_lines(
             f"wheelbase_m = {round(seen.commands.wheelbase_m, 4):g}"
             f"  # {seen.commands.wheelbase_from}",
         ]
-    hangs = role == "scan" and seen.footprint.upside_down
-    if role in seen.lidars:
-        lines += seen.lidars[role].lines()
-        hangs = seen.lidars[role].upside_down
-    if hangs:
+    if role == "scan" and seen.footprint.lidar_aside:
+        lines += _lidar_lines(seen.footprint)
+    if role == "scan" and seen.footprint.upside_down:
         lines.append("upside_down = true  # by its frame; not if its driver turns the scans over")
     if kind.at_changes:
         lines += [
@@ -352,6 +351,15 @@ def _input_lines(
             if seen.hold.stops_hold:
                 lines.append("stop_holds = true  # a command to stop, until the next one")
         lines += [*trial.comments(f"inputs.{role}.max_age_s"), f"max_age_s = {age:g}"]
-    if role in FALLBACKS and not (role == "scan" and len(seen.lidars) > 1):
+    if role in FALLBACKS:
         lines.append("optional = true")
     return [*lines, ""]
+
+
+def _lidar_lines(footprint: Footprint) -> list[str]:
+    """Where a lidar is that is beside the middle."""
+    x, y, yaw = footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0
+    return [
+        f"lidar_at_m = [{round(x, 3) + 0.0:g}, {round(y, 3) + 0.0:g}]  # ahead, to the left",
+        f"lidar_yaw_rad = {round(yaw, 4) + 0.0:g}",
+    ]

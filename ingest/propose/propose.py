@@ -164,13 +164,12 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.scan", clouds))
     if reported := lidar_guess(seen.footprint):
         advice.append(Advice("task.body.lidar_yaw_rad", reported.replace("A GUESS", "a guess")))
-    if len(seen.lidars) > 1:
-        scans = ", ".join(seen.roles[name][0][0].name for name in seen.lidars)
-        advice.append(Advice("inputs.scan", f"the lidars of {scans} are put together"))
-    hanging = [name for name, lidar in seen.lidars.items() if lidar.upside_down]
+    if others := [topic.name for topic, _ in seen.roles["scan"][1:]]:
+        used = seen.roles["scan"][0][0].name
+        text = f"{used} alone is used: add further lidars by hand ({', '.join(others[:3])}?)"
+        advice.append(Advice("inputs.scan", text))
     if seen.footprint.upside_down and seen.roles["scan"]:
-        hanging = ["scan"]
-    advice += [Advice(f"inputs.{name}", UPSIDE_DOWN) for name in hanging]
+        advice.append(Advice("inputs.scan", UPSIDE_DOWN))
     return Proposal(
         *(text, recording.path, missing, len(seen.signals)),
         *(trial.ticks, trial.transitions, problems, advice),

@@ -13,9 +13,10 @@ from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.propose.evidence.commands import Commands
 from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, Footprint
 from restock.ingest.propose.evidence.gather import Evidence
+from restock.ingest.propose.evidence.lidars import range_lines
 from restock.ingest.propose.evidence.robot_lines import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
-from restock.ingest.propose.evidence.scanned_outline import TIGHT_PER_WIDTH, range_lines
+from restock.ingest.propose.evidence.scanned_outline import TIGHT_PER_WIDTH
 from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.robot import Robot
@@ -124,6 +125,7 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
     footprint = seen.footprint
     x, yaw = footprint.lidar_x_m, footprint.lidar_yaw_rad
     placed = footprint.lidar_source != DESCRIBED
+    aside = bool(seen.roles["scan"]) and footprint.lidar_aside
     return [
         "[task.body]  # the outline, from which clearance is measured",
         f"# {footprint.source}"
@@ -138,12 +140,12 @@ def _body_lines(seen: Evidence, trial: Trial) -> list[str]:
                 + ("; a guess" if x is None else "")
                 + ("" if x is None and not placed else f"; {footprint.lidar_source}")
             ]
-            if seen.roles["scan"] and not seen.lidars
+            if seen.roles["scan"] and not aside
             else []
         ),
-        *(["# Clearance is as from the middle: lidar_at_m of the inputs."] if seen.lidars else []),
+        *(["# Clearance is as from the middle: lidar_at_m of the inputs."] if aside else []),
         *(f"# {line}" for line in textwrap.wrap(lidar_guess(footprint), 96)),
-        *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 else []),
+        *([f"lidar_yaw_rad = {round(yaw, 4):g}"] if yaw and abs(yaw) > 1e-3 and not aside else []),
         "",
         *_reward_lines(footprint.width_m),
     ]

@@ -20,11 +20,9 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.containers.open_recording import open_recording
-from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged, TopicColumns, offsets_of
 from restock.ingest.live.observer import LiveObserver
 from restock.ingest.profile.profile import Profile, load_profile, parse_profile
-from restock.ingest.propose.evidence.gather import gather
 from restock.ingest.steps.needs import read_topics
 from restock.ingest.steps.steps import Steps, steps_of
 from restock.ingest.task.scan import MovedMap, SectorMap, outline_reach, with_unseen
@@ -303,51 +301,6 @@ def proposed(drive: Corridor, folder: Path, capsys: Any, *more: str) -> tuple[Pr
     return parse_profile(said["toml"], where="p"), said["toml"], json.dumps(said["advice"])
 
 
-@pytest.mark.parametrize("roll_rad", [0.0, np.pi])
-def test_several_lidars_are_proposed_by_their_transforms(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], roll_rad: float
-) -> None:
-    profile, text, advice = proposed(Corridor(12.0, roll_rad=roll_rad), tmp_path, capsys)
-    for name, place, topic in (("scan", FRONT, "/scan_front"), ("scan_2", REAR, "/scan_rear")):
-        source = profile.inputs.scans[name]
-        assert source.topic == topic
-        assert source.lidar_at_m == pytest.approx(place[:2], abs=1e-3)
-        assert source.lidar_yaw_rad == pytest.approx(place[2], abs=1e-3)
-        assert not source.optional
-    assert profile.inputs.scans["scan_2"].upside_down == (roll_rad > 0)
-    assert "/scan_front, /scan_rear are put together" in advice
-    assert ("upside down" in advice) == (roll_rad > 0)
-    assert profile.task.body.lidar_x_m == profile.task.body.lidar_yaw_rad == 0
-    # All around, as the two are.
-    assert profile.robot.lidar.angle_max_rad - profile.robot.lidar.angle_min_rad > 6.2
-    usable = sectors_of(read(tmp_path / "bag", text))
-    assert len(usable) > 40
-    straight_left, straight_right = usable[:, 27], usable[:, 9]
-    body_m = profile.task.body.width_m / 2
-    assert np.median(straight_left) == pytest.approx(LEFT_M - 1.0 - body_m, abs=0.01)
-    assert np.median(straight_right) == pytest.approx(1.0 - RIGHT_M - body_m, abs=0.01)
-    assert straight_left.max() < LEFT_M - 1.0  # behind the post, too
-
-
-def test_for_a_proposal_transforms_are_read_once_and_angles_of_all_lidars_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads: list[dict[str, list[str]]] = []
-    usual = Recording.read
-
-    def read(self: Recording, wanted: Any, reductions: Any = None) -> Any:
-        reads.append({name: list(paths) for name, paths in wanted.items()})
-        return usual(self, wanted, reductions)
-
-    monkeypatch.setattr(Recording, "read", read)
-    with open_recording(Corridor(12.0).bag(tmp_path / "bag")) as recording:
-        seen = gather(recording, None, odometry_as_command=False)
-    assert list(seen.lidars) == ["scan", "scan_2"]
-    assert sum("/tf_static" in one for one in reads) == 1
-    angles = [list(one) for one in reads if any("angle_max" in paths for paths in one.values())]
-    assert angles == [["/scan_front", "/scan_rear"]]
-
-
 def test_a_scan_made_of_the_others_is_the_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -360,36 +313,6 @@ def test_a_scan_made_of_the_others_is_the_one(
     profile, _, _ = proposed(Joined(12.0), tmp_path, capsys)
     assert {name: one.topic for name, one in profile.inputs.scans.items()} == {"scan": "/z_scan"}
     assert profile.inputs.scans["scan"].lidar_at_m is None
-
-
-def test_another_robots_lidar_in_the_recording_is_not_put_beside_its_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    class Two(Corridor):
-        def topics(self) -> dict[str, TopicColumns]:
-            found = super().topics()
-            bases = found["/tf_static"].fields["transforms[].header.frame_id"]
-            assert isinstance(bases, Ragged)
-            bases.values[-1] = "other/base_link"
-            return found
-
-    profile, _, _ = proposed(Two(12.0), tmp_path, capsys)
-    assert [one.topic for one in profile.inputs.scans.values()] == ["/scan_front"]
-
-
-def test_a_depth_cameras_scan_is_not_put_beside_a_lidars(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    class Narrow(Corridor):
-        def scan(self, times_s: Any, place: Place, frame: str, **more: Any) -> TopicColumns:
-            wide = self.field_rad
-            self.field_rad = 1.2 if place == REAR else wide
-            found = super().scan(times_s, place, frame, **more)
-            self.field_rad = wide
-            return found
-
-    profile, _, _ = proposed(Narrow(12.0), tmp_path, capsys)
-    assert [one.topic for one in profile.inputs.scans.values()] == ["/scan_front"]
 
 
 def test_one_lidar_beside_the_middle_has_its_place(
@@ -411,7 +334,7 @@ def test_one_lidar_beside_the_middle_has_its_place(
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         (two_lidars().replace("[inputs.scan]", "[inputs.scan_3]"), "without `inputs.scan`"),
         (two_lidars(rear="optional = true"), "inputs.scan_2.optional"),

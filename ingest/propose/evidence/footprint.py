@@ -24,6 +24,7 @@ OUTLINE = ("fixed", "continuous")  # joints of what is always part of it; no arm
 SIZES_M = (0.02, 30.0)  # of a robot that this can be
 
 
+MIN_ASIDE_M = 0.05  # of the middle
 DESCRIBED = "as described"  # where a lidar's place is from
 UPSIDE_DOWN = (
     "the lidar hangs upside down by its frame, so its scans are turned over; if its driver does "
@@ -45,7 +46,11 @@ class Footprint:
     upside_down: bool = False  # the lidar
     lidar_unplaced: str = ""  # the frame of its scans, where nothing says which way it points
     measured: bool = True  # False: a guess, though with a reason
-    middle_m: tuple[float, float] = (0.0, 0.0)  # of the outline, in the base frame
+
+    @property
+    def lidar_aside(self) -> bool:
+        """Whether the lidar is so far beside the middle that its input must say where it is."""
+        return abs(self.lidar_y_m) > MIN_ASIDE_M
 
     @property
     def sane(self) -> bool:
@@ -129,7 +134,6 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
         length,
         width,
         f"shapes of {count} links in {source}",
-        middle_m=(middle_x, middle_y),
     )
     if (lidar := _lidar(places, scan_frame)) is None:
         return found

@@ -37,13 +37,10 @@ from restock.ingest.propose.evidence.frame_guess import (
 )
 from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.lidars import (
-    MountedLidar,
-    lidars_of,
-    made_of_others_first,
+    lidar_place,
     moved_in_frame,
     scans_of,
-    seen_from_middle,
-    with_scans,
+    with_lidar,
 )
 from restock.ingest.propose.evidence.motion_choice import (
     MotionChoice,
@@ -66,12 +63,7 @@ from restock.ingest.propose.evidence.roles import (
     topics_for,
     usable_topics,
 )
-from restock.ingest.propose.evidence.scanned_outline import (
-    ScannedOutline,
-    lidar_place,
-    scanned_outline,
-    with_lidar,
-)
+from restock.ingest.propose.evidence.scanned_outline import ScannedOutline, scanned_outline
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import plain
 from restock.ingest.steps.input_columns import estimate_reduction
@@ -103,7 +95,6 @@ class Evidence:
     recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
-    lidars: dict[str, MountedLidar]  # by their inputs, which say where they are
     outline: ScannedOutline | None  # where its scans say something of it
     goal: GoalChoice
     signals: list[Candidate]
@@ -155,7 +146,8 @@ def gather(
     if framed or roles["pose"]:
         poses, poses_from = pose_series(recording, roles, frames if framed else None, edges)
     scanned = scans_of(recording, roles["scan"])
-    roles["scan"] = made_of_others_first(roles["scan"], scanned)
+    # Of several lidars' scans, the one in the frame of the base is the others put together.
+    roles["scan"].sort(key=lambda fit: plain(scanned[fit[0].name].frame) not in BASE_FRAMES)
     scan = roles["scan"][0][0].name if roles["scan"] else None
     frame = scanned[scan].frame if scan is not None else ""
     notes: list[str] = []
@@ -172,18 +164,13 @@ def gather(
         footprint = replace(footprint, lidar_unplaced=plain(frame))
     if scan is not None:
         footprint = moved_in_frame(footprint, scanned[scan])
-    lidars = lidars_of(recording, roles["scan"], scanned, edges, footprint)
-    mounted = [(scanned[topic.name], lidar) for topic, _, lidar in lidars.values()]
     robot = propose_robot(
         recording,
         urdf,
         scanned[scan] if scan is not None else None,
         upside_down=footprint.upside_down,
-        lidars=mounted,
+        lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    if lidars:
-        roles = with_scans(roles, lidars)
-        footprint = seen_from_middle(footprint, [lidar for _, lidar in mounted])
     turned, told_rad = how_it_turned(recording, roles, poses)
     robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
     robot = wheelbase_of(recording, roles, poses, robot)
@@ -221,7 +208,6 @@ def gather(
         recorded_s,
         footprint,
         notes,
-        {name: lidar for name, (_, _, lidar) in lidars.items()},
         outline,
         GoalChoice.of(logged=bool(roles["goal"]), hindsight_wanted=hindsight_goals),
         candidates(

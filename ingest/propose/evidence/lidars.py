@@ -1,4 +1,4 @@
-"""The lidars of a robot that has several, or one beside its middle: whose scans are joined."""
+"""Where a robot's lidar is, by descriptions, transforms and its scans, and what these cover."""
 
 from __future__ import annotations
 
@@ -11,38 +11,22 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
-from restock.ingest.profile.inputs import SCANS
+from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.roles import Kind, Roles
-from restock.ingest.propose.evidence.scanned_outline import lidar_place
+from restock.ingest.propose.evidence.frame_guess import named_frames, transform_topics
+from restock.ingest.propose.evidence.roles import Kind
+from restock.ingest.propose.evidence.scanned_outline import OWN_SPREAD_M, ScannedOutline
+from restock.ingest.steps.align import align
 from restock.ingest.steps.clearance import BEAMS
-from restock.ingest.steps.frames import Edges, frame_id_path, plain
+from restock.ingest.steps.frames import Edges, Tree, frame_id_path, plain, upward
 from restock.ingest.task.signals import yaw_of
 from restock.ingest.urdf.description import BASE_FRAMES
 
-MIN_ASIDE_M = 0.05  # of the middle: a lidar whose input must say where it is
-WIDE_RAD = math.radians(150)  # a depth camera's scan is narrower, and of no height of a lidar
+MAX_ASIDE_M = 3.0  # of the middle: a lidar
+MIN_RANGE_M = 0.01
 Place = tuple[float, float, float]  # ahead and to the left (m), and turned (rad)
 _TURN = 2 * math.pi
-_BINS = 360  # of the circle
-
-
-@dataclass(frozen=True)
-class MountedLidar:
-    """Where a lidar is in the frame of the outline's middle, and how its scans lie there."""
-
-    x_m: float = 0.0  # ahead
-    y_m: float = 0.0  # to the left
-    yaw_rad: float = 0.0
-    upside_down: bool = False
-
-    def lines(self) -> list[str]:
-        """The keys of its input."""
-        at = f"[{round(self.x_m, 3) + 0.0:g}, {round(self.y_m, 3) + 0.0:g}]"
-        return [
-            f"lidar_at_m = {at}  # ahead of the middle, and to the left",
-            f"lidar_yaw_rad = {round(self.yaw_rad, 4) + 0.0:g}",
-        ]
+_LIMITS = ("range_min", "range_max")
 
 
 @dataclass(frozen=True)
@@ -51,8 +35,13 @@ class View:
 
     low_rad: float
     high_rad: float
-    step_rad: float
     beams: int
+
+    def turned(self, yaw_rad: float) -> View:
+        """Return the view of a lidar that is turned so, in the robot's frame."""
+        low, high = self.low_rad + yaw_rad, self.high_rad + yaw_rad
+        back = _TURN * round((low + high) / 2 / _TURN)  # the middle of it within half a turn
+        return View(low - back, high - back, self.beams)
 
 
 @dataclass(frozen=True)
@@ -83,106 +72,7 @@ class SeenScans:
         low, high = min(first, last), max(first, last)
         if count < 4 or not 0 < high - low < _TURN + 0.1 or max(abs(low), abs(high)) > 7:
             return None
-        return View(low, min(high, low + _TURN), abs(step), count)
-
-
-def lidars_of(
-    recording: Recording,
-    fits: Sequence[tuple[TopicInfo, Kind]],
-    scanned: Mapping[str, SeenScans],
-    edges: Edges,
-    footprint: Footprint,
-) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
-    """By the name of its input, each lidar whose place its input must say; empty where the robot
-    has one lidar, ahead of or behind the middle of its outline.
-
-    Several are those of different places on the base of the first, by transforms, that see 150
-    degrees or more. A topic in the frame of the base has been made of the others
-    (`made_of_others_first`).
-    """
-    if not fits:
-        return {}
-    found = _several(recording, fits, scanned, edges, footprint.middle_m) if len(fits) > 1 else {}
-    if len(found) > 1:
-        return found
-    if abs(footprint.lidar_y_m) <= MIN_ASIDE_M:
-        return {}
-    lidar = MountedLidar(
-        footprint.lidar_x_m or 0.0,
-        footprint.lidar_y_m,
-        footprint.lidar_yaw_rad or 0.0,
-        footprint.upside_down,
-    )
-    return {SCANS[0]: (*fits[0], lidar)}
-
-
-def _several(
-    recording: Recording,
-    fits: Sequence[tuple[TopicInfo, Kind]],
-    scanned: Mapping[str, SeenScans],
-    edges: Edges,
-    middle_m: tuple[float, float],
-) -> dict[str, tuple[TopicInfo, Kind, MountedLidar]]:
-    found: dict[str, tuple[TopicInfo, Kind, MountedLidar]] = {}
-    base, taken = "", set[str]()
-    for topic, kind in fits:
-        frame, view = scanned[topic.name].frame, scanned[topic.name].view()
-        wide = view is not None and view.high_rad - view.low_rad >= WIDE_RAD
-        apart = wide and frame not in taken and plain(frame) not in BASE_FRAMES
-        place = lidar_place(recording, edges, frame) if apart else None
-        if place is None and not found:  # the others are no reason to leave the first
-            return {}
-        if place is None or (found and place.base != base):  # another robot's is on another base
-            continue
-        base = place.base
-        taken.add(frame)
-        at = (place.x_m - middle_m[0], place.y_m - middle_m[1], place.yaw_rad)
-        at = scanned[topic.name].seen_from(*at, upside_down=place.upside_down)
-        lidar = MountedLidar(*at, place.upside_down)
-        found[SCANS[len(found)]] = (topic, kind, lidar)
-        if len(found) == len(SCANS):
-            break
-    return found
-
-
-def made_of_others_first(
-    fits: Sequence[tuple[TopicInfo, Kind]], scanned: Mapping[str, SeenScans]
-) -> list[tuple[TopicInfo, Kind]]:
-    """The scans' topics, those in the frame of the base first: of several lidars, as a node that
-    puts their scans together publishes them."""
-    return sorted(fits, key=lambda fit: plain(scanned[fit[0].name].frame) not in BASE_FRAMES)
-
-
-def with_scans(roles: Roles, lidars: Mapping[str, tuple[TopicInfo, Kind, MountedLidar]]) -> Roles:
-    """The roles with an input for each lidar, after that of the first one."""
-    found: Roles = {}
-    for role, fits in roles.items():
-        if role != SCANS[0]:
-            found[role] = fits
-            continue
-        taken = {topic.name for topic, _, _ in lidars.values()}
-        others = [fit for fit in fits if fit[0].name not in taken]
-        for name, (topic, kind, _) in lidars.items():
-            found[name] = [(topic, kind), *(others if name == SCANS[0] else [])]
-    return found
-
-
-def seen_from_middle(footprint: Footprint, lidars: Sequence[MountedLidar]) -> Footprint:
-    """The footprint where the lidars' inputs say where they are; a guess holds them all."""
-    length, width = footprint.length_m, footprint.width_m
-    if not footprint.measured:
-        length = max(length, *(2 * abs(lidar.x_m) for lidar in lidars))
-        width = max(width, *(2 * abs(lidar.y_m) for lidar in lidars))
-    return replace(
-        footprint,
-        length_m=length,
-        width_m=width,
-        lidar_x_m=0.0,
-        lidar_y_m=0.0,
-        lidar_yaw_rad=0.0,
-        upside_down=False,
-        lidar_unplaced=footprint.lidar_unplaced if len(lidars) == 1 else "",
-    )
+        return View(low, min(high, low + _TURN), count)
 
 
 def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
@@ -265,26 +155,87 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
     return SeenScans(said, (first, last, step[0]), origin)
 
 
-def joined_view(views: Sequence[tuple[View, float]]) -> View | None:
-    """What several lidars cover together, in the robot's frame: each with how it is turned (rad).
+@dataclass(frozen=True)
+class LidarPlace:
+    """Where a lidar is in a robot's base frame, by transforms."""
 
-    None where that is all around.
-    """
-    covered = np.zeros(_BINS, np.bool_)
-    for view, yaw_rad in views:
-        first = round((view.low_rad + yaw_rad) / _TURN * _BINS)
-        count = round((view.high_rad - view.low_rad + view.step_rad) / _TURN * _BINS)
-        covered[np.arange(first, first + min(count, _BINS)) % _BINS] = True
-    gaps = np.flatnonzero(~covered)
-    if not len(gaps):
+    base: str
+    x_m: float  # ahead
+    y_m: float  # to the left
+    yaw_rad: float
+    upside_down: bool
+
+
+def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
+    """Where the lidar is, by the last of the recording's transforms; None where they do not say,
+    or not sanely."""
+    if not scan_frame:
         return None
-    # From the end of the widest gap to its start: the circle is opened there.
-    runs = np.split(gaps, np.flatnonzero(np.diff(gaps) > 1) + 1)
-    if len(runs) > 1 and gaps[0] == 0 and gaps[-1] == _BINS - 1:
-        runs = [np.concatenate([runs[-1] - _BINS, runs[0]]), *runs[1:-1]]
-    widest = max(runs, key=len)
-    low = (int(widest[-1]) + 1) / _BINS * _TURN
-    high = low + (_BINS - len(widest)) / _BINS * _TURN
-    back = _TURN * round((low + high) / 2 / _TURN)  # the middle of it within half a turn
-    step = min(view.step_rad for view, _ in views)
-    return View(low - back, high - back, step, round((high - low) / step) + 1)
+    frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
+    topic, static_topic = transform_topics(recording)
+    for base in named_frames(BASE_FRAMES, frames):
+        if plain(scan_frame) == base:
+            return LidarPlace(base, 0.0, 0.0, 0.0, False)
+        if base not in upward(plain(scan_frame), edges.parents):
+            continue
+        usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
+        kept = edges.only({base, scan_frame})
+        segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
+        last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
+        times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
+        at = Tree(usual, kept, segments).place(scan_frame, times)
+        x, y = (float(way) for way in at.translation_m[0, :2])
+        yaw = float(at.yaw_rad[0])
+        if at.problem[0] == "" and max(abs(x), abs(y)) < MAX_ASIDE_M and np.isfinite(yaw):
+            return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
+    return None
+
+
+def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
+    """The footprint with the lidar's place by transforms, the base frame taken for its middle.
+
+    An outline that is guessed is made as large as to hold it. Of one that is measured, a lidar
+    outside says that the base frame is not its middle: then only how it is turned is known.
+    """
+    if place is None:
+        return footprint
+    turned = replace(footprint, lidar_yaw_rad=place.yaw_rad, upside_down=place.upside_down)
+    source = f"of {place.base}, by transforms; that this is the middle is a guess"
+    if not footprint.measured:
+        sizes = (footprint.length_m, place.x_m), (footprint.width_m, place.y_m)
+        length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
+        turned = replace(turned, length_m=length, width_m=width)
+    elif abs(place.x_m) > footprint.length_m / 2:
+        return replace(turned, lidar_source=f"{place.base} has it {place.x_m:.2f} m ahead, outside")
+    return replace(turned, lidar_x_m=place.x_m, lidar_y_m=place.y_m, lidar_source=source)
+
+
+def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
+    """The nearest and the farthest range of use, as a task has them."""
+    low, high, why = _range_m(recording, topic, outline)
+    return [
+        f"range_min_m = {low:g}{why}",
+        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
+    ]
+
+
+def _range_m(
+    recording: Recording, topic: str, outline: ScannedOutline | None
+) -> tuple[float, float, str]:
+    """The nearest and the farthest, at most 4 m, and why where the lidar says less.
+
+    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
+    """
+    if not set(_LIMITS) <= set(recording.leaves(topic)):
+        return 0.05, 4.0, ""
+    columns = recording.read({topic: _LIMITS})[topic].fields
+    low, high = (float(np.median(np.asarray(columns[path]))) for path in _LIMITS)
+    if not 0 <= low < high < np.inf:
+        return 0.05, 4.0, ""
+    own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
+    why = ""
+    if low < MIN_RANGE_M:
+        low, why = MIN_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
+    if own_m > low:
+        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
+    return round(low, 3), min(round(high, 3), 4.0), why

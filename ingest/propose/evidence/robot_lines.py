@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
 from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
-from restock.ingest.propose.evidence.lidars import MountedLidar, SeenScans, View, joined_view
+from restock.ingest.propose.evidence.lidars import SeenScans, View
 from restock.ingest.propose.evidence.roles import shared
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
@@ -166,11 +166,16 @@ def propose_robot(
     scan: SeenScans | None,
     *,
     upside_down: bool = False,
-    lidars: Sequence[tuple[SeenScans, MountedLidar]] = (),
+    lidar_yaw_rad: float = 0.0,
 ) -> RobotProposal:
-    """The robot that a URDF file, else the recording's description, and its scans describe; its
-    lidar may hang upside down, and `lidars`, with their scans, be somewhere else than ahead of
-    or behind the middle.
+    """Return the robot that a URDF file, else the recording's description, and its scans describe.
+
+    Args:
+        recording: what is read.
+        urdf: the file, if there is one.
+        scan: what the scans say of the lidar.
+        upside_down: the lidar hangs so.
+        lidar_yaw_rad: by which the twin's lidar, which is in the middle, covers what this one does.
 
     Raises:
         ConfigError: the file cannot be used: it has no wheels, say.
@@ -207,11 +212,8 @@ def propose_robot(
     if unfit and not values:
         return RobotProposal(notes=unfit, rolls=False)
     if scan is not None:
-        if lidars:
-            seen = _lidars(lidars, notes)
-        else:
-            view = scan.view(upside_down=upside_down)
-            seen = _beams(view, notes) if view is not None else {}
+        view = scan.view(upside_down=upside_down)
+        seen = {} if view is None else _beams(view.turned(lidar_yaw_rad), notes)
         values |= seen
         origin |= dict.fromkeys(seen, "logs")
     return RobotProposal(values, origin, notes)
@@ -242,23 +244,6 @@ def _beams(view: View, notes: list[str]) -> dict[str, Any]:
         "lidar.angle_min_rad": round(view.low_rad, 5),
         "lidar.angle_max_rad": round(view.high_rad, 5),
     }
-
-
-def _lidars(lidars: Sequence[tuple[SeenScans, MountedLidar]], notes: list[str]) -> dict[str, Any]:
-    """Of one lidar in the middle that covers what these do."""
-    views = [
-        (view, lidar.yaw_rad)
-        for scans, lidar in lidars
-        if (view := scans.view(upside_down=lidar.upside_down)) is not None
-    ]
-    if not views:
-        return {}
-    notes.append("the twin has one lidar, in the middle, that covers what the robot's do")
-    joined = joined_view(views)
-    if joined is not None:
-        return _beams(joined, notes)
-    beams = round(2 * math.pi / min(view.step_rad for view, _ in views))
-    return {"lidar.beams": min(beams, MAX_BEAMS)}  # all around, as its angles are by default
 
 
 def _key(key: str) -> str:

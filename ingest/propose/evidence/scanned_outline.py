@@ -9,7 +9,7 @@ belong to the outline, and are no obstacles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,15 +20,10 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.inputs import Input
-from restock.ingest.profile.tables import Clock, Frames
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.frame_guess import named_frames, transform_topics
 from restock.ingest.propose.evidence.roles import Kind
-from restock.ingest.steps.align import align
 from restock.ingest.steps.clearance import angle_keys, beam_angles
-from restock.ingest.steps.frames import Edges, Tree, plain, upward
 from restock.ingest.steps.motion import PoseSeries
-from restock.ingest.urdf.description import BASE_FRAMES
 
 BINS = 60  # of the full circle
 NEAREST = "nearest return by bearing"  # (N, BINS) float32, m; no field's name holds a space
@@ -36,11 +31,9 @@ MIN_SCANS = 20
 OFTEN = 0.005  # of the scans, and at least three: one odd return says nothing
 TIGHT_PER_WIDTH = 0.3  # room, by the robot's width: less is a near collision
 MIN_M = 0.05  # half of a robot's length
-MIN_RANGE_M = 0.01
 OWN_WITHIN_M, OWN_SPREAD_M = 0.5, 0.015
 # It must have turned so far, with so many scans each way it faced; and so many say the same.
 FACING_RAD, MIN_FACINGS, MIN_A_FACING, MOSTLY = np.pi / 6, 4, 5, 0.8
-MAX_ASIDE_M = 3.0  # of the middle: a lidar
 _LIMITS = ("range_min", "range_max")
 
 
@@ -140,89 +133,3 @@ def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
     place = np.minimum(turn[valid].astype(np.int64), BINS - 1)
     np.minimum.at(found, (row[valid], place), values[valid])
     return {NEAREST: found}
-
-
-def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
-    """The nearest and the farthest range of use, as a task has them."""
-    low, high, why = _range_m(recording, topic, outline)
-    return [
-        f"range_min_m = {low:g}{why}",
-        f"range_max_m = {high:g}  # lidar ranges beyond it count as free",
-    ]
-
-
-def _range_m(
-    recording: Recording, topic: str, outline: ScannedOutline | None
-) -> tuple[float, float, str]:
-    """The nearest and the farthest, at most 4 m, and why where the lidar says less.
-
-    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
-    """
-    if not set(_LIMITS) <= set(recording.leaves(topic)):
-        return 0.05, 4.0, ""
-    columns = recording.read({topic: _LIMITS})[topic].fields
-    low, high = (float(np.median(np.asarray(columns[path]))) for path in _LIMITS)
-    if not 0 <= low < high < np.inf:
-        return 0.05, 4.0, ""
-    own_m = outline.own_range_m + OWN_SPREAD_M if outline and len(outline.own_m) else 0
-    why = ""
-    if low < MIN_RANGE_M:
-        low, why = MIN_RANGE_M, "  # the lidar states less; 0 is where nothing came back"
-    if own_m > low:
-        low, why = own_m, "  # beyond the robot's own parts, which the lidar sees"
-    return round(low, 3), min(round(high, 3), 4.0), why
-
-
-@dataclass(frozen=True)
-class LidarPlace:
-    """Where a lidar is in a robot's base frame, by transforms."""
-
-    base: str
-    x_m: float  # ahead
-    y_m: float  # to the left
-    yaw_rad: float
-    upside_down: bool
-
-
-def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
-    """Where the lidar is, by the last of the recording's transforms; None where they do not say,
-    or not sanely."""
-    if not scan_frame:
-        return None
-    frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
-    topic, static_topic = transform_topics(recording)
-    for base in named_frames(BASE_FRAMES, frames):
-        if plain(scan_frame) == base:
-            return LidarPlace(base, 0.0, 0.0, 0.0, False)
-        if base not in upward(plain(scan_frame), edges.parents):
-            continue
-        usual = Frames(base, scan_frame, topic=topic, static_topic=static_topic)
-        kept = edges.only({base, scan_frame})
-        segments, _ = align(kept.topics, Clock(alignment="log_time"), kept.static)
-        last = max(int(s.stamp_ns[-1]) for s in segments[-1].topics.values() if len(s.stamp_ns))
-        times = [np.zeros(0, np.int64) for _ in segments[:-1]] + [np.array([last])]
-        at = Tree(usual, kept, segments).place(scan_frame, times)
-        x, y = (float(way) for way in at.translation_m[0, :2])
-        yaw = float(at.yaw_rad[0])
-        if at.problem[0] == "" and max(abs(x), abs(y)) < MAX_ASIDE_M and np.isfinite(yaw):
-            return LidarPlace(base, x, y, yaw, bool(at.rotation[0, 2, 2] < 0))
-    return None
-
-
-def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
-    """The footprint with the lidar's place by transforms, the base frame taken for its middle.
-
-    An outline that is guessed is made as large as to hold it. Of one that is measured, a lidar
-    outside says that the base frame is not its middle: then only how it is turned is known.
-    """
-    if place is None:
-        return footprint
-    turned = replace(footprint, lidar_yaw_rad=place.yaw_rad, upside_down=place.upside_down)
-    source = f"of {place.base}, by transforms; that this is the middle is a guess"
-    if not footprint.measured:
-        sizes = (footprint.length_m, place.x_m), (footprint.width_m, place.y_m)
-        length, width = (max(usual, 2 * abs(at)) for usual, at in sizes)
-        turned = replace(turned, length_m=length, width_m=width)
-    elif abs(place.x_m) > footprint.length_m / 2:
-        return replace(turned, lidar_source=f"{place.base} has it {place.x_m:.2f} m ahead, outside")
-    return replace(turned, lidar_x_m=place.x_m, lidar_y_m=place.y_m, lidar_source=source)
