@@ -8,7 +8,6 @@ comparisons with `nan` are silently false, and JSON has neither it nor `inf`.
 
 from __future__ import annotations
 
-import copy
 import functools
 import inspect
 import json
@@ -123,7 +122,7 @@ def typed(
         return msgspec.convert(_plain(document), kind)
     except msgspec.ValidationError as error:
         what = _in_words(str(error), document, kind, prefix)
-        if meant := _key_meant(str(error), kind, prefix):
+        if meant := _key_meant(str(error), document, kind, prefix):
             remedy = f"did you mean `{meant}`?" + (f" {remedy}" if remedy else "")
         raise ConfigError(what, where=where, remedy=remedy) from error
 
@@ -139,52 +138,6 @@ def toml_value(value: Any) -> str:
         return repr(float(value))  # JSON has no inf and nan
     # JSON would escape what is beyond 16 bits in two halves, and leave DEL as it is.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def with_value(text: str, key: str, value: Any, *, where: str) -> str:
-    """A TOML text with one key set, and every other line and comment as it was.
-
-    Args:
-        key: of a table, as `replay.ring_capacity`; it is added where it is not there.
-        where: names the text in errors.
-
-    Raises:
-        ConfigError: not TOML, or written in a way that a line of its own cannot change.
-    """
-    before, (table, _, name) = parse_toml(text, where=where), key.rpartition(".")
-    new = f"{name} = {toml_value(value)}"
-    lines, at, inside = text.splitlines(), None, ""
-    for number, line in enumerate(lines):
-        if header := re.fullmatch(r"\s*\[\s*([^\[\]]+?)\s*\]\s*(#.*)?", line):
-            inside = header[1]
-            at = number + 1 if inside == table else at
-        own = name if inside == table else key if not inside else None
-        if own and (found := re.match(rf"(\s*{re.escape(own)}\s*=\s*)[^#]*?(\s*#.*)?$", line)):
-            lines[number] = f"{found[1]}{toml_value(value)}{found[2] or ''}"
-            break
-    else:
-        if at is None:
-            lines += [*([""] if lines else []), f"[{table}]", new]
-        else:
-            lines.insert(at, new)
-    changed = "\n".join(lines) + "\n"
-    try:
-        after: Any = tomllib.loads(changed)
-    except tomllib.TOMLDecodeError:
-        after = None
-    expected: Any = copy.deepcopy(before)
-    place = expected
-    for part in table.split("."):
-        place = place.setdefault(part, {}) if isinstance(place, dict) else None
-    if isinstance(place, dict):
-        place[name] = value
-    if not isinstance(place, dict) or after != expected:
-        raise ConfigError(
-            f"{key} cannot be set without changing other lines",
-            where=where,
-            remedy=f"write it yourself: {new}, in a table [{table}]",
-        )
-    return changed
 
 
 def _key(name: str) -> str:
@@ -292,20 +245,19 @@ def _range_in_words(bounds: Mapping[str, float]) -> str:
 
 
 def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
-    """msgspec's message with the key as TOML writes it, and the range of the type in words."""
-    what, _, path = message.partition(" - at `$")
-    path = path.rstrip("`")
+    """Return msgspec's message with the key as TOML writes it, and with a range in words."""
+    what, path = _parted(message)
     for pattern, word in (("contains unknown", "unknown"), ("missing required", "missing")):
         if field := re.fullmatch(rf"Object {pattern} field `(.*)`", what):
             return f"{word} key `{_join(prefix, path, field[1])}`"
     key = _join(prefix, path)
     if re.fullmatch(r"Expected `\w+` [<>]=? .*", what):
-        place = _walk(kinds.type_info(kind), document, path)
-        if place is not None:
-            bounds, value, key = *place[:2], _join(prefix, place[2])
-            return f"{key} must be {_range_in_words(bounds)}, got {value}"
+        for place, value, name in _places(kinds.type_info(kind), document, path):
+            bounds = _bounds(place)
+            if isinstance(value, int | float) and bounds and not _inside(value, bounds):
+                return f"{_join(prefix, name)} must be {_range_in_words(bounds)}, got {value}"
     if re.match(r"Expected `|Invalid ", what) or not path:
-        choices = sorted(set(_choices(kinds.type_info(kind), path)))
+        choices = sorted(set(_choices(kind, document, path)))
         if choices and choices[0].startswith('"'):  # names stand before other kinds
             what += f"; choose from {', '.join(choices)}"
         return f"`{key}`: {what}" if key else what
@@ -313,93 +265,71 @@ def _in_words(message: str, document: Any, kind: Any, prefix: str) -> str:
     return what if what.startswith((key, "`")) or " " not in what else f"{key}.{what}"
 
 
-def _key_meant(message: str, kind: Any, prefix: str) -> str | None:
-    """The key that an unknown one was likely meant to be, where one is near it."""
+def _parted(message: str) -> tuple[str, str]:
+    """Split a message of msgspec into what is wrong, and the path of the value."""
     what, _, path = message.partition(" - at `$")
-    path = path.rstrip("`")
+    return what, path.rstrip("`")
+
+
+def _key_meant(message: str, document: Any, kind: Any, prefix: str) -> str | None:
+    """Return the key that is nearest to an unknown one, if one is near."""
+    what, path = _parted(message)
     unknown = re.fullmatch(r"Object contains unknown field `(.*)`", what, re.S)
     if unknown is None:
         return None
     from difflib import get_close_matches
 
-    near = get_close_matches(unknown[1], set(_keys(kinds.type_info(kind), path)), n=1)
+    known = set()
+    for place, _, _ in _places(kinds.type_info(kind), document, path):
+        if isinstance(place, kinds.StructType):
+            known |= {field.encode_name for field in place.fields} | {place.tag_field or ""}
+    near = get_close_matches(unknown[1], known, n=1)
     return _join(prefix, path, near[0]) if near else None
 
 
-def _keys(kind: kinds.Type, path: str) -> Iterator[str]:
-    """The keys of the table that a message's path leads to; of several that it may be, of all."""
-    if isinstance(kind, kinds.UnionType):
-        for option in kind.types:
-            yield from _keys(option, path)
-    elif isinstance(kind, kinds.StructType) and not path:
-        yield from (field.encode_name for field in kind.fields)
-        yield from (kind.tag_field,) if kind.tag_field else ()
-    elif step := re.fullmatch(_STEP, path, re.S):
-        if isinstance(kind, kinds.StructType):
-            for field in kind.fields:
-                if field.encode_name == step[1][1:]:
-                    yield from _keys(field.type, step[2])
-        elif (item := _item(kind)) is not None:
-            yield from _keys(item, step[2])
+def _choices(kind: Any, document: Any, path: str) -> Iterator[str]:
+    """Yield what may stand at a message's path: names in quotes, or a number or table."""
+    for place, _, _ in _places(kinds.type_info(kind), document, path):
+        if isinstance(place, kinds.LiteralType):
+            yield from (f'"{value}"' for value in place.values)
+        elif isinstance(place, kinds.IntType | kinds.FloatType):
+            yield "a number"
+        elif isinstance(place, kinds.StructType | kinds.DictType):
+            yield "a table"
 
 
-def _walk(kind: kinds.Type, value: Any, path: str) -> tuple[dict[str, float], Any, str] | None:
-    """Bounds, value and key of what a message's path leads to; `[...]` is any item of a map."""
+def _places(
+    kind: kinds.Type, value: Any, path: str, key: str = ""
+) -> Iterator[tuple[kinds.Type, Any, str]]:
+    """Yield each type, value and key that a message's path leads to.
+
+    There are several where a type is a union, and where `[...]` stands for any key of a table.
+    """
     if isinstance(kind, kinds.UnionType):
         for option in kind.types:
-            if place := _walk(option, value, path):
-                return place
-        return None
+            yield from _places(option, value, path, key)
+        return
     if not path:
-        bounds = _bounds(kind)
-        return (bounds, value, "") if bounds and not _inside(value, bounds) else None
+        yield kind, value, key
+        return
     step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
     if isinstance(kind, kinds.StructType | kinds.TypedDictType | kinds.DataclassType):
-        fields = {field.encode_name: field.type for field in kind.fields}
         name = step[1:]
-        if name not in fields or not isinstance(value, Mapping) or name not in value:
-            return None
-        place = _walk(fields[name], value[name], rest)
-        return place and (place[0], place[1], _join(name, place[2]))
-    item = _item(kind)
-    if isinstance(kind, kinds.TupleType):
-        item = kind.item_types[int(step[1:-1])]
-    if item is None or not isinstance(value, Mapping | list | tuple):
-        return None
-    if step == "[...]":
-        for name, one in value.items() if isinstance(value, Mapping) else ():
-            if isinstance(one, int | float | Mapping | list) and (place := _walk(item, one, rest)):
-                return place[0], place[1], _join(str(name), place[2])
-        return None
-    index = int(step[1:-1])
-    # `[...]` may stand for another item of the map, one that is longer.
-    place = _walk(item, value[index], rest) if index < len(value) else None
-    return place and (place[0], place[1], _join(step, place[2]))
-
-
-def _choices(kind: kinds.Type, path: str) -> Iterator[str]:
-    """What may stand where a message's path leads to: names in quotes, or a number or table."""
-    if isinstance(kind, kinds.UnionType):
-        for option in kind.types:
-            yield from _choices(option, path)
-        return
-    if not path:
-        if isinstance(kind, kinds.LiteralType):
-            yield from (f'"{value}"' for value in kind.values)
-        elif isinstance(kind, kinds.IntType | kinds.FloatType):
-            yield "a number"
-        elif isinstance(kind, kinds.StructType | kinds.DictType):
-            yield "a table"
-        return
-    step, rest = re.fullmatch(_STEP, path, re.S).groups()  # type: ignore[union-attr]
-    if isinstance(kind, kinds.StructType):
-        if step[1:] == kind.tag_field:
-            yield f'"{kind.tag}"'
+        if isinstance(kind, kinds.StructType) and name == kind.tag_field:
+            yield kinds.LiteralType((kind.tag,)), None, key
         for field in kind.fields:
-            if field.encode_name == step[1:]:
-                yield from _choices(field.type, rest)
-    elif (item := _item(kind)) is not None:
-        yield from _choices(item, rest)
+            if field.encode_name == name and isinstance(value, Mapping):
+                yield from _places(field.type, value.get(name), rest, _join(key, name))
+        return
+    inside = value.items() if isinstance(value, Mapping) else ()
+    if step != "[...]" and isinstance(value, list | tuple):
+        inside = [(step, one) for one in value[int(step[1:-1]) :][:1]]
+    for name, one in inside:
+        item = (
+            kind.item_types[int(step[1:-1])] if isinstance(kind, kinds.TupleType) else _item(kind)
+        )
+        if item is not None:
+            yield from _places(item, one, rest, _join(key, str(name)))
 
 
 def _has(document: Any, keys: list[str]) -> bool:

@@ -118,8 +118,7 @@ MAY_IMPORT = {
     "cli/data": (
         "cli ingest ingest/containers ingest/containers/formats ingest/profile ingest/propose"
         " ingest/propose/evidence ingest/steps ingest/store ingest/task replay replay/export"
-        " replay/fleet replay/mixture replay/panel replay/plan replay/store train/dqn"
-        " train/evaluation"
+        " replay/fleet replay/mixture replay/panel replay/plan replay/store train/evaluation"
     ),
     "cli/fleet": (
         "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"

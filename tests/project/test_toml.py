@@ -19,7 +19,7 @@ from msgspec import Meta, inspect
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.replay.mixture.mixture import Mixture
-from restock.toml import Checked, parse_toml, read_toml, toml_value, typed, with_value
+from restock.toml import Checked, parse_toml, read_toml, toml_value, typed
 from restock.train.dqn.config import (
     NetworkConfig,
     TrainConfig,
@@ -294,47 +294,6 @@ def test_a_file_that_cannot_be_read_says_why(tmp_path: Path) -> None:
             read_toml(tmp_path / name)
     (tmp_path / "good.toml").write_text("a = 1\n[b]\nc = 'x'", encoding="utf-8")
     assert read_toml(tmp_path / "good.toml") == {"a": 1, "b": {"c": "x"}}
-
-
-KEYS = st.from_regex(r"[a-z][a-z_]{0,5}", fullmatch=True)
-SCALARS = st.one_of(st.integers(-9, 9), st.booleans(), st.text('ab# "[]=', max_size=6))
-TABLES = st.dictionaries(KEYS, st.dictionaries(KEYS, SCALARS, max_size=3), max_size=3)
-
-
-@given(TABLES, KEYS, KEYS, st.integers(1, 99), st.text("ab#", max_size=3))
-def test_one_value_of_a_text_is_set_and_all_else_stays(
-    tables: dict[str, dict[str, Any]], table: str, name: str, value: int, comment: str
-) -> None:
-    lines = []
-    for key, entries in tables.items():
-        lines.append(f"[{key}]  # {comment}")
-        lines += [f"{entry} = {toml_value(of)} # {comment}" for entry, of in entries.items()]
-    text = "\n".join(lines)
-    expected = {key: dict(entries) for key, entries in tables.items()}
-    expected.setdefault(table, {})[name] = value
-    if "#" in str(tables.get(table, {}).get(name)):  # a text with one is left to its writer
-        with pytest.raises(ConfigError, match="write it yourself"):
-            with_value(text, f"{table}.{name}", value, where="test")
-        return
-    changed = with_value(text, f"{table}.{name}", value, where="test")
-    assert parse_toml(changed, where="test") == expected
-    kept = [line for line in lines if not line.startswith(f"{name} =")]
-    assert [line for line in changed.splitlines() if line in kept] == kept
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["replay = {batch_size = 4}", "[replay]\ntext = '''\nring_capacity = 3\n'''", "replay = 4"],
-)
-def test_a_value_that_no_line_holds_alone_is_left_to_its_writer(text: str) -> None:
-    with pytest.raises(ConfigError, match="write it yourself: ring_capacity = 7"):
-        with_value(text, "replay.ring_capacity", 7, where="test")
-
-
-def test_a_dotted_key_is_set_where_it_stands() -> None:
-    text = "replay.ring_capacity = 5 # five\n[env]\nnum_envs = 2\n"
-    changed = with_value(text, "replay.ring_capacity", 7, where="test")
-    assert changed == text.replace("= 5", "= 7")
 
 
 def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from restock.replay.store.capacity import capacity_of_rows, recommend_capacity
 from restock.replay.store.store import Store
 from restock.train import ring_capacity
 from restock.train.describe import describe_run
-from restock.train.dqn.config import load_config
 from restock.train.prepare import prepare_new
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
@@ -116,46 +115,6 @@ def test_the_verb_recommends(store_path: Path, capsys: pytest.CaptureFixture[str
 def test_a_path_is_no_connection(store_path: Path) -> None:
     with pytest.raises(ArgumentError, match=r'give Store\("store"\)\.connection'):
         recommend_capacity(str(store_path))  # type: ignore[arg-type]
-
-
-def test_the_number_is_written_into_a_config(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "train.toml"
-    path.write_text(
-        "seed = 3  # ours\n\n[replay]\nbatch_size = 64\nring_capacity = 5000 # guess\n", "utf-8"
-    )
-    apply = ["audit", str(store_path), "--capacity", "--apply"]
-    assert cli.main([*apply, str(path), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    rows = document["capacity"]["recommended"]
-    assert document["applied"] == {"config": str(path), "ring_capacity": rows, "before": 5000}
-    assert path.read_text("utf-8") == (
-        f"seed = 3  # ours\n\n[replay]\nbatch_size = 64\nring_capacity = {rows} # guess\n"
-    )
-    assert cli.main([*apply, str(tmp_path / "new.toml")]) == 0
-    assert load_config(tmp_path / "new.toml").replay.ring_capacity == rows
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("[strata]\nnominal = 0.5\n", "strata"),  # a mixture
-        ("replay = { batch_size = 64 }\n", "cannot be set without changing other lines"),
-        (f"[replay]\nbatch_size = {10**9}\n", "at least a batch"),
-        ("[replay\n", "TOML"),
-    ],
-)
-def test_a_file_that_cannot_take_it_stays_as_it_is(
-    store_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, complaint: str
-) -> None:
-    path = tmp_path / "config.toml"
-    path.write_text(text, "utf-8")
-    assert cli.main(["audit", str(store_path), "--capacity", "--apply", str(path)]) == 2
-    assert complaint in capsys.readouterr().err
-    assert path.read_text("utf-8") == text
-    assert cli.main(["audit", str(store_path), "--apply", str(path)]) == 2
-    assert "--capacity" in capsys.readouterr().err
 
 
 def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> None:

@@ -54,8 +54,6 @@ class AuditCommand:
     capacity: bool = False
     """Instead of auditing, show how coverage grows with the number of rows kept, and how many are
     enough."""
-    apply: Annotated[Path | None, tyro.conf.arg(metavar="CONFIG")] = None
-    """With --capacity: write that number into this training config, as replay.ring_capacity."""
     reward: bool = False
     """Only check whether the reward agrees with the outcomes: print returns by driver, condition
     and outcome, and check that more success earns a higher return (docs/reward.md)."""
@@ -139,12 +137,6 @@ class AuditCommand:
         from restock.files import expect_file_place
         from restock.replay.places import RUN_CONFIG
 
-        if self.apply is not None:
-            raise ConfigError(
-                "--apply writes the capacity that --capacity finds",
-                where="restock audit",
-                remedy="give both",
-            )
         if self.discount is not None and not (self.reward and 0 <= self.discount <= 1):
             raise ConfigError(
                 f"must be within [0, 1], got {self.discount:g}"
@@ -261,12 +253,8 @@ class AuditCommand:
             self.store, memory_limit=self.memory_limit, only_store=True, version=version
         ) as connection:
             capacity = recommend_capacity(connection)
-        applied = None
-        if self.apply is not None:
-            applied = _apply(self.apply, capacity.recommended)
         if self.json:
-            document = {"store": str(self.store), "capacity": asdict(capacity)}
-            output.print_json(document if applied is None else document | {"applied": applied})
+            output.print_json({"store": str(self.store), "capacity": asdict(capacity)})
             return int(ExitCode.OK)
         output.print_table(capacity.curve, title="what the newest rows cover")
         output.stdout().print(
@@ -278,11 +266,6 @@ class AuditCommand:
                 f"the newest half keeps {capacity.half_share:.0%}: the logs still add new cells, "
                 "and more recordings will add more"
             )
-        if applied is not None:
-            output.say(
-                f"{applied['config']}: replay.ring_capacity = {applied['ring_capacity']}"
-                + ("" if applied["before"] is None else f" (was {applied['before']})")
-            )
         return int(ExitCode.OK)
 
 
@@ -290,26 +273,6 @@ def _refuse_with(command: AuditCommand, other: str, *names: str) -> None:
     from restock.cli.command_line import refuse
 
     refuse(command, names, f"cannot be combined with {other}", remedy="leave out one of them")
-
-
-def _apply(path: Path, rows: int) -> dict[str, Any]:
-    """Set `replay.ring_capacity` of a training config, which need not be there yet.
-
-    Raises:
-        ConfigError: it is no training config, or the number does not go with its other settings.
-    """
-    from restock.files import write_text
-    from restock.toml import parse_toml, with_value
-    from restock.train.dqn.config import load_config, parse_config
-
-    text, before = "", None
-    if path.exists():
-        before = load_config(path).replay.ring_capacity
-        text = path.read_text(encoding="utf-8")
-    changed = with_value(text, "replay.ring_capacity", rows, where=str(path))
-    parse_config(parse_toml(changed, where=str(path)), where=str(path))
-    write_text(path, changed)
-    return {"config": str(path), "ring_capacity": rows, "before": before}
 
 
 def _document(part: str, finding: Finding) -> dict[str, Any]:
