@@ -116,7 +116,7 @@ def _answer(options: argparse.Namespace) -> int:
 
 
 def primary_arms(study: Study) -> Study:
-    """The study with the two arms of its primary contrast alone."""
+    """Return the study with the two arms of its primary contrast alone."""
     assert study.primary is not None
     arms = [arm for arm in study.arms if arm.name in study.primary.pair]
     base = next(arm for arm in arms if arm.name == study.primary.baseline)
@@ -141,7 +141,7 @@ def quick(study: Study) -> Study:
 
 
 def _beside_the_stores(question: str, out: Path) -> Path:
-    """Copies of a question's mixtures where the stores are: a mixture's path starts at its file."""
+    """Copy a question's mixtures beside its stores, as a mixture's paths start at its file."""
     folder = out / "mixtures"
     folder.mkdir(parents=True, exist_ok=True)
     for mixture in (HERE / question).glob("*.toml"):
@@ -218,8 +218,10 @@ def _record(recording: Path, flags: list[str], conditions: str) -> None:
 
 
 def curves(plan: StudyPlan) -> str:
-    """Success in the rare conditions at each periodic evaluation, the mean over seeds; and how far
-    each arm is ahead of its baseline there, paired by seed."""
+    """Return success in rare conditions at each periodic evaluation, the mean over seeds.
+
+    Beside it stands how far each arm is ahead of its baseline, paired by seed.
+    """
     runs = {
         arm.name: [
             RunCurve(path, plan.study.rare) if (path / DONE).exists() else None

@@ -1,4 +1,4 @@
-"""A fleet of three robots over four weeks, one with a worn wheel from the third: who drifts?
+"""Ask drift who of three robots, one with a worn wheel from the third week, has changed.
 
     python benchmarks/fleet.py [--out FOLDER] [--quick] [--json] [--check]
 
@@ -74,7 +74,7 @@ class FleetDrive:
         )
 
     def hardware(self) -> Perturbation:
-        """The robot's own, with the day's payload and floor, and its wheel as worn as it is."""
+        """Return the robot's own hardware with the day's payload, floor and wheel wear."""
         rng = np.random.default_rng(self.seed)
         own = dict(ROBOTS[self.robot])
         if self.robot == WORN and self.week >= WORN_FROM:

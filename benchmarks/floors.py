@@ -1,4 +1,4 @@
-"""The floors that recordings show: what they are made from, and do planned missions arrive on them?
+"""Show what the floors of recordings are made from, and whether missions arrive on them.
 
     python benchmarks/floors.py RECORDING... [--missions N] [--json] [--check]
 

@@ -59,7 +59,7 @@ def main() -> int:
 
 
 def scene(kind: str) -> Image.Image:
-    """The first moment in which what the kind is named for is close ahead of the robot."""
+    """Return the first moment in which what the kind is named for is close ahead of the robot."""
     for seed in range(SEEDS):
         env = WarehouseVectorEnv(1, conditions={kind: 1.0}, autoreset_mode=AutoresetMode.DISABLED)
         observation, _ = env.reset(seed=seed)

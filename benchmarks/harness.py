@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 def option_parser(doc: str | None, quick: str = "") -> argparse.ArgumentParser:
-    """The options that benchmarks share; `quick` says what a small run is, where there is one."""
+    """Return the options that benchmarks share; `quick` describes a small run, if there is one."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -39,7 +39,10 @@ def option_parser(doc: str | None, quick: str = "") -> argparse.ArgumentParser:
 
 
 def in_turns(contenders: Mapping[str, Callable[[], T]], rounds: int) -> dict[str, list[T]]:
-    """What each contender gives in each round; in turns, so that a busy machine slows all."""
+    """Return what each contender gives in each round.
+
+    They take turns, so that a busy machine slows all of them.
+    """
     measured: dict[str, list[T]] = {name: [] for name in contenders}
     for number in range(rounds):
         for name, measure in contenders.items():
@@ -49,7 +52,7 @@ def in_turns(contenders: Mapping[str, Callable[[], T]], rounds: int) -> dict[str
 
 
 def medians(measured: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """The middle of each contender's rounds."""
+    """Return the middle of each contender's rounds."""
     return {name: float(np.median(values)) for name, values in measured.items()}
 
 
@@ -74,7 +77,7 @@ def mean_interval(
 
 
 def run_restock(arguments: Sequence[str]) -> None:
-    """A command of Restock in this process; what it prints goes to stderr."""
+    """Run a command of Restock in this process; what it prints goes to stderr."""
     with contextlib.redirect_stdout(sys.stderr):
         code = restock(arguments)
     if code not in (0, 3):
@@ -99,7 +102,7 @@ def once(mark: Path, requested: Sequence[str], do: Callable[[], object]) -> None
 
 
 def markdown(header: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
-    """A table as the docs have it."""
+    """Return a table as the docs have it."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 

@@ -196,7 +196,7 @@ def measured(path: Path, store: Path) -> dict[str, float]:
 
 
 def compressed(bag: Path) -> Path:
-    """The bag's storage file compressed as a whole, as rosbag2's file mode does."""
+    """Return the bag's storage file compressed as a whole, as rosbag2's file mode does."""
     for file in list(bag.glob("*.mcap")):
         with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
             zstandard.ZstdCompressor(level=1).copy_stream(source, sink)
@@ -205,7 +205,7 @@ def compressed(bag: Path) -> Path:
 
 
 def memory(folder: Path, seconds: float, image_mb: float) -> dict[str, dict[str, float]]:
-    """Recordings of `seconds` with and without images, in each container, and a longer one."""
+    """Measure recordings with and without images in each container, and a longer one."""
     images = int(image_mb * 1e6 / robot_log.IMAGE_BYTES)
     zstd_bag = folder / "zstd_bag"
     used = {}
@@ -234,8 +234,10 @@ def memory(folder: Path, seconds: float, image_mb: float) -> dict[str, dict[str,
 def targets(
     ratio: dict[str, float], workers: dict[str, float], used: dict[str, dict[str, float]]
 ) -> dict[str, tuple[float, bool | None]]:
-    """The targets of the design: what they say, what was measured, and whether that meets them;
-    None where a peer that is not installed was to be measured."""
+    """Return each target, what was measured, and whether that meets it.
+
+    None stands for a peer that is not installed.
+    """
     peak = max(one["peak_mb"] for one in used.values())
     images = max(one["peak_mb"] for one in used.values() if one["images"]) - used[PLAIN]["peak_mb"]
     ratio = dict.fromkeys(PEERS["rerun-sdk"], math.nan) | ratio
@@ -260,7 +262,7 @@ def targets(
 
 
 def lines(answer: dict[str, Any]) -> Iterator[str]:
-    """The figures as tables."""
+    """Yield the figures as tables."""
     yield f"{answer['messages']:,} messages, {answer['log_s']:.0f} s, {answer['mcap_mb']:.0f} MB"
     equal = ", ".join(f"{who} {count}" for who, count in answer["equal_columns"].items())
     yield f"columns equal: {equal}\n"

@@ -101,8 +101,10 @@ def mcap_to_rows(folder: Path) -> Callable[[], object]:
 
 
 def row_to_gradient(folder: Path, *, plain: bool) -> Callable[[], object]:
-    """Return what makes one update, online, after a short run: by the default recipe on a panel of
-    a sample log, or of plain DQN without logs."""
+    """Return what makes one update, online, after a short run.
+
+    It learns by the default recipe on a panel of a sample log, or as plain DQN without logs.
+    """
     from restock.cli import main
     from restock.train import loop
     from restock.train.prepare import prepare_new

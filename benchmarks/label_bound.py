@@ -92,7 +92,7 @@ def has(one: Log, name: str) -> Bools:
 
 
 def features(one: Log, timing: str) -> F32:
-    """What the network sees of each step, (N, F): no other episode's steps."""
+    """Return what the network sees of each step, (N, F): no other episode's steps."""
     bearing = np.arctan2(one["waypoint_near_y_m"], one["waypoint_near_x_m"])
     way = np.minimum(one["plan_return_m"], 2.5)
     turned = one["wheel_yaw_rate_radps"] - one["gyro_yaw_rate_radps"]
@@ -129,7 +129,7 @@ def features(one: Log, timing: str) -> F32:
 
 
 def at(one: Log, column: Any, k: int) -> Any:
-    """The column k steps later, NaN beyond the episode, (N,)."""
+    """Return the column k steps later, NaN beyond the episode, (N,)."""
     episode = one["episode_index"]
     there = np.arange(len(column)) + k
     inside = (there >= 0) & (there < len(column))
@@ -138,7 +138,7 @@ def at(one: Log, column: Any, k: int) -> Any:
 
 
 def fitted(x: F32, y: Bools) -> Any:
-    """A network's probabilities, as a function of features."""
+    """Return a network's probabilities, as a function of features."""
     torch.manual_seed(0)
     middle, scale = x.mean(0), x.std(0) + 1e-3
     inputs, wanted = torch.from_numpy((x - middle) / scale), torch.from_numpy(y.astype(np.float32))
@@ -170,7 +170,7 @@ def fitted(x: F32, y: Bools) -> Any:
 
 
 def best(logs: Sequence[Log], condition: Condition, probable: Sequence[F32]) -> LabelScore:
-    """The score of these probabilities by the thresholds that suit events best."""
+    """Return the score of these probabilities by the thresholds that suit events best."""
     ahead = 2 if condition.timing == "post" else 0
     known = np.concatenate([one["known"] for one in logs])
     true = np.concatenate([has(one, condition.name) for one in logs])[known]

@@ -85,7 +85,7 @@ def main() -> int:
 
 
 def development(cache: Path, minutes: float, count: int | None) -> list[Log]:
-    """The steps of the development logs, kept in `cache` beside what is measured."""
+    """Return the steps of the development logs, kept in `cache` beside what is measured."""
     logs = []
     for floors, seeds in SEEDS["development"].items():
         for seed in list(seeds)[:count]:
@@ -99,7 +99,7 @@ def development(cache: Path, minutes: float, count: int | None) -> list[Log]:
 
 
 def stored(cache: Path, floors: str, seeds: Sequence[int], minutes: float) -> Path:
-    """The store of these logs, recorded and ingested where they are not, labelled as of now."""
+    """Return the store of these logs, newly labelled; missing ones are recorded and ingested."""
     cache.mkdir(parents=True, exist_ok=True)
     name = floors.replace(":", "_")
     store = cache / f"{name}_{seeds[0]}_{minutes:g}"
@@ -144,7 +144,7 @@ def _pair(precision: float | None, recall: float | None) -> str:
 
 
 def reliability_table(bins: Sequence[Mapping[str, Any]]) -> str:
-    """A row a condition, a column a tenth of probability: the share that is true."""
+    """Return a row a condition, a column a tenth of probability: the share that is true."""
     names = sorted({row["condition"] for row in bins})
     one = {(row["condition"], round(row["from_probability"] * 10)): row for row in bins}
     rows = [
@@ -157,7 +157,7 @@ def reliability_table(bins: Sequence[Mapping[str, Any]]) -> str:
 
 
 def misses(floors: str, one: LabelQuality) -> list[str]:
-    """What of a condition is below its target."""
+    """Return what of a condition is below its target."""
     shares = {
         "step": (one.score.precision, one.score.recall),
         "event": (one.score.event_precision, one.score.event_recall),
@@ -177,7 +177,7 @@ _CONSTANT = re.compile(r"[+-]\s*[\d.]+(?!\S| \*)")
 
 
 def fit(logs: Sequence[Log], name: str) -> dict[str, float]:
-    """The weights of the terms of a condition's `odds`, by a logistic regression on these logs.
+    """Fit the weights of the terms of a condition's `odds` by logistic regression on these logs.
 
     `odds` is written as `+ .27 + 3.52 * near_m ...`, perhaps within `CASE WHEN`; each term is a
     `let`. It sees the steps whose odds that sum is, and no other branch's.
@@ -219,7 +219,7 @@ def _number(text: str) -> float:
 
 
 def steps_of(one: Log) -> pa.Table:
-    """The steps as conditions see them, of a log's signals."""
+    """Return the steps as conditions see them, of a log's signals."""
     columns = signal_columns({s.name: one[s.name].astype(s.dtype) for s in STORED_SIGNALS})
     places = {name: one[name].astype(np.int64) for name in ("episode_index", "step_index")}
     return pa.table(places | columns)

@@ -70,7 +70,7 @@ def main() -> int:
 
 
 def _asked(options: argparse.Namespace) -> Study:
-    """The file's study with the arms and seeds that were asked for, on panels of this folder."""
+    """Return the file's study with the requested arms and seeds, on panels of this folder."""
     study = load_study(options.study)
     names = options.arms.split(",") if options.arms else [arm.name for arm in study.arms]
     wanted = {study.base.name, *names}
@@ -141,7 +141,7 @@ def _restock(arguments: Sequence[str], plan: StudyPlan, job: StudyJob) -> float:
 
 
 def table(plan: StudyPlan) -> str:
-    """What there is, arm by arm, and how far each is ahead of its baseline."""
+    """Return what there is, arm by arm, and how far each is ahead of its baseline."""
     runs = {
         arm.name: {
             job.seed: job.path

@@ -1,4 +1,4 @@
-"""Is a policy from logs alone as good as the planner that drove in them, before it drives at all?
+"""Compare a policy from logs alone with the planner that drove in them, before it ever drives.
 
     python benchmarks/offline.py --out DIR [--hours 8] [--seeds 3] [--quick] [--json] [--check]
 
@@ -91,7 +91,7 @@ def main() -> int:
 
 
 def _panel(out: Path, hours: float) -> Path:
-    """The panel of so many hours of the fleet."""
+    """Return the panel of so many hours of the fleet."""
     logs, store, panel = out / "logs", out / "store", out / "panel"
     logs.mkdir(parents=True, exist_ok=True)
     left = hours * 60
@@ -122,7 +122,7 @@ def _policy(run: Path, start: StartPolicy) -> Policy:
 
 
 def _kept(file: Path, episodes: int, drive: Callable[[], pa.Table]) -> pa.Table:
-    """The drives in a file, driven where it is not there or has other episodes."""
+    """Return the drives in a file, driven where it is not there or has other episodes."""
     if not file.exists() or pq.read_metadata(file).num_rows != episodes * len(KINDS):
         pq.write_table(drive(), file)
     return pq.read_table(file)

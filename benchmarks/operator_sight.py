@@ -1,4 +1,4 @@
-"""How many bumps does a driver have who decides as the operator does, but sees less?
+"""Count the bumps of a driver who decides as the operator does, but sees less.
 
     python benchmarks/operator_sight.py [--episodes 300] [--quick] [--json]
 
@@ -127,7 +127,7 @@ def main() -> int:
 
 
 def _driven(kind: str, sees: str, driver: Operator, episodes: int) -> dict[str, Any]:
-    """What one driver's missions of a kind come to."""
+    """Return what one driver's missions of a kind come to."""
     results = drive_missions(driver, (kind,), episodes, EVALUATION_SEED)
     taken_s = [result.time_s for result in results if result.success]
     low, high = wilson(len(taken_s), len(results))

@@ -64,7 +64,7 @@ SETTINGS = {
 
 
 def plant(clean: Path, faulty: Path, fault: str) -> None:
-    """A store with the fault in its rows."""
+    """Write a store with the fault in its rows."""
     rng = np.random.default_rng(0)
     action = load_profile("warehouse_amr").task.action_names.index(ACTION)
     source, writer = StoreWriter(clean), StoreWriter(faulty)
@@ -102,7 +102,7 @@ def plant(clean: Path, faulty: Path, fault: str) -> None:
 
 
 def panel_for(fault: str, out: Path) -> Path:
-    """The panel that a fault trains on, made once."""
+    """Return the panel that a fault trains on, made once."""
     clean, panel = out / "clean", out / "panels" / fault.replace(" ", "_")
     logs = Path(__file__).parents[1] / "sample_logs"
     run_restock(["ingest", str(logs), "--store", str(clean)])  # skips what it has

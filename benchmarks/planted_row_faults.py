@@ -67,7 +67,7 @@ class Fault(NamedTuple):
 
 
 def missions(filling: Filling, share: float, rng: np.random.Generator) -> np.ndarray:
-    """The ticks (T,) of a share of the missions, which pauses of the recording divide."""
+    """Return the ticks (T,) of a share of the missions, which pauses of the recording divide."""
     number = np.cumsum(np.diff(filling.tick_ns, prepend=filling.tick_ns[:1]) > 2 * 10**9)
     chosen = rng.permutation(int(number.max()) + 1)
     return np.isin(number, chosen[: max(round(share * len(chosen)), 1)])
@@ -303,7 +303,7 @@ OUTCOMES = ("named", "named otherwise", "UNDETERMINED", "HEALTHY")
 
 
 def planting(fault: Fault, rng: np.random.Generator) -> type[Filling]:
-    """A `Filling` that plants the fault before routes are looked up, or when all is there."""
+    """Return a `Filling` that plants the fault before routes are looked up, or at the end."""
 
     class Planted(Filling):
         def _scan(self) -> None:
@@ -321,7 +321,7 @@ def planting(fault: Fault, rng: np.random.Generator) -> type[Filling]:
 
 
 def plant(logs: Path, fault: Fault, out: Path) -> Path:
-    """A store of the recordings with the fault, made once."""
+    """Return a store of the recordings with the fault, made once."""
     store = out / re.sub(r"\W+", "_", f"{logs.stem}-{fault.type}-{fault.dose}")
     mark = store.with_name(f"{store.name}.json")
     once(mark, [str(logs.resolve())], lambda: _plant(logs, fault, store))
@@ -363,7 +363,10 @@ def rewrite(
 
 
 def unchanged(out: Path) -> list[Path]:
-    """Recordings without a fault, made once: all kinds of missions, drivers, floors and loads."""
+    """Return recordings without a fault: all kinds of missions, drivers, floors and loads.
+
+    They are made once.
+    """
     paths = []
     for name, (missions, seed, flags) in UNCHANGED.items():
         paths.append(out / f"{name}.mcap")

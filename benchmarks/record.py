@@ -51,7 +51,7 @@ def measure(file_format: str, minutes: float) -> dict[str, Any]:
 
 
 def in_own_process(file_format: str, minutes: float) -> dict[str, Any]:
-    """The same, in a fresh process: peak memory is a process's."""
+    """Measure it in a fresh process, as peak memory is a process's."""
     command = [sys.executable, __file__, "--one", file_format, str(minutes)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     result: dict[str, Any] = json.loads(done.stdout)

@@ -44,7 +44,7 @@ CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8  # bytes before a chunk's records, but fo
 
 
 def decompress_only(path: Path) -> Callable[[], None]:
-    """Reads each chunk's bytes, decompresses them and computes their CRC.
+    """Read each chunk's bytes, decompress them and compute their CRC.
 
     Where they lie is looked up beforehand; the CRC is by the fastest there is, as Restock's.
     """
@@ -170,7 +170,7 @@ def check_values(path: Path, bag: Path) -> dict[str, int]:
 
 
 def arrow_column(messages: pa.StructArray, leaf: Leaf) -> FieldColumn:
-    """A field path of rerun's messages as a column of Restock's."""
+    """Return a field path of rerun's messages as a column of Restock's."""
     return _inside(messages, list(leaf.steps), leaf.kind)
 
 

@@ -126,7 +126,7 @@ def sampling(quick: bool) -> dict[str, Any]:
 def installed(
     peers: dict[str, Callable[[], None] | str],
 ) -> tuple[dict[str, Callable[[], None]], dict[str, str]]:
-    """The other libraries' draws, and why some are left out."""
+    """Return the other libraries' draws, and why some are left out."""
     draws = {name: draw for name, draw in peers.items() if callable(draw)}
     return draws, {name: why for name, why in peers.items() if isinstance(why, str)}
 
@@ -160,7 +160,7 @@ def ten_million(count: int, rounds: int, draws: int) -> dict[str, float]:
 
 
 def panel_build(count: int) -> dict[str, float]:
-    """A panel of `count` rows from an Arrow table, checksummed."""
+    """Return a panel of `count` rows from an Arrow table, checksummed."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     import pyarrow as pa
     from support.stores import CONDITIONS, recording_transitions
@@ -186,7 +186,7 @@ def panel_build(count: int) -> dict[str, float]:
 
 
 def cold_panel(count: int, batches: int) -> dict[str, float]:
-    """A panel that is not in memory, read at random and in chunks: rows a second of wall time.
+    """Measure rows a second of wall time of a panel on disk, read at random and in chunks.
 
     The file is dropped from the page cache before each; where the system does not do that (as on
     some virtual machines' own caches) both are faster than a disk.
@@ -242,7 +242,7 @@ def cold_panel(count: int, batches: int) -> dict[str, float]:
 
 
 def record_share(rounds: int, updates: int) -> dict[str, float]:
-    """An update of the default recipe with and without the record of what was fed."""
+    """Measure an update of the default recipe with and without the record of what was fed."""
     from own_updates import Restock, config
     from train_peers import data
 
@@ -273,7 +273,7 @@ def _us(run: Callable[[int], object], updates: int) -> float:
 
 
 def fresh_ring(steps: int) -> dict[str, float]:
-    """Appending steps of 16 environments, three-step returns, labels at the end of episodes."""
+    """Measure appending steps of 16 environments, with three-step returns and late labels."""
     us = {}
     for name, reserved in (("", {}), ("reserved_", {"rare": 10_000})):
         envs, length = 16, 100
@@ -324,7 +324,7 @@ def main() -> int:
 
 
 def _turns(quick: bool) -> tuple[int, int]:
-    """Rounds, and draws of each contender in one."""
+    """Return the rounds, and the draws of each contender in one."""
     return (5, 128) if quick else (7, 384)
 
 
@@ -339,7 +339,7 @@ SECTIONS: dict[str, Callable[[bool], dict[str, Any]]] = {
 
 
 def missed(figures: dict[str, Any]) -> list[str]:
-    """The targets of the design that these figures miss."""
+    """Return the targets of the design that these figures miss."""
     ratios = figures["sampling"]["ratios"] if "sampling" in figures else {}
     misses = [
         f"{name}: {ratio:.2f}, at least {TARGETS[name][2]:g}"
@@ -356,7 +356,7 @@ def missed(figures: dict[str, Any]) -> list[str]:
 
 
 def lines(result: dict[str, Any]) -> Iterator[str]:
-    """The figures as a table and lines, for people."""
+    """Yield the figures as a table and lines, for people."""
     for section, figures in result.items():
         if section != "sampling":
             line = ", ".join(f"{key} {value:,.4g}" for key, value in figures.items())

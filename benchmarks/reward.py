@@ -113,7 +113,7 @@ def drive(policy: Policy, specs: Sequence[EpisodeSpec], task: Any) -> Driven:
 
 
 def missions(per_cell: int) -> list[EpisodeSpec]:
-    """The same always; blocked aisles twice, for they are blocked partly or wholly."""
+    """Return the same missions each time; those of blocked aisles twice, as they block two ways."""
     return [
         EpisodeSpec(kind, FIRST_SEED + index)
         for kind in KINDS

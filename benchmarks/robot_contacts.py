@@ -1,4 +1,4 @@
-"""A bumper against labels that were made without it: are they where the contacts are?
+"""Compare labels with a bumper's contacts that they were made without.
 
 A contact is a run of messages in which any of a bumper's fields is pressed; two within a second are
 one. The labels come from lidar and odometry: the store must not have the bumper among its inputs,
@@ -47,7 +47,7 @@ class ContactScore:
 
 
 def contacts_of(recording: Recording) -> Spans | None:
-    """The contacts of a recording; None where no bumper can be read."""
+    """Return the contacts of a recording; None where no bumper can be read."""
     words = KINDS["bumper"][0].words
     pressed: list[int] = []
     read = False
@@ -69,7 +69,7 @@ def contacts_of(recording: Recording) -> Spans | None:
 
 
 def events(times_ns: Sequence[int]) -> Spans:
-    """Times in order, as runs without a longer pause than PARTED_NS."""
+    """Return sorted times as runs without a pause longer than PARTED_NS."""
     spans: Spans = []
     for time in times_ns:
         if spans and time - spans[-1][1] <= PARTED_NS:
@@ -80,7 +80,7 @@ def events(times_ns: Sequence[int]) -> Spans:
 
 
 def score_contacts(store: Store, contacts: Mapping[str, Spans]) -> ContactScore:
-    """The labels of a store's rows against contacts by recording (its path).
+    """Score the labels of a store's rows against the contacts of each recording (by path).
 
     Raises:
         StoreError: a label may have been made from the bumper.

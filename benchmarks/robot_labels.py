@@ -68,7 +68,7 @@ def scores(profile: Profile, seed: int, steps: int) -> Iterator[dict[str, Any]]:
 
 
 def driven(profile: Profile, seed: int, steps: int) -> tuple[pa.Table, list[frozenset[str]]]:
-    """Steps of ROBOTS robots, and what is true of each."""
+    """Return steps of ROBOTS robots, and what is true of each."""
     task = msgspec.structs.replace(profile.task, goal="route")
     shares = {kind: 1 / len(KINDS) for kind in KINDS}
     env = WarehouseVectorEnv(ROBOTS, task=task, robot=profile.robot, seed=seed, conditions=shares)

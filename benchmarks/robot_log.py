@@ -87,7 +87,7 @@ def _template(topic: str) -> Any:
 
 
 def _packed(topic: str, stamps: NDArray[np.int64], rng: np.random.Generator) -> list[bytes]:
-    """The topic's messages at these times, serialised."""
+    """Return the topic's messages at these times, serialised."""
     kind = TYPES[topic][0]
     if topic in ("/diagnostics", "/state"):
         return [bytes(STORE.serialize_cdr(_varied(topic, rng), kind)) for _ in stamps]
@@ -145,7 +145,7 @@ def messages(seconds: float, seed: int = 1) -> Iterator[tuple[str, int, bytes]]:
 def with_images(
     lines: Iterator[tuple[str, int, bytes]], seconds: float, images: int
 ) -> Iterator[tuple[str, int, bytes]]:
-    """The same messages with camera images evenly among them: noise, which no one compresses."""
+    """Yield the same messages with camera images of noise, evenly among them."""
     if not images:
         yield from lines
         return
@@ -170,7 +170,7 @@ def write_mcap(
     index: bool = True,
     summary: bool = True,
 ) -> Path:
-    """The log as MCAP, zstd. Without `summary`, the file's end says nothing of what is in it."""
+    """Write the log as MCAP with zstd; without `summary` it has no index at its end."""
     with path.open("wb") as file:
         writer = Writer(
             file,
@@ -200,7 +200,7 @@ def _kinds(images: int) -> dict[str, str]:
 
 
 def write_bag(folder: Path, seconds: float, *, images: int = 0) -> Path:
-    """The log as a rosbag2 sqlite3 bag."""
+    """Write the log as a rosbag2 sqlite3 bag."""
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
         connections = {
             topic: bag.add_connection(topic, kind, typestore=STORE)

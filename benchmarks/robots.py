@@ -87,7 +87,7 @@ class Kind:
 
 
 def kinds_of(paths: Sequence[Path], kept: Path) -> list[Kind]:
-    """The recordings by kind of robot; what an earlier call found of the same files is kept."""
+    """Return the recordings by kind of robot; what an earlier call found of these files is kept."""
     files = [[str(path), path.stat().st_size] for path in paths]
     if kept.is_file() and (known := read_json(kept))["files"] == files:
         return [Kind(one["told"], tuple(one["paths"])) for one in known["kinds"]]
@@ -116,13 +116,13 @@ def user_tags(bags: Path) -> dict[str, dict[str, str]]:
 
 
 def start(kind: Kind, folder: Path, minutes: float, twin: str) -> None:
-    """The whole way; what it says is kept in the folder."""
+    """Run the whole of `restock start`; what it prints is kept in the folder."""
     flags = ["--out", str(folder), "--twin", twin, "--accept", "--minutes", f"{minutes:g}"]
     write_text(folder / "start.txt", said(["start", *kind.paths, *flags]))
 
 
 def said(command: Sequence[str]) -> str:
-    """What a verb prints."""
+    """Return what a verb prints."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         restock(list(command))
@@ -132,7 +132,7 @@ def said(command: Sequence[str]) -> str:
 def measured(
     kind: Kind, folder: Path, tags: Mapping[str, Mapping[str, str]], definitions: Path | None
 ) -> dict[str, Any]:
-    """The figures of one kind, from what `restock start` left."""
+    """Return the figures of one kind, from what `restock start` left."""
     stages = read_json(folder / "start" / "stages.json")
     documents = {
         name: json.loads(file.read_text(encoding="utf-8"))
@@ -200,7 +200,7 @@ def rows_of(documents: Documents) -> dict[str, Any]:
 
 
 def twin_of(stages: Documents, documents: Documents) -> dict[str, Any]:
-    """The robot fitted, and how far it ends from nominal driving."""
+    """Return how the robot was fitted, and how far it ends from nominal driving."""
     fits = documents.get("fit", {}).get("fits", [{"estimates": [], "warnings": []}])[0]
     gap = documents.get("gap", {"paths": [], "verdicts": []})
     ends = {}
@@ -228,8 +228,10 @@ def twin_of(stages: Documents, documents: Documents) -> dict[str, Any]:
 
 
 def policy_of(stages: Documents, documents: Documents) -> dict[str, Any]:
-    """Success in the twin by policy (`cloned` is how the logs were driven) with how good the clone
-    is, and what held-out logs say."""
+    """Return success in the twin by policy (`cloned` is how the logs were driven).
+
+    With it come how good the clone is, and what held-out logs say.
+    """
     driven: dict[str, dict[str, str]] = {}
     for one in documents.get("eval", {}).get("results", []):
         if one["perturbation"] == "none" and one["success"] is not None:
@@ -259,7 +261,7 @@ def contacts_against_labels(kind: Kind, store: Path, definitions: Path | None) -
 
 
 def lines_of(robots: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The tables."""
+    """Return the tables."""
     header = [
         *("robot, by its own words", "recordings", "rows", "conditions", "stood in"),
         *("fitted", "gap after 3 s, m", "twin in nominal driving", *DROVE),

@@ -123,7 +123,7 @@ def ask(store: Path, question: str) -> dict[str, float]:
 
 
 def requested(store: Path, question: str, limit_s: float) -> dict[str, float]:
-    """The same in a process of its own; empty where it is not done after `limit_s`."""
+    """Return the same in a process of its own; empty where it is not done after `limit_s`."""
     command = [sys.executable, __file__, "--ask", question, str(store)]
     print(f"  {question} …", file=sys.stderr)
     try:
@@ -171,7 +171,7 @@ def _answers(store: Path, size: Size, rounds: int) -> dict[str, dict[str, float]
 
 
 def missed(figures: Mapping[str, Any]) -> list[str]:
-    """The targets that these figures miss."""
+    """Return the targets that these figures miss."""
     misses = []
     for name, one in figures.items():
         for question, most in SIZES[name].targets_s.items():
@@ -187,7 +187,7 @@ def missed(figures: Mapping[str, Any]) -> list[str]:
 
 
 def lines(figures: Mapping[str, Any]) -> Iterator[str]:
-    """The figures as tables."""
+    """Yield the figures as tables."""
     for name, one in figures.items():
         size = f"{one['files']:,} files, {one['rows']:,} rows, {one['disk_bytes'] / 1e6:,.0f} MB"
         yield f"{name}: {size}"

@@ -37,7 +37,7 @@ FIRST_DAY = datetime(2026, 1, 5, tzinfo=UTC)
 def write_fleet(
     path: Path, recordings: int, rows: int, *, batch: int, sectors: int | None = None
 ) -> None:
-    """A store of so many recordings of about so many rows, `batch` of them a commit.
+    """Write a store of so many recordings of about so many rows, `batch` of them a commit.
 
     `sectors` of the lidar are observed; by default the shipped task's. Manifests are folded at the
     end, as `restock ingest` ends.
@@ -52,7 +52,7 @@ def write_fleet(
 
 
 def files_of_day(store: Path, day: int) -> list[Path]:
-    """The files of the recordings that began in a day of a fleet, counted from 0."""
+    """Return the files of the recordings that began in a day of a fleet, counted from 0."""
     hours = range(max(24 * day, 1), 24 * (day + 1))  # recording N begins N hours after FIRST_DAY
     folders = [store / TRANSITIONS / f"{hour:016x}" for hour in hours]
     return [file for folder in folders for file in folder.glob("*.parquet")]
@@ -72,7 +72,7 @@ def drives(recordings: int, rows: int, task: Task) -> Iterator[tuple[pa.Table, p
 
 
 def drive(template: pa.Table, number: int, task: Task) -> tuple[pa.Table, pa.Table]:
-    """The rows of a template as another recording's, and its manifest."""
+    """Drive the rows of a template as another recording's, and its manifest."""
     rng, count = np.random.default_rng(number), len(template)
     recording_id = f"{number:016x}"
     started = FIRST_DAY + timedelta(hours=number)
@@ -103,5 +103,5 @@ def drive(template: pa.Table, number: int, task: Task) -> tuple[pa.Table, pa.Tab
 
 
 def disk_bytes(folder: Path) -> int:
-    """What the files of a folder hold."""
+    """Return what the files of a folder hold."""
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

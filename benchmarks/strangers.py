@@ -1,4 +1,4 @@
-"""Other people's robots by the proposed profile, without a hand: how much of their time is rows?
+"""Read other people's robots by the proposed profile: how much of their time becomes rows.
 
     python benchmarks/strangers.py --bags FOLDER [--only TEXT] [--json] [--check]
 
@@ -117,7 +117,7 @@ def main() -> int:
 
 
 def recordings_of(bags: Path) -> list[tuple[Path, bool]]:
-    """The recordings, and whether each has a command and a pose by `fleets.json`."""
+    """Return the recordings, and whether each has a command and a pose by `fleets.json`."""
     listed = bags / "fleets.json"
     if not listed.is_file():
         return [(path, True) for path in recordings_in(bags)]
@@ -174,7 +174,7 @@ def measure(path: Path, name: str, counts: bool) -> Stranger:
 
 
 def _seconds(steps: Steps, episodes: Split) -> float:
-    """What the transitions span, in log time."""
+    """Return what the transitions span, in log time."""
     stamps, pace = steps.signals["stamp_ns"], steps.clock.pace or 1.0
     return sum(int(stamps[one.last] - stamps[one.first]) for one in episodes.episodes) / NS / pace
 
@@ -210,7 +210,7 @@ def command_and_pose_s(recording: Recording) -> float:
 
 
 def _transformed(recording: Recording) -> list[tuple[float, float, float, float]]:
-    """The moving transforms, each as where its child is; those of a robot's wheels left out."""
+    """Return the moving transforms by child frame, without those of a robot's wheels."""
     name, kind = TRANSFORMS
     if name not in recording.topics or recording.topics[name].type != kind:
         return []

@@ -119,7 +119,7 @@ def _drive(
 def _table(
     runs: Sequence[Path], uniform: Sequence[Path], settings: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """A row for each cell, and for rare conditions and all of them, of each setting."""
+    """Return a row for each cell, and for rare conditions and all of them, of each setting."""
     rng = np.random.default_rng(0)
     rows = []
     for setting in settings:
@@ -193,7 +193,7 @@ def _faster(
 
 
 def _missed(rows: Sequence[dict[str, Any]], budget: str) -> list[str]:
-    """The targets of a budget that are missed, on the episodes as they are."""
+    """Return the targets of a budget that are missed, on the episodes as they are."""
     at = {row["cell"]: row for row in rows if row["setting"] == "none"}
     missed = []
     least = {"three-minutes": 0.8, "ten-minutes": 0.9, "hour": 0.95}.get(budget)

@@ -51,7 +51,7 @@ FEED_TARGET = 0.06  # of an update, at most
 
 
 def in_place(settings: TrainConfig, arrays: Arrays) -> Updates:
-    """The arithmetic of an update alone: one batch, drawn beforehand, again and again."""
+    """Return the arithmetic of an update alone: one batch, drawn beforehand, again and again."""
     whole = Restock(settings, arrays)
     learner, rows = whole.learner, whole.batches.draw_online().rows.clone()
 
@@ -91,7 +91,7 @@ def us_of(run: Updates, updates: int) -> float:
 
 
 def lines(answer: dict[str, Any]) -> Iterator[str]:
-    """The figures, for people."""
+    """Yield the figures, for people."""
     for name, value in answer["us_per_update"].items():
         yield f"{name:28s} {value:7.0f} us an update"
     for name, value in answer["ratios"].items():

@@ -112,7 +112,7 @@ def seconds_of_runs(device: str, part: float, folder: Path) -> dict[str, dict[st
 
 
 def lines_of_runs(answer: dict[str, Any]) -> Iterator[str]:
-    """The figures of whole runs, for people."""
+    """Yield the figures of whole runs, for people."""
     yield answer["device"]
     for name, by_place in answer["s_per_1000_env_steps"].items():
         each = ", ".join(f"{place} {value:.2f}" for place, value in by_place.items())
@@ -120,7 +120,7 @@ def lines_of_runs(answer: dict[str, Any]) -> Iterator[str]:
 
 
 def lines(answer: dict[str, Any]) -> Iterator[str]:
-    """The figures, for people."""
+    """Yield the figures, for people."""
     yield answer["device"]
     for batch, of_batch in answer["us_per_update"].items():
         for name, value in of_batch.items():

@@ -48,7 +48,7 @@ def mlp() -> nn.Sequential:
 
 
 def cleanrl(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates:
-    """The update of CleanRL's `cleanrl/dqn.py`, line by line, without its logging.
+    """Return the update of CleanRL's `cleanrl/dqn.py`, line by line, without its logging.
 
     Its buffer is the one of Stable-Baselines3 1 (`cleanrl_utils/buffers.py`): a gather of each
     column, then `torch.tensor`. Its target is copied every 500 steps (`tau` 1).

@@ -80,7 +80,7 @@ class Contestant:
 
 
 def under_way(env: WarehouseVectorEnv) -> Callable[[], object]:
-    """A step under random actions, of environments that are some steps into their episodes."""
+    """Return steps under random actions of environments that are already in their episodes."""
     env.reset(seed=1)
     rng = np.random.default_rng(0)
     # As in a long run, some episode or other is always about to end.
@@ -95,14 +95,14 @@ def under_way(env: WarehouseVectorEnv) -> Callable[[], object]:
 
 
 def vector(count: int, nthread: int = 1, **arguments: Any) -> Contestant:
-    """The whole vector environment."""
+    """Return the whole vector environment."""
     return Contestant(
         under_way(WarehouseVectorEnv(count, seed=1, nthread=nthread, **arguments)), count
     )
 
 
 def with_beams(beams: int) -> Contestant:
-    """The same with another lidar."""
+    """Return the same with another lidar."""
     env = WarehouseVectorEnv(SCALED, seed=1)
     old = env.simulation
     env.simulation = Simulation(SCALED, env.task, env.warehouse, old.timestep_s, 1, beams=beams)
@@ -111,7 +111,7 @@ def with_beams(beams: int) -> Contestant:
 
 
 def in_pieces(floor: Warehouse, count: int) -> Warehouse:
-    """The same floor with its racks cut, along x, into so many boxes: what a map gives."""
+    """Return the same floor with its racks cut, along x, into so many boxes: what a map gives."""
     each = -(-count // len(floor.racks))
     racks = []
     for rack in floor.racks:
@@ -138,7 +138,7 @@ def ranging(switch: str, beams: int, boxes: int | None) -> Contestant:
 
 
 def physics(count: int) -> Contestant:
-    """The substeps of a control period alone, of robots under way, always from the same state."""
+    """Return the substeps of a control period alone, always from the same state."""
     env = WarehouseVectorEnv(count, seed=1)
     under_way(env)
     sim = env.simulation
@@ -298,7 +298,7 @@ def lines(
     ratios: dict[str, float],
     shares: dict[int, dict[str, float]],
 ) -> Iterator[str]:
-    """The figures as tables."""
+    """Yield the figures as tables."""
     yield f"{'microseconds an environment step':40s} {'CPU':>8s} {'wall':>8s}"
     yield from (f"{name:40s} {cpu[name]:8.1f} {wall[name]:8.1f}" for name in cpu)
     yield from (f"{name:40s} {value:8.2f}" for name, value in ratios.items())

@@ -16,7 +16,7 @@ from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
 
 def trained(path: Path, settings: Sequence[str], panel: Path | None = None) -> Run:
-    """The run at a path, trained or resumed where it has not ended."""
+    """Return the run at a path, trained or resumed where it has not ended."""
 
     def train() -> None:
         run_restock(train_words(path, settings, panel))

@@ -61,7 +61,7 @@ RESAMPLES = 2000
 
 
 def cell_of(episode: Episode) -> str:
-    """The finest cell of the table that an episode belongs to."""
+    """Return the finest cell of the table that an episode belongs to."""
     kind = episode.spec.condition
     if kind == "wheel_slip":
         friction = episode.patches[episode.patches[:, 2] > 0, 4].min()
@@ -97,7 +97,7 @@ def fixed(per_cell: int) -> list[tuple[EpisodeSpec, str]]:
 
 
 def train(out: Path, agent: str, seed: int, env_steps: int) -> Path:
-    """The run of an agent and a seed, trained where it is not there or not at its end."""
+    """Train the run of an agent and a seed, trained where it is not there or not at its end."""
     settings = [*AGENTS[agent], *SETTINGS, f"schedule.env_steps={env_steps}", f"seed={seed}"]
     return trained(out / f"{agent.replace(', ', '-').replace(' ', '_')}-{seed}", settings).path
 
@@ -132,7 +132,7 @@ def overall(values: NDArray[np.float64], parts: list[NDArray[np.int64]]) -> NDAr
 
 
 def misses(rows: list[dict[str, Any]]) -> list[str]:
-    """What of `--check` does not hold."""
+    """Return what of `--check` does not hold."""
     at = {(row["driver"], row["cell"]): row for row in rows}
     cells = list(dict.fromkeys(row["cell"] for row in rows if row["cell"] != "overall"))
     every, nominal = AGENTS
@@ -232,7 +232,7 @@ def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
-    """The table of the docs: success with its interval, and the share that touched something."""
+    """Return the docs' table: success with its interval, and the share that touched something."""
     drivers = list(dict.fromkeys(row["driver"] for row in rows))
     at = {(row["driver"], row["cell"]): row for row in rows}
     texts = {

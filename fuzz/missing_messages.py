@@ -35,7 +35,7 @@ PAGE = 4096
 
 
 def damaged(data: bytes, rng: random.Random) -> tuple[str, bytes]:
-    """A name of the damage, and the bytes with it."""
+    """Return a name of the damage, and the bytes with it."""
     kind = rng.choice(["change", "cut out", "zero", "repeat", "insert", "cut short"])
     unit = rng.choice([1, 8, 512, PAGE])
     at = rng.randrange(max(len(data) // unit, 1)) * unit

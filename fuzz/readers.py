@@ -71,7 +71,7 @@ def require(holds: bool, what: str) -> None:
 
 
 def recording(data: bytes) -> None:
-    """A file of any kind. The first byte's lowest bit says whether to salvage."""
+    """Read a file of any kind; the lowest bit of the first byte is whether to salvage."""
     with tempfile.TemporaryDirectory(dir=_memory()) as folder:
         path = Path(folder) / "input"
         path.write_bytes(data[1:])
@@ -79,7 +79,7 @@ def recording(data: bytes) -> None:
 
 
 def metadata(data: bytes) -> None:
-    """A bag's folder, with this metadata.yaml."""
+    """Read a bag's folder with this metadata.yaml."""
     with tempfile.TemporaryDirectory(dir=_memory()) as folder:
         path = Path(folder) / "bag"
         path.mkdir()
@@ -109,14 +109,14 @@ def _read(path: Path, *, salvage: bool) -> None:
 
 
 def cdr(data: bytes) -> None:
-    """A ROS 2 definition and messages of it, compared with rosbags."""
+    """Decode messages by a ROS 2 definition, and compare them with rosbags."""
     definition, payloads = _parts(data)
     form = "ros2idl" if definition.startswith(b"module") else "ros2msg"
     _compare_with_rosbags("cdr", form, definition, payloads)
 
 
 def ros1(data: bytes) -> None:
-    """A ROS 1 definition and messages of it, compared with rosbags."""
+    """Decode messages by a ROS 1 definition, and compare them with rosbags."""
     definition, payloads = _parts(data)
     _compare_with_rosbags("ros1", "ros1msg", definition, payloads)
 
@@ -144,13 +144,13 @@ def _compare_with_rosbags(
 
 
 def json_messages(data: bytes) -> None:
-    """A JSON Schema and messages."""
+    """Decode messages by a JSON Schema."""
     schema, payloads = _parts(data)
     _decode(Channel(1, "/t", "T", "json", "jsonschema" if schema else "", schema), payloads)
 
 
 def protobuf(data: bytes) -> None:
-    """A FileDescriptorSet and messages."""
+    """Decode messages by a FileDescriptorSet."""
     definition, payloads = _parts(data)
     _decode(Channel(1, "/t", "p.T", "protobuf", "protobuf", definition), payloads)
 
@@ -169,7 +169,7 @@ def _decode(channel: Channel, payloads: list[bytes]) -> None:
 
 
 def _parts(data: bytes) -> tuple[bytes, list[bytes]]:
-    """A definition and payloads, each after its length in two bytes."""
+    """Return a definition and payloads, each after its length in two bytes."""
     parts = []
     while len(data) >= 2:
         (length,) = struct.unpack_from("<H", data)

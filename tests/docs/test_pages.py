@@ -62,7 +62,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
 
 @pytest.fixture(scope="session")
 def prepared(server: Reader, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a reader has: recordings, a store and a panel of them, two runs."""
+    """Return what a reader has: recordings, a store and a panel of them, two runs."""
     folder = tmp_path_factory.mktemp("prepared")
     (folder / "sample_logs").symlink_to(ROOT / "sample_logs")
     (folder / "docs").symlink_to(ROOT / "docs")
@@ -136,13 +136,13 @@ def test_blocks_that_are_not_run_are_few_and_say_why() -> None:
 
 
 def check_mixture(block: Block, folder: Path) -> None:
-    """A part of a mixture is checked with the shortest list of strata, where it has none."""
+    """Check a part of a mixture, with the shortest list of strata if it has none."""
     listed = {"strata", "each_condition"} & set(tomllib.loads(block.text))
     parse_mixture(block.text + ("" if listed else "\n[each_condition]\n"), where=block.place)
 
 
 def check_study(block: Block, folder: Path) -> None:
-    """A part of a study is checked with what it leaves out taken from the page's whole one."""
+    """Check a part of a study; what it leaves out comes from the page's whole one."""
     whole = next(b for b in blocks(ROOT / block.page) if b.marks.get("file") == "study.toml")
     own = tomllib.loads(block.text)
     left_out = {
@@ -174,8 +174,10 @@ max_age_s = 0.2
 
 
 def check_profile(block: Block, folder: Path) -> None:
-    """A part of a profile is checked as an addition to the shipped one, whose inputs of the same
-    names it replaces."""
+    """Check a part of a profile as an addition to the shipped one.
+
+    It replaces the inputs of the same names.
+    """
     shipped = (files("restock.ingest.profile") / "profiles/warehouse_amr.toml").read_text("utf-8")
     tables = re.split(r"^(?=\[)", shipped, flags=re.MULTILINE)
     own = [rf"\[inputs\.{name}[].]" for name in tomllib.loads(block.text).get("inputs", {})]

@@ -14,7 +14,7 @@ PAGE = ROOT / "docs/tutorial.md"
 
 
 def check_verdicts(notebook: nbformat.NotebookNode) -> None:
-    """What the text says of a comparison and of two broken runs is what their cells put out."""
+    """Check that the text states the verdicts that its cells print."""
     said = {cell.source: text_of(cell) for cell in notebook.cells if cell.cell_type == "code"}
 
     def of(words: str) -> str:

@@ -177,7 +177,7 @@ MODULES = {
 
 
 def imports(path: Path) -> Iterator[str]:
-    """What a file imports of Restock, as paths: `ingest/task/scan`, `errors`."""
+    """Yield what a file imports of Restock, as paths: `ingest/task/scan`, `errors`."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -208,7 +208,7 @@ def edges(folder: str) -> dict[str, str]:
 
 
 def allowed(folder: str) -> set[str]:
-    """The table's short names, looked up in the folder's own room first."""
+    """Return the table's short names, looked up in the folder's own room first."""
     room = folder.split("/")[0]
     return {
         name if name in FOLDERS and name.split("/")[0] in ROOMS else f"{room}/{name}"

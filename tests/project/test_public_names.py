@@ -124,7 +124,7 @@ def public(parts: list[str]) -> bool:
 
 
 def blocks(path: Path, text: str) -> Iterator[str]:
-    """The Python in a file: all of it, or the blocks of a page (those of shells do not import)."""
+    """Yield the Python of a file, or of a page's blocks (those of shells do not import)."""
     if path.suffix == ".py":
         yield text
         return

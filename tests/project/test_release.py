@@ -83,7 +83,7 @@ def options_of(verb: str) -> set[str]:
 
 
 def check_command(line: str) -> int:
-    """A `restock` call's verb and options are those that there are; 1 where it is one."""
+    """Return a `restock` call's verb and options are those that there are; 1 where it is one."""
     found = re.search(r"(?:^|/)restock ([\w-]+)(.*)", line.strip())
     if found is None:
         return "python -m" in line

@@ -1,5 +1,4 @@
-"""The wheel holds every file of every room, takes no generic name in site-packages, and says which
-packages it needs."""
+"""The wheel holds every file of every room and names the packages that it needs."""
 
 from __future__ import annotations
 
@@ -111,7 +110,7 @@ def test_every_package_that_is_imported_is_declared() -> None:
 
 
 def installed_with(name: str) -> set[str]:
-    """A distribution, all that it needs, and what these need in turn."""
+    """Return a distribution, all that it needs, and what these need in turn."""
     found: set[tuple[str, frozenset[str]]] = set()
     waiting = [Requirement(name)]
     while waiting:

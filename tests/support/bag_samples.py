@@ -106,7 +106,7 @@ def messages(count: int = 20, seed: int = 7) -> Iterator[tuple[str, int, Any]]:
 
 
 def write_bag(folder: Path, count: int = 20, storage: str = "sqlite3") -> Path:
-    """A rosbag2 bag with message definitions."""
+    """Write a rosbag2 bag with message definitions."""
     plugin = StoragePlugin.SQLITE3 if storage == "sqlite3" else StoragePlugin.MCAP
     with BagWriter(folder, version=9, storage_plugin=plugin) as bag:
         connections = {
@@ -128,7 +128,7 @@ def write_mcap(
     packed: bool = False,
     **options: Any,
 ) -> Path:
-    """An MCAP file of the same messages, in several chunks; `packed`: each message zstd."""
+    """Write an MCAP file of the same messages, in several chunks; `packed`: each message zstd."""
     with path.open("wb") as file:
         writer = McapWriter(file, compression=compression, chunk_size=chunk_size, **options)
         writer.start(profile="ros2", library="test")
@@ -146,7 +146,7 @@ def write_mcap(
 
 
 def compress_files(bag: Path) -> Path:
-    """The bag with each storage file compressed as a whole, as rosbag2's file mode does."""
+    """Compress each storage file of the bag as a whole, as rosbag2's file mode does."""
     for file in [*bag.glob("*.db3"), *bag.glob("*.mcap")]:
         with file.open("rb") as source, file.with_name(file.name + ".zstd").open("wb") as sink:
             zstandard.ZstdCompressor(level=1).copy_stream(source, sink)

@@ -33,7 +33,7 @@ def profile_with(text: str = CAMERAS) -> Profile:
 
 
 def picture(number: int, channels: int = 3) -> NDArray[np.uint8]:
-    """An image (H, W, C) whose colour is its number, and whose left half is darker."""
+    """Return an image (H, W, C) whose colour is its number, and whose left half is darker."""
     image = np.full((HEIGHT, WIDTH, channels), 40 + 2 * (number % 100), np.uint8)
     image[:, : WIDTH // 2] //= 2
     image[..., 0] //= 2
@@ -90,6 +90,6 @@ def camera_bag(
     storage: str = "sqlite3",
     duration_s: float = 6.0,
 ) -> Path:
-    """A drive with these topics beside it."""
+    """Return a drive with these topics beside it."""
     topics = typed_topics(Drive(duration_s=duration_s)) | dict(cameras or front_and_rear())
     return write_topics(topics, folder, storage=storage)

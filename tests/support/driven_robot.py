@@ -1,5 +1,4 @@
-"""A robot that drives straight ahead at .5 m/s, as columns of topics and as a rosbag2: for tests
-whose right answers can be worked out by hand."""
+"""A robot that drives straight ahead at .5 m/s, for tests worked out by hand."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ class Drive:
         return 1.0 + SPEED_MPS * time_s
 
     def topics(self) -> dict[str, TopicColumns]:
-        """What a reader would hand over for the profile `warehouse_amr`."""
+        """Return what a reader would hand over for the profile `warehouse_amr`."""
         fast = np.arange(0, self.duration_s, 0.02)
         ticks = np.arange(0, self.duration_s, PERIOD_S)
         tenth = np.arange(0, self.duration_s, 0.1)
@@ -107,7 +106,7 @@ class Drive:
 def columns(
     time_s: NDArray[Any], fields: dict[str, FieldColumn], *, stamped: bool = True
 ) -> TopicColumns:
-    """A topic whose messages were measured at these times."""
+    """Return a topic whose messages were measured at these times."""
     stamp = START_NS + np.rint(time_s * 1e9).astype(np.int64)
     fields = dict(fields)
     if stamped:
@@ -128,7 +127,7 @@ def pose(path: str, x: NDArray[Any], y: float) -> dict[str, FieldColumn]:
 
 
 def scans(ranges: NDArray[Any]) -> dict[str, FieldColumn]:
-    """Scans (N, B) over the full circle, from straight behind counter-clockwise."""
+    """Return scans (N, B) over the full circle, from straight behind counter-clockwise."""
     count, beams = ranges.shape
     flat = np.asarray(ranges, np.float32).reshape(-1)
     return {
@@ -157,19 +156,19 @@ def without(topic: TopicColumns, keep: NDArray[np.bool_]) -> TopicColumns:
 
 
 def write_bag(drive: Drive, folder: Path, *, storage: str = "sqlite3") -> Path:
-    """The drive as a rosbag2 folder, `sqlite3` or `mcap`, written by rosbags."""
+    """Write the drive as a rosbag2 folder, `sqlite3` or `mcap`, written by rosbags."""
     return write_topics(typed_topics(drive), folder, storage=storage)
 
 
 def write_bags(folder: Path, count: int) -> Path:
-    """A folder of this many recordings, `drive0` and so on: of 3 s, 4 s, …"""
+    """Write a folder of this many recordings, `drive0` and so on, of 3 s, 4 s and so on."""
     for number in range(count):
         write_bag(Drive(duration_s=3.0 + number, truth="nominal"), folder / f"drive{number}")
     return folder
 
 
 def typed_topics(drive: Drive) -> dict[str, tuple[str, TopicColumns]]:
-    """The drive's topics with the types of their messages, as `write_topics` takes them."""
+    """Return the drive's topics with the types of their messages, as `write_topics` takes them."""
     names = {
         "/cmd_vel": "geometry_msgs/msg/Twist",
         "/amcl_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -225,8 +224,10 @@ def write_topics(
 
 @cache
 def _humble() -> Any:
-    """The types of ROS 2 Humble, which compile how each is serialised when it is first written, and
-    those of ackermann_msgs and move_base_msgs."""
+    """Return the types of ROS 2 Humble, with those of ackermann_msgs and move_base_msgs.
+
+    They compile how each is serialised when it is first written.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from restock.ingest.decoding.definitions import ackermann_types
@@ -239,7 +240,7 @@ def _humble() -> Any:
 
 
 def _blank(types: Any, name: str) -> Any:
-    """A message with every field zero or empty."""
+    """Return a message with every field zero or empty."""
     from rosbags.interfaces import Nodetype
 
     values: dict[str, Any] = {}

@@ -31,7 +31,7 @@ DOCUMENT: dict[str, Any] = {
 
 
 def document(seed: int = 0, **changes: Any) -> dict[str, Any]:
-    """A run's config.json, with `section__key=value` changed."""
+    """Return a run's config.json, with `section__key=value` changed."""
     whole = copy.deepcopy(DOCUMENT)
     whole["config"]["seed"] = seed
     for path, value in changes.items():
@@ -54,7 +54,7 @@ def make_run(
     first_episode_seed: int = 90_000,
     episodes: int = 40,
 ) -> Path:
-    """A finished run: half its rows from logs by quota, half fresh, each episode of one kind."""
+    """Write a finished run: half its rows from logs by quota, half fresh, one kind an episode."""
     seed = whole["config"]["seed"]
     rng = np.random.default_rng([seed, abs(round(1000 * success))])
     run = Run.create(path, whole)

@@ -38,8 +38,10 @@ class SyntheticRobot:
 
 
 def fleet(robots: list[SyntheticRobot], **size: int) -> duckdb.DuckDBPyConnection:
-    """A connection with the rows of a store of this fleet, of a size as `drives` has it, and those
-    of its views that `install_named` is asked for."""
+    """Return a connection with the rows of a store of this fleet.
+
+    Its size is as `drives` has it; `install_named` adds views.
+    """
     made = drives(robots, **size)
     connection = duckdb.connect()
     transitions = pa.concat_tables(rows for rows, _ in made)
@@ -48,7 +50,7 @@ def fleet(robots: list[SyntheticRobot], **size: int) -> duckdb.DuckDBPyConnectio
 
 
 def fleet_store(path: Path, robots: list[SyntheticRobot], **size: int) -> Path:
-    """The same as a store on disk."""
+    """Return the same as a store on disk."""
     made = drives(robots, **size)
     for name, tables in (
         ("recordings", [row for _, row in made]),
@@ -80,7 +82,7 @@ def drives(
 def wander(
     rng: np.random.Generator, rows: int, deviation: float, memory: float = 0.9
 ) -> np.ndarray:
-    """An AR(1) process (rows,) of that standard deviation."""
+    """Return an AR(1) process (rows,) of that standard deviation."""
     drawn = rng.normal(0, deviation * np.sqrt(1 - memory**2), rows)
     return np.asarray(lfilter([1.0], [1.0, -memory], drawn))
 

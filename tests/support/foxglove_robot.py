@@ -1,5 +1,4 @@
-"""A robot that records Foxglove's message types as JSON or protobuf, and its command and IMU as
-whatever named them: it drives in a circle, so that what it says can be checked by hand."""
+"""A robot that drives in a circle and records Foxglove's message types as JSON or protobuf."""
 
 from __future__ import annotations
 
@@ -84,8 +83,10 @@ def place(time_s: float) -> tuple[float, float, float]:
 
 
 def drive(duration_s: float = 20.0) -> list[Message]:
-    """Time, topic, type and values of each message: command 10 Hz, pose and odometry 20 Hz, scan
-    10 Hz, of a wall that is all around at one range."""
+    """Return time, topic, type and values of each message.
+
+    Command 10 Hz, pose and odometry 20 Hz, scan 10 Hz of a wall at one range all around.
+    """
     messages: list[Message] = []
     for time_s in np.arange(0, duration_s, 0.05).tolist():
         x, y, yaw = place(time_s)
@@ -110,7 +111,7 @@ def drive(duration_s: float = 20.0) -> list[Message]:
 
 
 def write_robot(path: Path, encoding: str, messages: list[Message]) -> Path:
-    """An MCAP file of these messages, as "json" or "protobuf"."""
+    """Write an MCAP file of these messages, as "json" or "protobuf"."""
     files = _descriptors().SerializeToString()
     with path.open("wb") as file:
         writer = Writer(file)

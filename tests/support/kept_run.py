@@ -23,7 +23,7 @@ QUICK = FittedQConfig(iterations=2, updates=2, batch_size=32, hidden=(8,), cloni
 
 
 def kept_network(settings: NetworkConfig = NETWORK, task: Task = TASK) -> QNetwork:
-    """What `kept_run` keeps: random weights, seed 0."""
+    """Return what `kept_run` keeps: random weights, seed 0."""
     generator = torch.Generator().manual_seed(0)
     return DQN(LossConfig()).make_network(
         settings, task.observation_size, len(task.actions), generator
@@ -36,7 +36,7 @@ def kept_run(
     panel: Panel | None = None,
     profile: str = "warehouse_amr",
 ) -> Path:
-    """That network as the best of gradient step 7, as if it had learnt from the panel."""
+    """Write that network as the best of gradient step 7, as if it had learnt from the panel."""
     task = load_profile(profile).task
     config = msgspec.structs.replace(TrainConfig(), network=network, profile=profile)
     fed = None if panel is None else panel_document(panel)

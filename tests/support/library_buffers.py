@@ -33,13 +33,13 @@ share = "natural"
 
 
 def make_store(folder: Path) -> Path:
-    """A store of two recordings of the warehouse's task."""
+    """Make a store of two recordings of the warehouse's task."""
     recordings = [recording_transitions(index, task=TASK) for index in (1, 2)]
     return write_store(folder / "store", recordings, task=TASK)
 
 
 def make_panel(store: Path, out: Path, *, n_step: int = 1, post: str = "none") -> Panel:
-    """A panel of a quarter wheel slip; `post` corrects what is known only afterwards."""
+    """Make a panel of a quarter wheel slip; `post` corrects what is known only afterwards."""
     return panel_of(store, MIXTURE.format(n_step=n_step, post=post), out)
 
 
@@ -86,7 +86,7 @@ def sb3_envs(count: int, **arguments: Any) -> Any:
 
 
 def trained_sb3(folder: Path, steps: int = 520) -> TrainedBuffer:
-    """A DQN after 40 updates on logs and some hundred environment steps."""
+    """Return a DQN after 40 updates on logs and some hundred environment steps."""
     sb3 = pytest.importorskip("stable_baselines3")
     from restock.train.libraries.sb3_buffer import MixtureReplayBuffer, dqn_critic
 
@@ -146,7 +146,7 @@ def tianshou_dqn(n_step: int = 1) -> Any:
 
 
 def trained_tianshou(folder: Path) -> TrainedBuffer:
-    """A DQN after 30 updates on logs, and some on logs and 500 fresh steps."""
+    """Return a DQN after 30 updates on logs, and some on logs and 500 fresh steps."""
     pytest.importorskip("tianshou")
     from tianshou.algorithm.algorithm_base import policy_within_training_step
     from tianshou.data import Collector, CollectStats

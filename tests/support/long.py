@@ -9,8 +9,10 @@ import pytest
 
 
 def one_in(every: int, values: Iterable[Any]) -> list[Any]:
-    """The first of each `every` values as it is, the others marked `long`; a tuple is of several
-    parameters."""
+    """Return the first of each `every` values as it is, and the others marked `long`.
+
+    A tuple is of several parameters.
+    """
     return [
         value
         if number % every == 0

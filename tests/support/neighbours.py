@@ -15,7 +15,7 @@ from support.paths import ROOT
 
 
 def read_with(library: str, path: Path) -> Any:
-    """What the real library finds, in a Python that has it; the test is skipped where none has."""
+    """Read with the real library, in a Python that has it; skip the test if none has."""
     apart = ROOT / ".venv-neighbours" / "bin" / "python"
     python = os.environ.get("RESTOCK_NEIGHBOURS_PYTHON") or str(
         apart if apart.exists() else sys.executable

@@ -36,7 +36,7 @@ _STYLE = re.compile("\x1b\\[[0-9;]*m")
 
 
 def cells_of(page: str) -> list[tuple[str, str]]:
-    """The cells of a page in order, each ("markdown" | "code", its source)."""
+    """Return the cells of a page in order, each ("markdown" | "code", its source)."""
     cells = []
     at = 0
     for piece in _PIECE.finditer(page):
@@ -52,7 +52,7 @@ def cells_of(page: str) -> list[tuple[str, str]]:
 
 
 def notebook_of(page: str) -> nbformat.NotebookNode:
-    """The page as a notebook whose cells were not executed yet."""
+    """Return the page as a notebook whose cells were not executed yet."""
     make = {"markdown": new_markdown_cell, "code": new_code_cell}
     cells = [
         make[kind](source, id=f"cell-{number}")
@@ -63,7 +63,7 @@ def notebook_of(page: str) -> nbformat.NotebookNode:
 
 
 def executed(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
-    """The notebook with its outputs, run in `folder` by this Python and its `restock`."""
+    """Return the notebook with its outputs, run in `folder` by this Python and its `restock`."""
     from nbclient import NotebookClient
 
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
@@ -80,7 +80,7 @@ def executed(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.Notebook
 
 
 def text_of(cell: nbformat.NotebookNode) -> str:
-    """What a cell printed and showed, as text."""
+    """Return what a cell printed and showed, as text."""
     parts = []
     for output in cell.outputs:
         if output.output_type == "stream":
@@ -92,14 +92,14 @@ def text_of(cell: nbformat.NotebookNode) -> str:
 
 
 def picture_of(cell: nbformat.NotebookNode) -> bytes | None:
-    """The picture that a cell showed, as PNG."""
+    """Return the picture that a cell showed, as PNG."""
     shown = [output.data for output in cell.outputs if output.output_type != "stream"]
     pictures = [data["image/png"] for data in shown if "image/png" in data]
     return base64.b64decode(pictures[0]) if pictures else None
 
 
 def filled(page: str, notebook: nbformat.NotebookNode, pictures: str) -> str:
-    """The page with the outputs of an executed notebook; its pictures lie in this folder."""
+    """Return the page with the outputs of an executed notebook; its pictures lie in this folder."""
     cells = iter([cell for cell in notebook.cells if cell.cell_type == "code"])
 
     def piece(found: re.Match[str]) -> str:
@@ -117,7 +117,7 @@ def filled(page: str, notebook: nbformat.NotebookNode, pictures: str) -> str:
 
 
 def pictures_of(page: str, notebook: nbformat.NotebookNode) -> dict[str, bytes]:
-    """The pictures of a page by their names."""
+    """Return the pictures of a page by their names."""
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     found: dict[str, Any] = {
         piece["picture"]: picture_of(cell)

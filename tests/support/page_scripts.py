@@ -37,7 +37,7 @@ class _Scripts(HTMLParser):
 
 
 def charts_of(html: str) -> dict[str, Any]:
-    """What a page's charts are drawn from: config, rows and charts, as its script reads them.
+    """Return config, rows and charts of a page, as its script reads them.
 
     Asserts that its scripts are those that draw charts, and that its policy lets only them run.
     """

@@ -86,7 +86,7 @@ def blocks(path: Path) -> list[Block]:
 
 
 def indented(path: Path) -> list[int]:
-    """The lines on which a page has a code block that is indented instead of fenced."""
+    """Return the lines on which a page has a code block that is indented instead of fenced."""
     lines = path.read_text(encoding="utf-8").splitlines()
     found, fenced, listed = [], False, False
     for number, line in enumerate(lines, start=1):

@@ -20,18 +20,18 @@ NO_SPLIT = "[evaluation_split]\nby = 'none'\n"
 
 
 def moment(stamp_ns: int) -> str:
-    """A time as TOML writes it."""
+    """Return a time as TOML writes it."""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).isoformat()
 
 
 def planned(transitions: pa.Table, text: str) -> PanelPlan:
-    """A mixture worked out over a table."""
+    """Return a mixture worked out over a table."""
     with open_source(transitions, task=TASK, conditions=CONDITIONS) as source:
         return plan_panel(source.connection, parse_mixture(text), source.conditions)
 
 
 def panel_of(source: pa.Table | Path, mixture: Mixture | str, out: Path, **given: Any) -> Panel:
-    """A panel of a table or of a store's folder."""
+    """Return a panel of a table or of a store's folder."""
     if isinstance(mixture, str):
         mixture = parse_mixture(mixture)
     if isinstance(source, pa.Table):

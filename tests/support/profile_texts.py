@@ -8,6 +8,6 @@ WAREHOUSE = (ROOT / "ingest" / "profile" / "profiles" / "warehouse_amr.toml").re
 
 
 def framed(text: str = WAREHOUSE, frames: str = "[frames]\n\n[clock]") -> str:
-    """The profile without a pose topic: its poses come from transforms."""
+    """Return the profile without a pose topic: its poses come from transforms."""
     start, end = text.index("[inputs.pose]"), text.index("[inputs.wheels]")
     return (text[:start] + text[end:]).replace("[clock]", frames, 1)

@@ -52,7 +52,7 @@ SHORT = {
 
 @contextmanager
 def reader(folder: Path) -> Iterator[Reader]:
-    """A server for as long as the context lasts; its socket and client lie in `folder`."""
+    """Yield a server for as long as the context lasts; its socket and client lie in `folder`."""
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(map(str, [ROOT / "tests", *sys.path])),
@@ -192,7 +192,7 @@ def _page(blocks: list[tuple[str, str, str, list[int], str]]) -> int:
 
 
 def _sql(text: str) -> None:
-    """A block of SQL is a question to the store."""
+    """Run a block of SQL on the store."""
     import restock
 
     with restock.open("store/") as store:
@@ -287,7 +287,7 @@ def cut_short() -> None:
 
     @contextmanager
     def before_it(stage: Any, say: Any) -> Iterator[Any]:
-        """What the demo runs in a process of its own would not be cut short there."""
+        """Yield what the demo runs in a process of its own would not be cut short there."""
         code = cli.main(list(stage.beside)) if stage.beside else 0
         yield lambda: code
 
@@ -306,7 +306,7 @@ def cut_short() -> None:
 
 
 def cut_libraries_short() -> None:
-    """The same for the loop of Stable-Baselines3."""
+    """Cut the loop of Stable-Baselines3 short."""
     from stable_baselines3 import DQN
 
     learn, update = DQN.learn, DQN.train

@@ -26,7 +26,7 @@ def address(request: pytest.FixtureRequest) -> str:
 
 
 def files_of(place: Path | str) -> list[str]:
-    """The files of a store by their paths in it, as the disk or the server lists them."""
+    """Return the files of a store by their paths in it, as the disk or the server lists them."""
     if isinstance(place, Path):
         return sorted(str(p.relative_to(place)) for p in place.rglob("*") if p.is_file())
     import boto3
@@ -38,7 +38,7 @@ def files_of(place: Path | str) -> list[str]:
 
 @contextmanager
 def s3_server() -> Iterator[str]:
-    """The address of a server that is up for as long as the context."""
+    """Yield the address of a server that is up for as long as the context."""
     command = [sys.executable, __file__]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -113,7 +113,7 @@ def recording_transitions(
 def manifest(
     transitions: pa.Table, *, task: Task = TASK, tags: Mapping[str, str] | None = None
 ) -> pa.Table:
-    """The `recordings` row of one recording's transitions."""
+    """Return the `recordings` row of one recording's transitions."""
     first = transitions.slice(0, 1).to_pylist()[0]
     conditions, exposures = (
         [
@@ -181,7 +181,7 @@ def write_store(
     task: Task = TASK,
     tags: Sequence[Mapping[str, str]] = (),
 ) -> Path:
-    """A store of these recordings and their tags, one commit each, the manifest row first."""
+    """Write a store of these recordings and their tags, one commit each, the manifest row first."""
     for transitions, reported in zip_longest(recordings, tags):
         row = manifest(transitions, task=task, tags=reported)
         write_deltalake(str(path / "recordings"), row, mode="append")
@@ -195,7 +195,7 @@ def views_over(
     recordings: pa.Table,
     observation_type: str = "FLOAT[]",
 ) -> Definitions:
-    """The views of a store over these rows, no summaries: those `install_named` is asked for."""
+    """Return the views of a store over these rows, no summaries; `install_named` adds views."""
     with passed_in(connection, given=transitions, manifests=recordings):
         connection.execute(
             "CREATE TABLE stored_transitions AS FROM given;"
@@ -210,7 +210,7 @@ def views_over(
 
 @lru_cache(64)
 def one(recording: int, ingest: str = "a", seed: int = 0) -> tuple[pa.Table, pa.Table]:
-    """A recording's manifest row and transitions."""
+    """Return a recording's manifest row and transitions."""
     rows = recording_transitions(recording, ingest=ingest, seed=seed)
     row = manifest(rows).to_pylist()[0]
     row["ingested_at"] = datetime(2026, 1, 1, tzinfo=UTC)

@@ -55,7 +55,7 @@ def config(**changes: Any) -> TrainConfig:
 
 
 def logs(rows: int = 200) -> Logs:
-    """Logged steps of someone who mostly drives forward, a few of them slipping."""
+    """Return logged steps of someone who mostly drives forward, a few of them slipping."""
     rng = np.random.default_rng(0)
     size = TASK.observation_size
     packed = np.zeros((rows, row_width(size)), np.float32)

@@ -93,7 +93,7 @@ def graph_qos() -> Any:
 
 
 def follower_onnx(path: Path, profile: Profile) -> Path:
-    """An exported policy that does what navigation proposes: the nearest of the task's actions."""
+    """Return an exported policy that takes the task's action nearest to navigation's proposal."""
     import onnx
 
     task = profile.task

@@ -48,7 +48,7 @@ def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
 
 
 def imitation_loss(logits: Tensor, action: Tensor) -> Tensor:
-    """The mean of -log G(a|s), (), over the rows (M,) whose action is known; 0 without any."""
+    """Return the mean of -log G(a|s), (), over rows (M,) with a known action; 0 without any."""
     known = action != UNKNOWN
     each = functional.cross_entropy(logits, action, ignore_index=UNKNOWN, reduction="none")
     return each.sum() / known.sum().clamp_min(1)
@@ -66,7 +66,7 @@ class FilteredNetwork(nn.Module):
         self.register_buffer("ratio", torch.zeros(()) if ratio is None else ratio)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Action values (B, A) of observations (B, D)."""
+        """Return action values (B, A) of observations (B, D)."""
         plausible = plausible_actions(self.behaviour(observation), self.ratio)
         q: Tensor = self.values(observation)
         return q.masked_fill(~plausible, -torch.inf)
@@ -95,7 +95,7 @@ class ProposedNetwork(nn.Module):
     bias: Tensor
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Action values (B, A) of observations (B, D)."""
+        """Return action values (B, A) of observations (B, D)."""
         q: Tensor = self.inner(observation)
         nearness = observation[:, -2:] @ self.weight + self.bias
         nearest = (nearness >= nearness.amax(dim=1, keepdim=True)) & (q > -torch.inf)
@@ -112,12 +112,12 @@ def make_behaviour(
     actions: int,
     generator: torch.Generator | None = None,
 ) -> QNetwork:
-    """The network whose softmax is G."""
+    """Return the network whose softmax is G."""
     return QNetwork(observation_size, actions, hidden=config.hidden, generator=generator)
 
 
 def make_policy(config: TrainConfig, observation_size: int, actions: int) -> PolicyNetwork:
-    """What a run's config says acts, to load weights into."""
+    """Return the policy network that a run's config describes, to load weights into."""
     values = make_network(config, observation_size, actions)
     if not config.teacher.filters:
         return values
@@ -158,7 +158,7 @@ class Behaviour(Stateful):
         self.move_to(0)
 
     def move_to(self, env_steps: int) -> None:
-        """The ratio after `env_steps` environment steps."""
+        """Set the ratio for the time after `env_steps` environment steps."""
         self.in_force = value_at(self.config.ratio, env_steps)
 
     @property
@@ -171,14 +171,14 @@ class Behaviour(Stateful):
         self.ratio.fill_(ratio)
 
     def learn(self, labelled: Labelled) -> None:
-        """One gradient step."""
+        """Make one gradient step."""
         device = self.ratio.device
         self._fill_gradient(Labelled(labelled.observation.to(device), labelled.action.to(device)))
         self.updates += 1
         self.optimizer.step(self._slow, self.averaging_rate(self.updates))
 
     def move(self, labelled: Labelled, rate: Tensor) -> None:
-        """The same on the device alone; the caller keeps the counts."""
+        """Do the same on the device alone; the caller keeps the counts."""
         self._fill_gradient(labelled)
         self.optimizer.move(self._slow, rate)
 
@@ -187,7 +187,7 @@ class Behaviour(Stateful):
         return averaging_rate(self._averaging, update)
 
     def count(self, updates: int) -> None:
-        """That so many updates were made by `move`."""
+        """Count updates that were made by `move`."""
         self.updates += updates
         self.optimizer.count(updates)
 

@@ -65,7 +65,7 @@ class Launched:
             self._event.record()
 
     def outcome(self) -> Outcome:
-        """Waits for them."""
+        """Wait for them."""
         if self._event is not None:
             self._event.synchronize()
         td, q, *tail = self._per_row.unbind(dim=1)
@@ -166,11 +166,11 @@ class CapturedUpdates:
         place[: len(values)].copy_(values, non_blocking=True)
 
     def _now(self, of_block: Tensor) -> Tensor:
-        """What the update under way has of (K, ...)."""
+        """Return what the update under way has of (K, ...)."""
         return of_block.index_select(0, self._cursor).squeeze(0)
 
     def _one(self, labels: bool) -> None:
-        """The update that the cursor is at."""
+        """Make the update that the cursor is at."""
         row = self._now(self._rows)
         rows = self._now(self._packed) if self.table is None else self.table.index_select(0, row)
         logged, conservative, rate, behaviour_rate = self._now(self._scalars).unbind()
@@ -194,7 +194,7 @@ class CapturedUpdates:
         self._cursor.add_(1)
 
     def _captured(self, labels: bool) -> torch.cuda.CUDAGraph:
-        """An update as a graph; the parameters are as before."""
+        """Capture an update as a graph; the parameters stay as before."""
         moved = self.learner.moved
         before = [tensor.clone() for tensor in moved]
         self._cursor.zero_()

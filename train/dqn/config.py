@@ -103,7 +103,7 @@ class JumpStartConfig(Checked, frozen=True):
     horizon_steps: Count = 60  # most first steps of an episode that it drives
 
     def horizon(self, env_steps: int) -> int:
-        """The most steps of an episode that begins after `env_steps`."""
+        """Return the most steps of an episode that begins after `env_steps`."""
         left = max(1.0 - env_steps / self.env_steps, 0.0) if self.env_steps else 0.0
         return round(self.horizon_steps * left)
 
@@ -278,7 +278,7 @@ class TrainConfig(Checked, frozen=True):
 
 
 def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
-    """Raises ConfigError where a setting of the teacher is given, but nobody teaches."""
+    """Raise ConfigError where a setting of the teacher is given, but nobody teaches."""
     if teacher.source == "none" and (keys := changed(teacher, source="none")):
         raise ConfigError(
             'has no effect where teacher.source is "none"',
@@ -288,7 +288,7 @@ def refuse_untaught(teacher: TeacherConfig, *, within: str = "") -> None:
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig:
-    """A config from a TOML file (or the defaults), then `key.path=value` overrides.
+    """Load a config from a TOML file (or the defaults), then apply `key.path=value` overrides.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown key or a value out of range; names the key.
@@ -306,7 +306,10 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> TrainConfig
 
 
 def apply_overrides(document: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """A copy of plain values with `key.path=value` applied; values are TOML, or bare strings."""
+    """Return a copy of plain values with `key.path=value` applied.
+
+    Values are TOML, or bare strings.
+    """
     applied = copy.deepcopy(dict(document))
     for override in overrides:
         _apply(applied, override)
@@ -326,7 +329,7 @@ def as_overrides(document: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
-    """A typed config from plain values.
+    """Parse a typed config from plain values.
 
     Raises:
         ConfigError: an unknown or renamed key, or a value out of range; names the key.
@@ -337,7 +340,7 @@ def parse_config(document: Mapping[str, Any], *, where: str) -> TrainConfig:
 
 
 def _refuse_other_rule(target: Any, where: str) -> None:
-    """Raises ConfigError where a setting of one target rule stands under the other."""
+    """Raise ConfigError where a setting of one target rule stands under the other."""
     if not isinstance(target, Mapping):
         return
     for key, rule, other in (("every", "hard", "polyak"), ("tau", "polyak", "hard")):

@@ -51,7 +51,7 @@ class FittedQConfig:
 
 
 def soft_greedy(network: PolicyNetwork, observation: F32, epsilon: float) -> F32:
-    """The probabilities (N, A) of the greedy policy that acts at random with probability `epsilon`.
+    """Return the probabilities (N, A) of the greedy policy that acts at random with `epsilon`.
 
     A deterministic policy has none for any action but one, so an episode in which the logs did
     anything else once says nothing about it.
@@ -146,7 +146,7 @@ def cloned_behaviour(
 
 
 def cloned_probabilities(clone: QNetwork, observation: F32) -> NDArray[np.float64]:
-    """The probability of each action (N, A) under a cloned behaviour."""
+    """Return the probability of each action (N, A) under a cloned behaviour."""
     logits = values(clone, observation)
     probability = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(probability / probability.sum(axis=1, keepdims=True), np.float64)
@@ -154,7 +154,7 @@ def cloned_probabilities(clone: QNetwork, observation: F32) -> NDArray[np.float6
 
 @torch.no_grad()
 def values(network: nn.Module, observation: F32) -> NDArray[np.float64]:
-    """Action values (N, A), a part at a time: bounds memory."""
+    """Return action values (N, A), computed in parts to bound memory."""
     starts = range(0, max(len(observation), 1), _PART)
     parts = [network(torch.from_numpy(observation[at : at + _PART])) for at in starts]
     return np.asarray(torch.cat(parts).double().numpy())

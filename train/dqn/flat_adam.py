@@ -49,14 +49,14 @@ class FlatParameters:
                 parameter.grad = view
 
     def views(self, flat: Tensor) -> list[Tensor]:
-        """A tensor as long as `values`, parameter by parameter, in the network's order."""
+        """Return views of a tensor as long as `values`, one a parameter, in the network's order."""
         return [
             flat[offset : offset + shape.numel()].view(shape)
             for offset, shape in zip(self._offsets, self._shapes, strict=True)
         ]
 
     def flat_of(self, pieces: list[Tensor]) -> Tensor:
-        """The inverse of `views`: a new tensor; what lies between parameters is 0."""
+        """Return the inverse of `views`: a new tensor, 0 between parameters."""
         flat = torch.zeros_like(self.values)
         for view, piece in zip(self.views(flat), pieces, strict=True):
             view.copy_(piece)
@@ -68,7 +68,7 @@ _BETAS, _EPS = (0.9, 0.999), 1e-8  # Adam's
 
 
 def averaging_rate(rate: float, steps: int) -> float:
-    """At which an average of weights goes to those of step number `steps` (from 1).
+    """Return the rate of an average of weights at step number `steps` (from 1).
 
     The greedy policy of a single update is noisy: a small change of values turns over many
     actions at once. The average over the last 1 / rate updates is not (Polyak and Juditsky 1992).
@@ -125,12 +125,12 @@ class FlatAdam(Stateful):
         self._compiled_step(average, rate)
 
     def count(self, steps: int) -> None:
-        """That so many steps were made, by `move` alone."""
+        """Count steps that were made by `move`."""
         self._steps += steps
 
     @torch.no_grad()
     def move(self, average: Tensor | None, rate: float | Tensor) -> None:
-        """As `step`, by operations on the device alone, which a CUDA graph can repeat."""
+        """Step by operations on the device alone, which a CUDA graph can repeat."""
         self._clip()
         values, gradient, moved, squares = self._moved
         adam(

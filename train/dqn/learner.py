@@ -112,7 +112,7 @@ class Learner(Stateful):
         expert: Tensor | None = None,
         labelled: Labelled | None = None,
     ) -> Loss:
-        """One gradient step on `rows`; the target's clock is ticked by `self.target` afterwards.
+        """Make one gradient step on `rows`; `self.target` ticks the target's clock afterwards.
 
         Args:
             rows: (B, 2D + 3) float32, on the learner's device.
@@ -139,7 +139,7 @@ class Learner(Stateful):
         rate: Tensor,
         behaviour_rate: Tensor,
     ) -> Loss:
-        """An update by operations on the device alone, which a CUDA graph can repeat.
+        """Make an update by operations on the device alone, which a CUDA graph can repeat.
 
         With the target's, where that follows at every update. Rates () are of the averages. The
         counts are the caller's to keep, by `count`.
@@ -153,7 +153,7 @@ class Learner(Stateful):
         return loss
 
     def count(self, updates: int, *, labelled: bool) -> None:
-        """That so many updates were made by `move`."""
+        """Count updates that were made by `move`."""
         self.gradient_steps += updates
         self.optimizer.count(updates)
         if self.behaviour is not None and labelled:
@@ -162,12 +162,12 @@ class Learner(Stateful):
             self.target.last_sync = self.gradient_steps
 
     def averaging_rate(self, update: int) -> float:
-        """Of the average of weights, at update number `update` (from 1)."""
+        """Return the rate of the average of weights at update number `update` (from 1)."""
         return averaging_rate(self.averaging, update)
 
     @property
     def moved(self) -> list[Tensor]:
-        """All that `move` moves."""
+        """Return all that `move` moves."""
         slow = [] if self.behaviour is None else self.behaviour.moved
         return [*self.optimizer.moved, self._policy, self._slow, *slow]
 
@@ -190,14 +190,14 @@ class Learner(Stateful):
         )
 
     def _plausible(self, next_observation: Tensor) -> Tensor | None:
-        """The actions (B, A) that the target's maximum may look at; None: all."""
+        """Return the actions (B, A) that the target's maximum may look at; None: all."""
         if self.behaviour is None or not self._filters_target:
             return None
         return self.behaviour.plausible(next_observation)
 
     @property
     def is_finite(self) -> bool:
-        """Whether every parameter is: a gradient that is not finite leaves its mark on them."""
+        """Whether every parameter is finite: a gradient that is not leaves its mark on them."""
         of_values = [self.optimizer.values]
         if self.behaviour is not None:
             of_values.append(self.behaviour.optimizer.values)
@@ -205,7 +205,7 @@ class Learner(Stateful):
 
     @torch.no_grad()
     def td_error(self, rows: Tensor, *, online: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Of rows, without learning: Q(s, a) - y (B,), Q(s) (B, A), Q_target(s) (B, A).
+        """Return Q(s, a) - y (B,), Q(s) (B, A) and Q_target(s) (B, A) of rows, without learning.
 
         `online` lets the online network bootstrap y, as if the target's clock did not lag.
         """
@@ -215,7 +215,7 @@ class Learner(Stateful):
         return td, self.network(batch.observation), self.target_network(batch.observation)
 
     def greedy(self, observation: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The best action (N,) of each observation (N, D), among the plausible ones."""
+        """Return the best action (N,) of each observation (N, D), among the plausible ones."""
         return greedy_actions(self._acting, observation)
 
     def take_over(self, weights: Mapping[str, Tensor]) -> None:
@@ -233,7 +233,7 @@ class Learner(Stateful):
 
 
 def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Packed rows to observation, next observation, action (int64), reward and discount."""
+    """Unpack rows into observation, next observation, action (int64), reward and discount."""
     size = observation_size
     return (
         rows[:, :size],
@@ -246,7 +246,7 @@ def unpack(rows: Tensor, observation_size: int) -> tuple[Tensor, Tensor, Tensor,
 
 @torch.inference_mode()
 def greedy_actions(network: PolicyNetwork, observation: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The best action (N,) of each observation (N, D), on the network's device."""
+    """Return the best action (N,) of each observation (N, D), on the network's device."""
     device = next(network.parameters()).device
     values = network(torch.from_numpy(np.ascontiguousarray(observation)).to(device))
     best: NDArray[np.int64] = values.argmax(dim=1).cpu().numpy()
@@ -254,7 +254,7 @@ def greedy_actions(network: PolicyNetwork, observation: NDArray[np.float32]) -> 
 
 
 def open_device(name: str) -> torch.device:
-    """The device, checked.
+    """Return the device, or refuse it.
 
     Raises:
         ConfigError: `cuda` where this PyTorch sees none.

@@ -52,14 +52,14 @@ class QNetwork(nn.Module):
                     module.bias.uniform_(-bound, bound, generator=generator)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Action values (B, A)."""
+        """Return action values (B, A)."""
         features = self.body(observation)
         values: Tensor = self.advantage(features)
         return values
 
 
 def clone(network: N) -> N:
-    """A copy that takes no gradients: the target network."""
+    """Return a copy that takes no gradients: the target network."""
     import copy
 
     copied = copy.deepcopy(network)
@@ -70,7 +70,7 @@ def clone(network: N) -> N:
 
 @contextmanager
 def torch_threads(number: int) -> Iterator[None]:
-    """As many threads of torch on the CPU for as long as the block runs.
+    """Set the number of torch's CPU threads while the block runs.
 
     Networks of this size are slower on several, many times so where other processes want the cores.
     """

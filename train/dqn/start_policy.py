@@ -37,7 +37,7 @@ class StartPolicy(Checked, frozen=True):
 def start_network(
     start: StartPolicy, policy: PolicyNetwork, actions: NDArray[Any]
 ) -> PolicyNetwork:
-    """The policy that `start` names, made of the networks of `policy`, which it shares.
+    """Return the policy that `start` names; it shares the networks of `policy`.
 
     `actions` are (A, 2) speed and yaw rate, in units of the fastest of each.
     """

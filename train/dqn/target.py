@@ -57,7 +57,7 @@ TargetRule = Hard | Polyak
 
 
 def describe(rule: TargetRule) -> dict[str, Any]:
-    """The rule as the run's config states it."""
+    """Return the rule as the run's config states it."""
     return {**msgspec.to_builtins(rule), "effective_lag_updates": rule.effective_lag}
 
 
@@ -88,7 +88,7 @@ class TargetUpdate(Stateful):
 
     @torch.no_grad()
     def pull(self) -> None:
-        """What the rule does to the target where it is due."""
+        """Move the target as the rule does when it is due."""
         for slow, fast in zip(self._target, self._online, strict=True):
             if isinstance(self.rule, Polyak):
                 slow.lerp_(fast, self.rule.tau)
