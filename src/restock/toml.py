@@ -14,7 +14,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -321,7 +321,7 @@ def _places(
             if field.encode_name == name and isinstance(value, Mapping):
                 yield from _places(field.type, value.get(name), rest, _join(key, name))
         return
-    inside = value.items() if isinstance(value, Mapping) else ()
+    inside: Iterable[tuple[Any, Any]] = value.items() if isinstance(value, Mapping) else ()
     if step != "[...]" and isinstance(value, list | tuple):
         inside = [(step, one) for one in value[int(step[1:-1]) :][:1]]
     for name, one in inside:

@@ -239,11 +239,11 @@ def training_cost(arms: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
     rows = []
     for arm, paths in arms.items():
         last = [row for path in paths if (row := _last_progress(path)) is not None]
-        row: dict[str, Any] = {"arm": arm, "runs": len(last)}
+        cost: dict[str, Any] = {"arm": arm, "runs": len(last)}
         for name in ("env_steps", "gradient_steps", "wall_s"):
             values = [one[name] for one in last]
-            row[name] = float(np.mean(values)) if values and None not in values else None
-        rows.append(row)
+            cost[name] = float(np.mean(values)) if values and None not in values else None
+        rows.append(cost)
     return rows
 
 

@@ -181,7 +181,8 @@ def _file_sizes(file: Path) -> tuple[int, int]:
 
 def _message_sizes(file: Path, salvage: bool) -> Iterator[tuple[int, int | None]]:
     """The compressed messages of a file; none where there is none among the first that are read."""
-    from restock.ingest.containers.discover import ZSTD_MAGIC, container_of
+    from restock.ingest.containers.discover import container_of
+    from restock.ingest.containers.formats.compression import ZSTD_MAGIC
     from restock.ingest.containers.formats.storage import unwatched
 
     container = container_of(file)
