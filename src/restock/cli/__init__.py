@@ -211,8 +211,7 @@ def _run(name: str, prog: str, rest: list[str]) -> int:
 
     import tyro
 
-    from restock.cli.command_line import prepared, refuse_empty_paths
-    from restock.cli.help import printed
+    from restock.cli.command_line import prepared, printed, refuse_empty_paths
 
     explained = bool({"-h", "--help"} & set(rest))
     try:

@@ -5,10 +5,16 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import io
+import os
+import re
+import shutil
+import sys
 import textwrap
 import types
 import typing
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, redirect_stdout
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,6 +25,9 @@ from restock.errors import ConfigError
 
 _PREPARED: list[type[Any]] = []
 _EXPLAINED: list[type[Any]] = []
+MIN_PROSE = 80  # columns that prose may take above narrower boxes, where the window has them
+MIN_COLUMNS = 30  # columns: in a few, tyro lays its boxes out without end
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
@@ -136,3 +145,64 @@ def _metavar(kind: Any) -> str:
     if typing.get_origin(kind) is Literal:
         return "{" + ",".join(map(str, typing.get_args(kind))) + "}"
     return _METAVARS.get(kind) or str(getattr(kind, "__name__", kind)).upper()
+
+
+class _Held(io.TextIOWrapper):
+    """A stream that keeps what is printed, and answers tyro as the real stdout would."""
+
+    def __init__(self, instead_of: io.TextIOBase) -> None:
+        encoding = (instead_of.encoding or "utf-8").lower()  # as tyro compares it
+        super().__init__(io.BytesIO(), encoding=encoding, newline="")
+        self._is_terminal = instead_of.isatty()
+
+    def isatty(self) -> bool:
+        return self._is_terminal
+
+    def text(self) -> str:
+        self.seek(0)
+        return self.read()
+
+
+@contextmanager
+def printed(*, help_asked: bool) -> Iterator[None]:
+    """Fit the help, or the complaint, that tyro prints in this block to the window."""
+    if shutil.get_terminal_size().columns < MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(MIN_COLUMNS)
+    if os.environ.get("NO_COLOR") or not (help_asked or sys.stderr.isatty()):
+        tyro._experimental_options["ansi_codes"] = False
+    if not help_asked:
+        yield
+        return
+    held = _Held(sys.stdout)  # type: ignore[arg-type]
+    try:
+        with redirect_stdout(held):
+            yield
+    finally:
+        sys.stdout.write(fitted(held.text(), shutil.get_terminal_size().columns))
+
+
+def fitted(text: str, columns: int) -> str:
+    """Wrap the prose of a help to the width of its boxes, with single empty lines between.
+
+    Empty lines in boxes are left out: tyro adds one where an option's text fills its last line.
+    """
+    given = [(line, _COLOUR.sub("", line)) for line in text.splitlines()]
+    boxes = [len(bare) for _, bare in given if bare[:1] in "╭│╰"]
+    width = max(min(MIN_PROSE, columns), *boxes, 0)
+    lines: list[str] = []
+    for line, bare in given:
+        empty_in_box = bare.startswith("│") and not bare.strip("│ ")
+        if empty_in_box or (not bare and lines and not lines[-1]):
+            continue
+        if line == bare and len(line) > width and not line.startswith(" "):  # not an example
+            hanging = "  " if line.startswith("usage:") else ""
+            lines += textwrap.wrap(
+                line,
+                width,
+                subsequent_indent=hanging,
+                break_on_hyphens=False,
+                break_long_words=False,
+            )
+        else:
+            lines.append(line)
+    return "\n".join([*lines, ""])

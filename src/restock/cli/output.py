@@ -11,10 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from restock.cli.table_layout import FAR, PIPE_WIDTH, Layout, Row, grouped, is_number
-from restock.cli.table_layout import cell as cell  # for those who print
 from restock.errors import visible
 from restock.words import counted, quoted
 
@@ -24,6 +22,10 @@ if TYPE_CHECKING:
 
     from restock.replay.store.store import Store
 
+Row = Mapping[str, Any]
+PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
+GAP = 3  # columns between two columns of a table
+SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, for who searches it
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
     **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),
@@ -132,11 +134,9 @@ def print_table(
 ) -> None:
     """A table on stdout, its title above it; numbers to the right.
 
-    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe names of
-    one word and cells up to SHORT are not: where columns leave too little, the table is wider. On a
-    narrow terminal columns stand closer, headers are wrapped at `_` and spaces, and words are cut
-    only where nothing else is left. Words that say how something is (fail, pass) are coloured on a
-    terminal.
+    As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe words and
+    cells up to SHORT are not: if columns leave too little room, the table is wider. Words that say
+    how something is (fail, pass) are coloured on a terminal.
     """
     names = list(columns if columns is not None else rows[0] if rows else ())
     if not sys.stdout.isatty() and _fits(rows, names):
@@ -148,21 +148,14 @@ def print_table(
     from rich.table import Table
 
     console, piped = stdout(), not sys.stdout.isatty()
-    layout = Layout.piped(rows, names) if piped else Layout.of(rows, names, console.width)
-    if piped:
-        console.width = max(PIPE_WIDTH, layout.width())
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, layout.apart - 1, 0, 0))
-    if layout.apart == FAR:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name, header, width in zip(names, layout.headers, layout.widths, strict=True):
-        numeric = any(is_number(row[name]) for row in rows)
-        table.add_column(
-            header,
-            justify="right" if numeric else "left",
-            overflow="fold",
-            no_wrap=numeric and width is None,
-            width=width,
-        )
+    least = [_least_width(rows, name, short=SHORT if piped else 0) for name in names]
+    apart, least = (GAP, least) if piped else _fitted(least, console.width)
+    padding = (0, 1) if apart == GAP else (0, apart - 1, 0, 0)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=padding)
+    for name, width in zip(names, least, strict=True):
+        justify: Literal["left", "right"]
+        justify = "right" if _numeric(rows, name) else "left"
+        table.add_column(name, justify=justify, overflow="fold", min_width=width)
     for row in rows:
         table.add_row(*(_styled(cell(row[name])) for name in names))
     if title is not None:  # rich's own would be wrapped to the table's width
@@ -171,7 +164,7 @@ def print_table(
             lines = _wrapped(lines[0], console.width)
         console.print("\n".join(lines), style=style, markup=False, soft_wrap=True)
     with console.capture() as captured:
-        console.print(table, soft_wrap=False)
+        console.print(table, soft_wrap=False, crop=not piped)
     # rich pads every line to the table's width; a pipe has no use for that.
     lines = captured.get().splitlines()
     text = "\n".join(lines if sys.stdout.isatty() else [line.rstrip() for line in lines])
@@ -187,10 +180,48 @@ def print_parted(
 ) -> None:
     """A table, and where it is too wide others below it with the other columns, each with `key`."""
     names = list(columns if columns is not None else rows[0] if rows else ())
-    for place, group in enumerate(grouped(rows, names, key, table_width())):
+    for place, group in enumerate(_grouped(rows, names, key, table_width())):
         if place:
             sys.stdout.write("\n")
         print_table(rows, group, title=None if place else title)
+
+
+def _grouped(
+    rows: Sequence[Row], names: Sequence[str], key: Sequence[str], width: int
+) -> list[list[str]]:
+    """Split columns into tables that fit into a width, each with the columns of `key`."""
+    least = {name: _least_width(rows, name) + GAP for name in names}
+    groups: list[list[str]] = []
+    for name in (name for name in names if name not in key):
+        if not groups or sum(least[one] for one in [*groups[-1], name]) > width + GAP - 2:
+            groups.append(list(key))
+        groups[-1].append(name)
+    return groups or [list(names)]
+
+
+def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
+    """Return the least width of a column in which no word, number or `short` cell is cut."""
+    from rich.cells import cell_len
+
+    texts = [cell(row[name]).replace(r"\[", "[") for row in rows]
+    full = max(cell_len(line) for text in [name, *texts] for line in text.split("\n"))
+    uncut = texts if _numeric(rows, name) else " ".join(texts).split()
+    return max([min(full, short), *map(cell_len, [*name.split(), *uncut])])
+
+
+def _fitted(least: list[int], width: int) -> tuple[int, list[int] | list[None]]:
+    """Return how far apart the columns of a terminal's table stand, and their least widths.
+
+    If words do not fit even side by side, rich cuts them where it must.
+    """
+    for apart in range(GAP, 0, -1):
+        if sum(least) + apart * (len(least) - 1) + 2 <= width:
+            return apart, least
+    return 1, [None] * len(least)
+
+
+def _numeric(rows: Sequence[Row], name: str) -> bool:
+    return any(is_number(row[name]) for row in rows)
 
 
 def print_wrapped(text: str) -> None:
@@ -206,7 +237,7 @@ def _wrapped(text: str, columns: int) -> list[str]:
 def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
     """Whether a table of these rows would have to be fitted into the terminal, or a pipe."""
     names = list(columns if columns is not None else rows[0] if rows else ())
-    widths = (max([len(name), *(len(cell(row[name])) for row in rows)]) + FAR for name in names)
+    widths = (max([len(name), *(len(cell(row[name])) for row in rows)]) + GAP for name in names)
     return sum(widths) > table_width()
 
 
@@ -236,7 +267,7 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
 
 def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
     """A table for files and pipes, as `print_table` lays it out: a line a row, however wide."""
-    numeric = [any(is_number(row[name]) for row in rows) for name in columns]
+    numeric = [_numeric(rows, name) for name in columns]
     texts = [
         [cell(row[name]).replace(r"\[", "[").replace("\n", r"\n") for name in columns]
         for row in rows
@@ -253,6 +284,26 @@ def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
 
     rule = " " + "─" * (sum(widths) + 3 * max(len(widths) - 1, 0)) + "\n"
     sys.stdout.writelines([line(list(columns)), rule, *(line(one) for one in texts)])
+
+
+def cell(value: Any) -> str:
+    """Return a value as a table shows it."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        # Large ones in full, as ids and sums are read: not 1.235e+06.
+        return f"{value:,.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
+    if isinstance(value, int):
+        return f"{value:,}" if abs(value) < 1_000_000_000 else str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(cell, value)) if any(item is not None for item in value) else ""
+    return visible(str(value), keep="\n\t").replace("[", r"\[")
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float | Decimal) and not isinstance(value, bool)
 
 
 CLOCK_COLUMNS = ["log - stamp s", "clock"]

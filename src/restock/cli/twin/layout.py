@@ -180,7 +180,7 @@ class LayoutCommand:
 
 def _show(name: str, facts: dict[str, Any]) -> None:
     from restock.cli import output
-    from restock.cli.table_layout import cell
+    from restock.cli.output import cell
 
     notes = facts.get("notes", [])
     rows = {key: value for key, value in facts.items() if key not in ("notes", "elsewhere")}
