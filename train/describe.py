@@ -47,16 +47,11 @@ def describe_run(prepared: Prepared) -> str:
             f"teacher.{key} has no effect: there is no panel"
             for key in changed(config.teacher, _OF_LOGS, **resolved)
         ]
-    if panel is None or not panel.splits:
+    if config.evaluation.off_policy and (panel is None or not panel.splits):
         has = "there is no panel" if panel is None else "the panel holds out no rows"
-        lines += [
-            f"{name} has no effect: {has} ([evaluation_split] of a mixture)"
-            for name, requested in (
-                ("offline_start.choose", config.offline_start.choose),
-                ("evaluation.off_policy", config.evaluation.off_policy),
-            )
-            if requested
-        ]
+        lines.append(
+            f"evaluation.off_policy has no effect: {has} ([evaluation_split] of a mixture)"
+        )
     if config.env.twin:
         lines += _not_evaluated(document)
         lines += sealed(open_floors(config.env.layouts))

@@ -25,10 +25,10 @@ from restock.ingest.task.label_scores import label_scores
 from restock.ingest.task.perturbation_columns import Perturbed
 from restock.ingest.task.schema import SIGNAL_COLUMNS, recording_schema
 from restock.train.feed.fresh_log import FreshEpisode, read_episodes
-from restock.train.jump_start import POLICIES
 from restock.train.run.run import now_ns
 
 FORMAT = "twin"
+AGENT = "dqn"  # who drove
 _MOVED = ("stamp_ns", "pose_stamp_ns")  # episodes begin at 0: laid out one after the other
 
 
@@ -134,7 +134,7 @@ def _values(
         zone=_zones(rows, episodes, profile)[begin].tolist(),
         truth=each("truth").tolist(),
         true_exposure=[reported or None for reported in each("exposure").tolist()],
-        policy=[POLICIES[code] for code in each("policy")],
+        policy=[AGENT] * len(number),
         policy_version=[version[episode] for episode in number],
         probability=each("probability"),
         perturbation=_perturbed(episodes).columns(number),

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from restock.errors import ExitCode, RestockError
@@ -27,15 +25,12 @@ from restock.train.evaluation.evaluate import (
     score,
 )
 from restock.train.evaluation.off_policy.dataset import load_ope_dataset
-from restock.train.evaluation.offline_start import choose_start
 from restock.train.evaluation.ope import OpeConfig, evaluate_off_policy, measures_of, notes_of
 from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
 from restock.train.feed.teacher import TeacherFailed
 from restock.train.finite import check_loss, check_parameters
-from restock.train.guard import enforce, falls
-from restock.train.jump_start import POLICIES
 from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
@@ -64,8 +59,6 @@ class TrainResult:
     wall_s: float
     best: Score | None
     last: Score | None
-    stopped: bool  # by the guard
-    rollbacks: int
 
 
 @interrupts_raised
@@ -126,14 +119,12 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             _close_interval(session, "offline", notify)
         if config.evaluation.off_policy:
             _evaluate_off_policy(session, notify, stop)  # on held-out logs, before it drives
-        if config.offline_start.choose:
-            _choose_start(session, stop)
         _evaluate(session, notify, stop)
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
     _evaluate_if_due(session, notify, stop)  # where the run stopped while it did
-    while progress.env_steps < schedule.env_steps and time_left(session) and not progress.stopped:
+    while progress.env_steps < schedule.env_steps and time_left(session):
         _interrupt(session, stop)
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
         warm = progress.env_steps >= schedule.warmup_env_steps
@@ -144,24 +135,13 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             _close_interval(session, "warmup", notify)
 
         # 3. Act, epsilon-greedy; the twin steps on its own thread …
-        greedy = session.greedy(session.collector.observation)
+        greedy = learner.greedy(session.collector.observation)
         epsilon = epsilon_at(progress.env_steps)
         action, probability = epsilon_greedy(
             greedy, learner.network.actions, epsilon, session.exploration
         )
         acting_step = learner.gradient_steps
-        driver = POLICIES.index("dqn" if session.starting is None else "start")
-        policy: NDArray[np.int16] | int = driver
-        if session.jump_start is not None:  # the logs' behaviour drives an episode's first steps
-            action, probability, policy = session.jump_start.take_over(
-                action,
-                probability,
-                session.collector.observation,
-                session.collector.steps,
-                progress.env_steps,
-                driver,
-            )
-        session.collector.start(action, probability, policy)
+        session.collector.start(action, probability)
 
         # 4. … while ended episodes get their labels, and the learner learns from what the ring held
         # before this step.
@@ -219,8 +199,6 @@ def _result(session: Session) -> TrainResult:
         session.wall_s,
         session.best,
         session.last,
-        progress.stopped,
-        progress.rollbacks,
     )
 
 
@@ -432,22 +410,6 @@ def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bo
     session.run.append("off_policy", [{**session.steps, **row} for row in rows])
 
 
-def _choose_start(session: Session, stop: Callable[[], bool]) -> None:
-    """Which policy drives first, by held-out logs, into the table `offline_start`."""
-    if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
-        return
-    if session.run.table("offline_start").num_rows:  # before the run stopped
-        return
-    session.start, rows = choose_start(
-        session.learner,
-        session.task,
-        load_ope_dataset(session.logs.panel, session.task, seed=session.config.seed),
-        session.config,
-        between=lambda: _interrupt(session, stop),
-    )
-    session.run.append("offline_start", [{**session.steps, **row} for row in rows])
-
-
 def _evaluate_if_due(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
     progress, every = session.progress, session.config.evaluation.every_env_steps
     if progress.env_steps - max(progress.evaluated_at, 0) >= every:
@@ -465,7 +427,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
         session.save_best(Score({}, 0.0, 0.0))
         return
     config, progress, learner = session.config, session.progress, session.learner
-    policy = GreedyPolicy(session.starting or learner.policy)
+    policy = GreedyPolicy(learner.policy)
     discount = config.loss.discount
     began_s = session.wall_s
     results = session.evaluation_buffer.drive(
@@ -491,8 +453,6 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
     }
     session.events.scalars(progress.env_steps, "evaluation", summary)
     notify("evaluation", {"env_steps": progress.env_steps, "best": best, **summary})
-    if fallen := falls(session.last, session.best, config.guard):
-        notify("guard", {"action": enforce(session, fallen), "falls": fallen})
 
 
 def _save(session: Session) -> None:
@@ -517,8 +477,6 @@ def nothing_to_do(session: Session) -> str | None:
     progress, schedule = session.progress, session.config.schedule
     if progress.evaluated_at != progress.env_steps or _interval_is_open(session):
         return None  # its end is still to be made
-    if progress.stopped:
-        return f"the guard stopped it after {progress.env_steps:,} environment steps"
     if not session.config.env.twin:
         return "it learns from logs alone, and has made its updates"
     if progress.env_steps >= schedule.env_steps:

@@ -16,17 +16,14 @@ import msgspec
 import numpy as np
 import torch
 
-from restock.arrays import F32, Ints
 from restock.errors import RunError
 from restock.ingest.task.conditions import Condition
 from restock.ingest.task.task import Mirror, Task
 from restock.replay.ring.ring import FreshRing
 from restock.state import Stateful
 from restock.toml import by_path
-from restock.train.dqn.behaviour import PolicyNetwork
 from restock.train.dqn.config import TrainConfig
-from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.start_policy import StartPolicy, start_network
+from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import Score, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
 from restock.train.evaluation.policies import kept_one, load_kept, save_agent
@@ -40,7 +37,6 @@ from restock.train.feed.logs import Logs, LogTerms
 from restock.train.feed.practice import Practice
 from restock.train.feed.probe import Probe
 from restock.train.feed.teacher import AskedTeacher
-from restock.train.jump_start import POLICIES, JumpStart
 from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
@@ -70,8 +66,6 @@ class Progress:
     offline_update_s: float = 0.0  # of an update on the logs, on average
     evaluation_s: float = 0.0  # of the last evaluation; before it, an estimate
     planned_env_steps: int = 0  # that the shares of batches are planned for
-    rollbacks: int = 0
-    stopped: bool = False  # by the guard
 
 
 @dataclass
@@ -106,8 +100,6 @@ class Session(Stateful):
         "practice",
         "feed",
         "probe",
-        "jump_start",
-        "start",
         "imitation",
         "exploration",
     )
@@ -115,7 +107,6 @@ class Session(Stateful):
         "best": Score | None,
         "last": Score | None,
         "probe": Probe | None,
-        "start": StartPolicy | None,
     }
 
     run: Run
@@ -135,7 +126,6 @@ class Session(Stateful):
     executor: ThreadPoolExecutor | None
     logs: Logs | None
     log_terms: LogTerms
-    jump_start: JumpStart | None
     practice: Practice
     imitation: Imitation | None  # what the behaviour network learns from
     lock: RunLock | None = None  # held while this process writes the run
@@ -144,7 +134,6 @@ class Session(Stateful):
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None
     last: Score | None = None
-    start: StartPolicy | None = None  # what was chosen to drive first; None: what is learnt
     silence_noted: int = 0  # states that the teacher had answered none of, when that was noted
     _started: float = field(default_factory=time.monotonic)
 
@@ -259,27 +248,13 @@ class Session(Stateful):
                 remedy=f"use an earlier one: --from-env-steps {whole}",
             ) from error
 
-    @property
-    def starting(self) -> PolicyNetwork | None:
-        """What drives until online updates begin, where it is not what is learnt."""
-        if self.start is None or self.progress.online_from is not None:
-            return None
-        return start_network(self.start, self.learner.policy, self.task.scaled_actions)
-
-    def greedy(self, observation: F32) -> Ints:
-        """What acts now without exploration, (N,)."""
-        if (starting := self.starting) is not None:
-            return greedy_actions(starting, observation)
-        return self.learner.greedy(observation)
-
     def save_best(self, results: Score) -> None:
         """Keep the policy as it is now as the run's best."""
         clocks = {
             "env_steps": self.progress.env_steps,
             "gradient_steps": self.learner.gradient_steps,
         }
-        start = self.start if self.progress.online_from is None else None
-        save_agent(self.run, self.learner.policy, self.task, results, clocks, start)
+        save_agent(self.run, self.learner.policy, self.task, results, clocks)
 
     def close(self) -> None:
         """Release the thread, the event files and the run."""
@@ -350,7 +325,7 @@ def open_session(
         n_step=config.loss.n_step,
         conditions=names,
         strata=None if strata is None else strata.names,
-        behaviour_policies=POLICIES,
+        behaviour_policies=("dqn",),
         reserved=dict.fromkeys(names, reserved),
     )
     batches = Batches(
@@ -393,13 +368,6 @@ def open_session(
         executor=executor,
         logs=logs,
         log_terms=LogTerms.of(config.loss, logs, learner.device),
-        jump_start=JumpStart.of(
-            config.jump_start,
-            logs,
-            (env.num_envs, task.observation_size, len(task.actions)),
-            seed,
-            resume=resume,
-        ),
         practice=Practice.of(
             config.practice,
             env,

@@ -40,7 +40,7 @@ DAMAGES = ("missing", "empty", "cut", "garbage")
 FILES = (
     "config.json",
     *("progress.parquet", "strata.parquet", "audit.parquet", "evaluations.parquet"),
-    *("sampled_episodes.parquet", "evaluation_buffer.parquet", "guard.parquet"),
+    *("sampled_episodes.parquet", "evaluation_buffer.parquet", "practice.parquet"),
     *("eval/episodes.parquet", "checkpoints/best.safetensors", "checkpoints/latest.safetensors"),
 )
 
@@ -163,7 +163,7 @@ def test_a_file_that_is_not_needed_stops_no_verb(
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(root / "run", run)
-    for name in ("ages.parquet", "audit.parquet", "guard.parquet"):
+    for name in ("ages.parquet", "audit.parquet", "policies.parquet"):
         damage(run / name, "cut")
     for verb in ("eval", "baseline", "compare"):
         assert check(run_verbs(run, root, tmp_path)[verb], run, capsys) < 2

@@ -146,7 +146,7 @@ def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for action in range(3)
         ],
     )
-    estimates = {"fqe": {"refused": None}, "wdr": {"value": None, "refused": HOSTILE}}
+    estimates = {"fqe": {"refused": None}, "pdwis": {"value": None, "refused": HOSTILE}}
     made.append(
         "off_policy",
         [
@@ -231,7 +231,7 @@ def test_the_replay_card_answers_every_question(run: Path, capsys) -> None:
     assert card["behaviour_policies"][0]["behaviour_policy"] == "planner"
     assert [(row["estimator"], row["value"]) for row in card["off_policy"]] == [
         ("fqe", 0.5),
-        ("wdr", None),
+        ("pdwis", None),
     ]
     assert card["practice"]["rule"] == "success"
     slip, other = card["practice"]["arms"]

@@ -324,7 +324,7 @@ def test_a_single_held_out_episode_is_not_told_as_a_verdict() -> None:
     rows = [
         {"measure": "return", "condition": "all", "episodes": 1, "low": None, "high": None}
         | {"estimator": name, "value": value, "refused": None if value else few}
-        for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None), ("wdr", None))
+        for name, value in (("logged", -1.05), ("fqe", 4.18), ("pdwis", None))
     ]
     reported, refused = outcomes.on_logs({"results": rows, "notes": []})
     assert reported.startswith(

@@ -41,9 +41,7 @@ def test_the_target_rule_is_written_with_its_name() -> None:
         ("epsilon.start=1.5", r"epsilon\.start must be in \[0, 1\], got 1\.5"),
         ("env.conditions.nominal=-1", r"env\.conditions\.nominal must be at least 0, got -1"),
         ("env.conditions={nominal = 0}", r"env\.conditions must have a share above 0"),
-        ("guard.conditions=['fog']", r"guard\.conditions: fog is not among env\.conditions"),
         ("evaluation.averaging=0", r"evaluation\.averaging must be in \(0, 1\], got 0"),
-        ("jump_start.horizon_steps=0", r"jump_start\.horizon_steps must be at least 1, got 0"),
         ("target={rule='polyak', tau=2}", r"target\.tau must be in \(0, 1\], got 2"),
         ("target.tau=2", r"target\.tau must be in \(0, 1\], got 2"),
         ("seed=-1", r"seed must be in \[0, 2147483647\], got -1"),
@@ -148,11 +146,11 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(
 
 def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path: Path) -> None:
     old = tmp_path / "old.toml"
-    old.write_text("[guide]\nenv_steps = 100\n")
-    for path, overrides in ((old, []), (None, ["guide.env_steps=100"])):
-        with pytest.raises(ConfigError, match="unknown key `guide`") as refused:
+    old.write_text("[guard]\nmargin = 0.3\n")
+    for path, overrides in ((old, []), (None, ["guard.margin=0.3"])):
+        with pytest.raises(ConfigError, match="unknown key `guard`") as refused:
             load_config(path, overrides)
-        assert "now called `jump_start`" in str(refused.value)
+        assert "it was removed" in str(refused.value)
 
 
 def test_the_default_shares_are_those_of_the_environment_itself() -> None:

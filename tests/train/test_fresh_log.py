@@ -236,7 +236,6 @@ def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
                 perturbation="nominal",
                 perturbation_values="{}",
                 layout="default",
-                policy=np.zeros(len(part), np.int16),
             )
         )
     return episodes

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,7 @@ from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
-from restock.train import jump_start
 from restock.train.describe import no_update
-from restock.train.dqn.fitted_q import FittedQConfig
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer
@@ -241,50 +238,6 @@ def test_one_checkpoint_is_kept_where_one_is_asked_for(tmp_path: Path) -> None:
         tmp_path / "run", config(record={"keep_checkpoints": 1}, schedule={"env_steps": 900})
     )
     assert earlier(live.run.latest) == {}
-
-
-JUMP_START = {"jump_start": {"env_steps": 1000, "horizon_steps": 5}}
-
-
-@pytest.fixture
-def quick_clone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the logs did in the corridor is soon learnt."""
-    monkeypatch.setattr(jump_start, "FittedQConfig", partial(FittedQConfig, cloning_updates=200))
-
-
-@pytest.mark.long
-def test_the_logs_behaviour_drives_first_and_hands_over(tmp_path: Path, quick_clone: None) -> None:
-    live = run_to_end(tmp_path / "run", config(**JUMP_START))
-    meta = {name: values[: len(live.ring)] for name, values in live.ring.meta.items()}
-    cloned = meta["behaviour_policy"] == live.ring.behaviour_policies.index("cloned")
-    early = meta["env_step"] < 500
-    assert cloned[early].mean() > cloned[~early].mean() > 0
-    assert not cloned[meta["env_step"] >= 1000].any()
-    assert meta["episode_step"][cloned].max() < 5  # then the learner drives to the end
-    forward = live.ring.rows[: len(live.ring), -3] == 1  # as it is in 7 of 10 logged steps
-    assert forward[cloned].mean() == pytest.approx(0.7, abs=0.15)
-    chance = meta["action_probability"][cloned]
-    assert chance[forward[cloned]].mean() > 0.5 > chance[~forward[cloned]].mean() > 0
-    fed = pq.read_table(tmp_path / "run" / "policies.parquet").to_pylist()
-    assert {"dqn", "cloned"} <= {r["behaviour_policy"] for r in fed if r["source"] == "fresh"}
-
-
-@pytest.mark.long
-def test_a_run_with_a_jump_start_resumes_bit_exact(tmp_path: Path, quick_clone: None) -> None:
-    whole = run_to_end(tmp_path / "whole", config(**JUMP_START))
-    path = Path(shutil.copytree(whole.run.path, tmp_path / "cut"))
-    latest = path / "checkpoints" / "latest.safetensors"
-    go_back(latest, min(earlier(latest)))
-    again = session(path, config(**JUMP_START), resume=True)
-    assert 0 < again.progress.env_steps < 1000  # while it still drives
-    train(again)
-    again.close()
-    assert_same_run(whole, again)
-
-
-def test_a_jump_start_needs_logs(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="needs the logs' behaviour, but this run has no logs"):
-        session(tmp_path / "run", config(**JUMP_START), logs=None)
 
 
 def test_half_of_each_online_batch_is_from_logs_by_quota(undisturbed: Session) -> None:
@@ -602,40 +555,6 @@ def spoilt(live: Session, at: int) -> Any:
         return False
 
     return stop
-
-
-@pytest.mark.parametrize("action", one_in(2, ["stop", "rollback"]))
-def test_the_guard_does_not_let_a_condition_be_unlearnt(tmp_path: Path, action: str) -> None:
-    settings = config(
-        guard={"margin": 0.5, "action": action, "conditions": ["nominal"]},
-        schedule={**SMALL["schedule"], "env_steps": 4000},
-    )
-    live = session(tmp_path / "r", settings)
-    said: list[dict[str, Any]] = []
-    outcome = train(
-        live,
-        stop=spoilt(live, at=2340),
-        notify=lambda event, values: said.append(values) if event == "guard" else None,
-    )
-    live.close()
-    assert said
-    assert said[0]["action"] == action
-    rows = pq.read_table(live.run.path / "guard.parquet").to_pylist()
-    assert {row["condition"] for row in rows} == {"nominal"}
-    assert all(row["best"] - row["now"] >= 0.5 for row in rows)
-    assert outcome.best is not None
-    if action == "stop":
-        assert outcome.stopped
-        assert outcome.env_steps < settings.schedule.env_steps
-    else:
-        assert outcome.rollbacks >= 1
-        assert outcome.env_steps == settings.schedule.env_steps
-        assert outcome.last is not None
-        assert outcome.last.success["nominal"] > 0.5  # it recovered
-
-
-def test_without_a_margin_the_guard_is_off(undisturbed: Session) -> None:
-    assert pq.read_table(undisturbed.run.path / "guard.parquet").num_rows == 0
 
 
 def test_the_margin_is_for_rows_of_the_named_policy_and_strata() -> None:

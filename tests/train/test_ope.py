@@ -207,7 +207,7 @@ def test_the_verb_evaluates_and_says_why_it_refuses(
     table = pq.read_table(run / "eval" / "off_policy.parquet").to_pylist()
     assert [row["value"] for row in table] == [row["value"] for row in rows]
     assert {row["gradient_steps"] for row in table} == {7}
-    assert {row["estimator"] for row in rows} == {"logged", "fqe", "pdwis", "wdr"}
+    assert {row["estimator"] for row in rows} == {"logged", "fqe", "pdwis"}
     for row in rows:
         assert (row["value"] is None) == (row["refused"] is not None)
     assert main(["sql", str(run), "SELECT count(*) AS n FROM eval_off_policy", "--json"]) == 0

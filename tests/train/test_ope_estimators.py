@@ -17,7 +17,6 @@ from restock.train.dqn.fitted_q import (
 from restock.train.evaluation.off_policy.estimators import (
     EssGate,
     OpeEpisodes,
-    doubly_robust,
     effective_episodes,
     estimate,
     observed,
@@ -73,17 +72,13 @@ TRUTH = float((TARGET[0] * CHAIN.q(TARGET)[0]).sum())
 
 
 def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET) -> OpeEpisodes:
-    state, action, reward, following, alive = CHAIN.drive(
-        BEHAVIOUR, episodes, np.random.default_rng(seed)
-    )
+    state, action, reward, _, alive = CHAIN.drive(BEHAVIOUR, episodes, np.random.default_rng(seed))
     value = (policy * q).sum(axis=1)
     value[-1] = 0.0
     ratio = np.where(alive, policy[state, action] / BEHAVIOUR[state, action], 1.0)
     return OpeEpisodes(
         ratio,
         np.where(alive, reward, 0.0),
-        np.where(alive, q[state, action], 0.0),
-        np.where(alive, value[following], 0.0),
         value[state[:, 0]],
         DISCOUNT,
     )
@@ -92,11 +87,11 @@ def logged(episodes: int, seed: int, q: np.ndarray, policy: np.ndarray = TARGET)
 NO_MODEL = np.zeros((STATES, ACTIONS))
 
 
-def repeated(estimator, q: np.ndarray, *, weighted: bool, episodes: int = 50) -> np.ndarray:
-    """The estimator over 300 data sets."""
+def repeated(*, weighted: bool, episodes: int = 50) -> np.ndarray:
+    """Importance sampling over 300 data sets."""
     return np.array(
         [
-            estimator(logged(episodes, seed, q), once(episodes), weighted=weighted)[0]
+            per_decision(logged(episodes, seed, NO_MODEL), once(episodes), weighted=weighted)[0]
             for seed in range(300)
         ]
     )
@@ -109,51 +104,38 @@ def test_the_exact_value_is_that_of_driving_it() -> None:
     assert state.shape == (20_000, STEPS)
 
 
-@pytest.mark.parametrize("model", ["none", "wrong", "right"])
-@pytest.mark.parametrize("estimator", [per_decision, doubly_robust], ids=["is", "dr"])
-def test_without_normalising_the_estimators_are_unbiased(estimator, model: str) -> None:
-    """Whatever the model: five standard errors of the mean over 300 data sets."""
-    q = {"none": NO_MODEL, "wrong": 0.5 * CHAIN.q(TARGET) + 0.2, "right": CHAIN.q(TARGET)}[model]
-    q = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, q)
-    found = repeated(estimator, q, weighted=False)
+def test_without_normalising_importance_sampling_is_unbiased() -> None:
+    """Five standard errors of the mean over 300 data sets."""
+    found = repeated(weighted=False)
     assert abs(found.mean() - TRUTH) < 5 * found.std() / np.sqrt(len(found)) + 0.005
 
 
 def test_normalised_weights_are_consistent() -> None:
     """More episodes, less error; and little of it with many."""
     few, many = (
-        np.sqrt(np.mean((repeated(per_decision, NO_MODEL, weighted=True, episodes=n) - TRUTH) ** 2))
-        for n in (10, 250)
+        np.sqrt(np.mean((repeated(weighted=True, episodes=n) - TRUTH) ** 2)) for n in (10, 250)
     )
     assert many < few / 2
-    for estimator in (per_decision, doubly_robust):
-        found = estimator(logged(20_000, 1, NO_MODEL), once(20_000))[0]
-        assert found == pytest.approx(TRUTH, abs=0.02)
+    found = per_decision(logged(20_000, 1, NO_MODEL), once(20_000))[0]
+    assert found == pytest.approx(TRUTH, abs=0.02)
 
 
-def test_doubly_robust_varies_less_than_importance_sampling_when_the_model_is_right() -> None:
-    sampling = repeated(per_decision, CHAIN.q(TARGET), weighted=True).std()
-    robust = repeated(doubly_robust, CHAIN.q(TARGET), weighted=True).std()
-    assert robust < 0.6 * sampling
-
-
-def test_doubly_robust_mends_a_wrong_model_and_the_model_alone_stays_wrong() -> None:
+def test_fitted_q_evaluation_is_as_wrong_as_its_model() -> None:
     wrong = np.where(np.arange(STATES)[:, None] == STATES - 1, 0.0, CHAIN.q(TARGET) + 0.5)
     answers = {e.estimator: e for e in _estimates(logged(4000, 2, wrong))}
     assert answers["fqe"].value == pytest.approx(TRUTH + 0.5, abs=1e-6)
     assert (answers["fqe"].low, answers["fqe"].high) == (None, None)  # it would leave that .5 out
-    assert answers["wdr"].value == pytest.approx(TRUTH, abs=0.05)
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say() -> None:
-    inside = {"pdwis": 0, "wdr": 0}
+    inside = 0
     for seed in range(100):
         for answer in _estimates(logged(120, seed, NO_MODEL), resamples=300):
-            if answer.estimator in inside:
+            if answer.estimator == "pdwis":
                 assert answer.low is not None
                 assert answer.high is not None
-                inside[answer.estimator] += answer.low <= TRUTH <= answer.high
-    assert min(inside.values()) >= 85
+                inside += answer.low <= TRUTH <= answer.high
+    assert inside >= 85
 
 
 def test_weights_of_the_same_policy_are_all_one() -> None:
@@ -169,9 +151,8 @@ def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> Non
     away = logged(60, 4, CHAIN.q(far), far)
     answers = {e.estimator: e for e in _estimates(away)}
     assert answers["fqe"].value is not None
-    for name in ("pdwis", "wdr"):
-        assert answers[name].value is None
-        assert "of 60 episodes, less than 12.0" in str(answers[name].refused)
+    assert answers["pdwis"].value is None
+    assert "of 60 episodes, less than 12.0" in str(answers["pdwis"].refused)
     reach = EssGate().measure(away)[1]
     assert 0 < reach < STEPS
     again = {e.estimator: e for e in _estimates(away, horizon=reach)}
@@ -182,7 +163,7 @@ def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
     """A single episode is worth one, whatever the policy: that says nothing of agreement."""
     alone = logged(1, 3, CHAIN.q(BEHAVIOUR), BEHAVIOUR)
     answers = {e.estimator: e.refused for e in _estimates(alone)}
-    assert answers["pdwis"] == answers["wdr"] == "1 episode, and weights take at least 5"
+    assert answers["pdwis"] == "1 episode, and weights take at least 5"
     assert answers["fqe"] is None
 
 
@@ -193,11 +174,9 @@ def test_a_deterministic_policy_that_no_episode_followed_is_refused_and_not_divi
     assert all(np.isfinite(e.value) for e in _estimates(away) if e.value is not None)
 
 
-def test_a_horizon_cuts_the_rewards_of_one_and_not_of_the_other() -> None:
-    """Doubly robust takes the model's word for the rest; with the right model that is right."""
+def test_a_horizon_cuts_the_rewards_after_it() -> None:
     near = logged(4000, 6, CHAIN.q(TARGET)).until(3)
     assert per_decision(near, once(4000))[0] < TRUTH - 0.1
-    assert doubly_robust(near, once(4000))[0] == pytest.approx(TRUTH, abs=0.02)
 
 
 def test_weights_do_not_overflow() -> None:

@@ -61,7 +61,6 @@ _KINDS: dict[str, Kind] = {
     "config.loss": "algorithm",
     "config.optimizer": "algorithm",
     "config.teacher": "algorithm",
-    "config.offline_start": "algorithm",
     "config.practice": "practice",
     "config.env.conditions": "practice",
     "config.env.perturbation": "environment",

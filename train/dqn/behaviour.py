@@ -72,38 +72,7 @@ class FilteredNetwork(nn.Module):
         return q.masked_fill(~plausible, -torch.inf)
 
 
-class ProposedNetwork(nn.Module):
-    """What navigation proposes, where `inner` finds that plausible; elsewhere `inner`'s best.
-
-    Values are `inner`'s, but where a proposal is followed -inf for every other action.
-
-    Args:
-        inner: action values, -inf where an action is not plausible.
-        actions: (A, 2) speed and yaw rate, in units of the fastest of each, as observations have
-            them in their last two entries; the one before says whether there is a proposal.
-    """
-
-    def __init__(self, inner: QNetwork | FilteredNetwork, actions: Tensor) -> None:
-        super().__init__()
-        self.inner = inner
-        self.observation_size, self.actions = inner.observation_size, inner.actions
-        # The nearest action to x has the largest 2 a.x - |a|^2.
-        self.register_buffer("weight", 2 * actions.T.contiguous())  # (2, A)
-        self.register_buffer("bias", -(actions**2).sum(dim=1))  # (A,)
-
-    weight: Tensor
-    bias: Tensor
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return action values (B, A) of observations (B, D)."""
-        q: Tensor = self.inner(observation)
-        nearness = observation[:, -2:] @ self.weight + self.bias
-        nearest = (nearness >= nearness.amax(dim=1, keepdim=True)) & (q > -torch.inf)
-        followed = (observation[:, -3:-2] > 0) & nearest.any(dim=1, keepdim=True)
-        return q.masked_fill(followed & ~nearest, -torch.inf)
-
-
-PolicyNetwork = QNetwork | FilteredNetwork | ProposedNetwork
+PolicyNetwork = QNetwork | FilteredNetwork
 
 
 def make_behaviour(
@@ -213,7 +182,6 @@ __all__ = [
     "FilteredNetwork",
     "Labelled",
     "PolicyNetwork",
-    "ProposedNetwork",
     "imitation_loss",
     "make_policy",
     "plausible_actions",

@@ -96,18 +96,6 @@ class ScheduleConfig(Checked, frozen=True):
     updates_per_env_step: Annotated[float, Meta(gt=0, le=1_000)] = 0.25
 
 
-class JumpStartConfig(Checked, frozen=True):
-    """The logs' behaviour drives the first steps of episodes: see `restock.train.jump_start`."""
-
-    env_steps: NonNegativeInt = 0  # steps over which it drives less and less; 0: never
-    horizon_steps: Count = 60  # most first steps of an episode that it drives
-
-    def horizon(self, env_steps: int) -> int:
-        """Return the most steps of an episode that begins after `env_steps`."""
-        left = max(1.0 - env_steps / self.env_steps, 0.0) if self.env_steps else 0.0
-        return round(self.horizon_steps * left)
-
-
 class TeacherConfig(Checked, frozen=True):
     """The teacher, which says what it would do, and how far the policy may deviate from that."""
 
@@ -150,14 +138,6 @@ class TeacherConfig(Checked, frozen=True):
             )
         if not self.hidden:
             raise ValueError("hidden must name the width of at least one layer, got []")
-
-
-class OfflineStartConfig(Checked, frozen=True):
-    """What drives before online updates: see `restock.train.evaluation.offline_start`."""
-
-    choose: bool = False  # true: the best candidate on held-out logs
-    # Filters beside the run's own, where it has a teacher with logged rows; 1: the clone alone.
-    ratios: tuple[Annotated[float, Meta(gt=0, le=1)], ...] = (0.1, 0.3, 1.0)
 
 
 class EnvConfig(Checked, frozen=True):
@@ -222,14 +202,6 @@ class EvaluationConfig(Checked, frozen=True):
     off_policy: bool = False  # evaluate the offline policy on logs, before it drives
 
 
-class GuardConfig(Checked, frozen=True):
-    # Of success in a condition, below the kept policy's; None: off.
-    margin: Annotated[float, Meta(gt=0, le=1)] | None = None
-    action: Literal["stop", "rollback"] = "stop"
-    conditions: tuple[str, ...] = ()  # conditions that are watched; empty: all evaluated
-    rollbacks: NonNegativeInt = 3  # after this number of rollbacks the run stops
-
-
 class RecordConfig(Checked, frozen=True):
     every_updates: Count = 500  # length of a logging interval
     audit_share: Share = 0.01  # share of batches whose rows are all recorded
@@ -254,21 +226,13 @@ class TrainConfig(Checked, frozen=True):
     replay: ReplayConfig = ReplayConfig()
     schedule: ScheduleConfig = ScheduleConfig()
     epsilon: LinearEpsilon = LinearEpsilon()
-    jump_start: JumpStartConfig = JumpStartConfig()
     teacher: TeacherConfig = TeacherConfig()
-    offline_start: OfflineStartConfig = OfflineStartConfig()
     env: EnvConfig = msgspec.field(default_factory=EnvConfig)
     practice: PracticeConfig = msgspec.field(default_factory=PracticeConfig)
     evaluation: EvaluationConfig = EvaluationConfig()
-    guard: GuardConfig = GuardConfig()
     record: RecordConfig = RecordConfig()
 
     def check(self) -> None:
-        unknown = set(self.guard.conditions) - set(self.env.conditions)
-        if unknown:
-            raise ValueError(
-                f"guard.conditions: {', '.join(sorted(unknown))} is not among env.conditions"
-            )
         capacity, waiting = self.replay.ring_capacity, self.env.num_envs * self.loss.n_step
         if capacity != "auto" and capacity < waiting:
             raise ValueError(
@@ -375,8 +339,6 @@ def _apply(document: dict[str, Any], override: str) -> None:
 
 
 __all__ = [
-    "JumpStartConfig",
-    "OfflineStartConfig",
     "PracticeConfig",
     "TeacherConfig",
     "TrainConfig",

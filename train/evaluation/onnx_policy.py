@@ -24,7 +24,7 @@ from restock.imports import import_extra
 from restock.ingest.live.policy_file import FORMAT, open_session
 from restock.ingest.profile.profile_text import profile_toml
 from restock.ingest.task.task import Task
-from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork, ProposedNetwork
+from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.policies import load_agent
 from restock.train.run.run import Run
@@ -74,13 +74,10 @@ def to_onnx(network: PolicyNetwork) -> Any:
     """The network as an ONNX model, node for layer; where it is filtered, both in one graph."""
     onnx = _onnx()
     graph = _Graph(onnx)
-    inner = network.inner if isinstance(network, ProposedNetwork) else network
-    plain = inner.values if isinstance(inner, FilteredNetwork) else inner
+    plain = network.values if isinstance(network, FilteredNetwork) else network
     values = graph.values(plain, "q")
-    if isinstance(inner, FilteredNetwork):
-        values = graph.filter(inner, values, "plausible_values")
-    if isinstance(network, ProposedNetwork):
-        values = graph.follow(network, values, "followed_values")
+    if isinstance(network, FilteredNetwork):
+        values = graph.filter(network, values, "plausible_values")
     graph.node("Identity", [values], "values")
     graph.node("ArgMax", ["values"], "action", axis=1, keepdims=0)
     tensor, kinds = onnx.helper.make_tensor_value_info, onnx.TensorProto
@@ -158,31 +155,6 @@ class _Graph:
         plausible = self.node("GreaterOrEqual", [logits, least], "plausible")
         none = self.constant("behaviour.none", np.array(-np.inf, np.float32))
         return self.node("Where", [plausible, values, none], output)
-
-    def follow(self, network: ProposedNetwork, values: str, output: str) -> str:
-        """The values (N, A); -inf but for the proposed action, where that is plausible."""
-        spread = np.zeros((network.observation_size, network.actions), np.float32)
-        spread[-2:] = _array(network.weight)
-        known = np.zeros((network.observation_size, 1), np.float32)
-        known[-3] = 1.0
-        zero = self.constant("proposed.zero", np.array(0.0, np.float32))
-        none = self.constant("proposed.none", np.array(-np.inf, np.float32))
-        axes = self.constant("proposed.axes", np.array([1], np.int64))
-        weight = self.constant("proposed.weight", spread)
-        bias = self.constant("proposed.bias", _array(network.bias))
-        nearness = self.node("Gemm", ["observation", weight, bias], "proposed.nearness")
-        largest = self.node("ReduceMax", [nearness, axes], "proposed.largest", keepdims=1)
-        nearest = self.node("GreaterOrEqual", [nearness, largest], "proposed.nearest")
-        possible = self.node("Greater", [values, none], "proposed.possible")
-        allowed = self.node("And", [nearest, possible], "proposed.allowed")
-        kept = self.node("Where", [allowed, values, none], "proposed.values")
-        best = self.node("ReduceMax", [kept, axes], "proposed.best", keepdims=1)
-        any_allowed = self.node("Greater", [best, none], "proposed.any")
-        entry = self.constant("proposed.entry", known)
-        said = self.node("MatMul", ["observation", entry], "proposed.said")
-        is_known = self.node("Greater", [said, zero], "proposed.known")
-        followed = self.node("And", [is_known, any_allowed], "proposed.followed")
-        return self.node("Where", [followed, kept, values], output)
 
 
 class OnnxPolicy:

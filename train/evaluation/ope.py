@@ -269,11 +269,7 @@ def padded_episodes(
 ) -> OpeEpisodes:
     """Rows by episode (N,) to padded episodes, as policy and model see them."""
     rows = steps.rows
-    policy, next_policy = (
-        soft_greedy(network, observation, epsilon)
-        for observation in (rows.observation, rows.next_observation)
-    )
-    q_now, q_next = values(q, rows.observation), values(q, rows.next_observation)
+    policy = soft_greedy(network, rows.observation, epsilon)
     at = np.arange(len(rows))
     first = np.flatnonzero(np.diff(steps.episode, prepend=-1))
     lengths = np.diff(np.append(first, len(rows)))
@@ -285,13 +281,10 @@ def padded_episodes(
         matrix[steps.episode, step] = column
         return matrix
 
-    value = np.where(rows.terminated, 0.0, (next_policy * q_next).sum(axis=1))
     return OpeEpisodes(
         padded(policy[at, rows.action] / probability, 1.0),
         padded(rows.reward),
-        padded(q_now[at, rows.action]),
-        padded(value),
-        (policy * q_now).sum(axis=1)[first],
+        (policy[first] * values(q, rows.observation[first])).sum(axis=1),
         discount,
     )
 

@@ -17,7 +17,6 @@ from restock.state import first_mismatch
 from restock.train.dqn.behaviour import PolicyNetwork, make_policy
 from restock.train.dqn.config import TrainConfig, parse_config
 from restock.train.dqn.learner import Learner, greedy_actions
-from restock.train.dqn.start_policy import StartPolicy, start_network
 from restock.train.evaluation.evaluate import Score
 from restock.train.run import checkpoint
 from restock.train.run.kept_policy import PolicyOrigin, env_steps_of, latest_drives
@@ -104,9 +103,6 @@ def load_agent(run: Run) -> GreedyPolicy:
             where=str(file),
             remedy="put the settings back that were changed in config.json: network, teacher",
         ) from error
-    if (start := state.get("start")) is not None:  # what the run began with is not beaten yet
-        made = msgspec.convert(start, StartPolicy)
-        network = start_network(made, network, task.scaled_actions)
     env_steps, updates = state["env_steps"], state["gradient_steps"]
     origin = PolicyOrigin("latest" if latest else "best", env_steps, updates, env_steps_of(run))
     return GreedyPolicy(network.eval(), f"{run.path.name}@{updates}", origin)
@@ -136,7 +132,6 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
         "task_hash": run.document["task_hash"],
         "env_steps": state["progress"]["env_steps"],
         "gradient_steps": learner.gradient_steps,
-        "start": state["start"] if state["progress"]["online_from"] is None else None,
     }
 
 
@@ -166,12 +161,8 @@ def save_agent(
     task: Task,
     score: Score,
     clocks: Mapping[str, int],
-    start: StartPolicy | None = None,
 ) -> None:
-    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`.
-
-    `start` says how the policy is made of it, where that is what the run began to drive with.
-    """
+    """Keep a network as the best of a run so far; `clocks` are `env_steps` and `gradient_steps`."""
     state = {
         "network": dict(network.state_dict()),
         "observation_size": task.observation_size,
@@ -179,7 +170,6 @@ def save_agent(
         "task_hash": task.hash,
         **clocks,
         "score": asdict(score),
-        "start": None if start is None else msgspec.to_builtins(start),
     }
     checkpoint.save(run.best, state)
 

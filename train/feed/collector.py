@@ -109,7 +109,7 @@ class Collector(Stateful):
         self._unlabelled: list[EndedEpisode] = []
         self.invalid_steps = 0  # whose physics blew up
         self.observation: NDArray[np.float32] = np.zeros(0, np.float32)
-        self._sent: tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int16]] | None = None
+        self._sent: tuple[NDArray[np.int64], NDArray[np.float32]] | None = None
         self._future: Future[Any] | None = None
         self._result: Any = None
         self._label: Label | int = UNKNOWN  # what the teacher would have done in the step
@@ -147,9 +147,8 @@ class Collector(Stateful):
         self,
         action: NDArray[np.int64],
         probability: NDArray[np.float32],
-        policy: NDArray[np.int16] | int = 0,
     ) -> Any:
-        """Send one action per environment, (N,); `policy` is the ring's code of who chose it.
+        """Send one action per environment, (N,), each drawn with its `probability` (N,).
 
         Returns what the step returned, which `finish` takes in; None where a thread makes it.
         """
@@ -164,7 +163,7 @@ class Collector(Stateful):
             self._future = self._executor.submit(self._step, action)
         else:
             self._result = self._step(action)
-        self._sent = (action, probability, np.broadcast_to(np.int16(policy), action.shape))
+        self._sent = (action, probability)
         return self._result
 
     def _step(self, action: NDArray[np.int64]) -> Any:
@@ -187,7 +186,7 @@ class Collector(Stateful):
         if self._sent is None:
             raise RuntimeError("finish() without start()")
         # Before the result: where the teacher failed, no step was made, and none is under way.
-        (action, probability, policy), self._sent = self._sent, None
+        (action, probability), self._sent = self._sent, None
         future, self._future = self._future, None
         result, self._result = future.result() if future is not None else self._result, None
         observation, reward, terminated, truncated, info = result
@@ -205,7 +204,6 @@ class Collector(Stateful):
             env_step=env_steps,
             gradient_step=acting_step,
             policy_version=acting_step,
-            behaviour_policy=policy,
             action_probability=probability,
             teacher_action=self._label,
         )
@@ -217,7 +215,6 @@ class Collector(Stateful):
                 self._steps,
                 action=action,
                 probability=probability,
-                policy=policy,
                 reward=reward,
                 progress_m=info["progress_m"],
                 truth=info["true_condition"],

@@ -23,8 +23,8 @@ from restock.train.run import checkpoint
 if TYPE_CHECKING:
     from restock.train.feed.collector import EndedEpisode
 
-_STEP = ("action", "probability", "policy", "reward", "progress_m", "truth", "exposure")
-_KINDS = {"action": "i2", "policy": "i2", "truth": "<U64", "exposure": "<U64"}
+_STEP = ("action", "probability", "reward", "progress_m", "truth", "exposure")
+_KINDS = {"action": "i2", "truth": "<U64", "exposure": "<U64"}
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,6 @@ class FreshEpisode:
     observation: F32  # (T + 1, D)
     action: NDArray[np.int16]  # (T,)
     probability: F32  # (T,)
-    policy: NDArray[np.int16]  # (T,) the ring's code of who chose the action
     reward: F32  # (T,)
     progress_m: F32  # (T,)
     truth: NDArray[np.str_]  # (T,) the true conditions
@@ -92,7 +91,7 @@ class FreshLog(Stateful):
         self._observation[np.arange(len(at)), at] = observation
 
     def took(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
-        """After it: action, probability, policy, reward, progress_m, truth and exposure (N,)."""
+        """After it: action, probability, reward, progress_m, truth and exposure (N,)."""
         for name, value in values.items():
             self._steps[name][np.arange(len(at)), at] = value
 

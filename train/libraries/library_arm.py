@@ -79,11 +79,8 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
         for name, bad in (
             ("replay.ring_reserved", config.replay.ring_reserved > 0),
             ("schedule.seconds", config.schedule.seconds is not None),
-            ("guard.margin", config.guard.margin is not None),
             ('replay.ring_capacity "auto"', config.replay.ring_capacity == "auto"),
-            ("jump_start.env_steps", config.jump_start.env_steps > 0),
             ("teacher.source", config.teacher.filters),
-            ("offline_start.choose", config.offline_start.choose),
             ("practice.rule", config.practice.rule != "natural"),
             ("evaluation.missions", config.evaluation.missions != "drawn"),
         )

@@ -1,17 +1,15 @@
 """Estimators of what a policy is worth, from episodes that other policies drove.
 
-Three estimators, each a few lines, over n logged episodes padded to T steps:
+Two estimators, over n logged episodes padded to T steps:
 
-- the model's own word, fitted Q evaluation (`restock.train.dqn.fitted_q`; Le et al. 2019,
-  arXiv:1903.08738): the mean of V(s_0). No importance weights, and as wrong as the model is;
+- fitted Q evaluation (`restock.train.dqn.fitted_q`; Le et al. 2019, arXiv:1903.08738): the mean of
+  the fitted model's V(s_0). No importance weights, and as wrong as the model is;
 - per-decision weighted importance sampling (Precup, Sutton and Singh 2000): each reward counts by
-  how much likelier the evaluated policy was to get that far. No model; consistent;
-- weighted doubly robust (Jiang and Li 2016, arXiv:1511.03722; Thomas and Brunskill 2016,
-  arXiv:1604.00923): the model's word, and what importance sampling says of the model's errors.
+  how much likelier the evaluated policy was to get that far. No model; consistent.
 
-The weights of two policies that differ grow apart with every step, until one episode speaks for
-all. The effective sample size tells, and below a stated share of the episodes the estimators that
-weigh are refused: a number from one episode is not printed as if it were from a hundred.
+The weights of two policies that differ grow apart with every step, until one episode outweighs all
+others. If the effective sample size is below a stated share of the episodes, the weighted estimate
+is refused: a number from one episode is not printed as if it were from a hundred.
 """
 
 from __future__ import annotations
@@ -23,20 +21,17 @@ import numpy as np
 from restock.arrays import F64, Bools
 from restock.stats import cluster_counts, percentiles
 
-FQE, PDWIS, WDR, LOGGED = "fqe", "pdwis", "wdr", "logged"
+FQE, PDWIS, LOGGED = "fqe", "pdwis", "logged"
 _TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class OpeEpisodes:
-    """Logged episodes as the evaluated policy and its model see them. After an episode's end
-    `ratio` is 1 and all else 0, as if it stayed where it is and got nothing."""
+    """Logged episodes as the evaluated policy sees them; after the end `ratio` is 1, `reward` 0."""
 
     ratio: F64  # (n, T) probability of the action, evaluated policy / behaviour policy
     reward: F64  # (n, T)
-    q: F64  # (n, T) the model's value of the action that was taken
-    next_value: F64  # (n, T) the model's value of where it led; 0 where the episode terminated
-    start_value: F64  # (n,) the model's value of where the episode began
+    start_value: F64  # (n,) the fitted model's value of the first observation
     discount: float
 
     def __len__(self) -> int:
@@ -48,21 +43,12 @@ class OpeEpisodes:
             self,
             ratio=self.ratio[episodes],
             reward=self.reward[episodes],
-            q=self.q[episodes],
-            next_value=self.next_value[episodes],
             start_value=self.start_value[episodes],
         )
 
     def until(self, horizon: int | None) -> OpeEpisodes:
-        """The first steps alone: importance sampling then knows of no reward after them, and
-        doubly robust takes the model's word for it."""
-        return replace(
-            self,
-            ratio=self.ratio[:, :horizon],
-            reward=self.reward[:, :horizon],
-            q=self.q[:, :horizon],
-            next_value=self.next_value[:, :horizon],
-        )
+        """Return the first `horizon` steps; importance sampling then sees no later reward."""
+        return replace(self, ratio=self.ratio[:, :horizon], reward=self.reward[:, :horizon])
 
     @property
     def discounts(self) -> F64:
@@ -89,22 +75,14 @@ def relative_weights(ratio: F64) -> F64:
 
 
 def per_decision(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> F64:
-    """(Weighted) per-decision importance sampling; `counts` (B, n) of each episode -> (B,).
+    """Estimate by per-decision importance sampling; `counts` (B, n) of each episode -> (B,).
 
     Unweighted it is unbiased, and its variance grows with every step; weighted it is consistent.
     """
-    return _weigh(logged.ratio, logged.reward, counts, weighted) @ logged.discounts
-
-
-def doubly_robust(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> F64:
-    """(Weighted) doubly robust; `counts` (B, n) of each episode -> (B,).
-
-    What the model says of the starts, and the weighted sum of where it was wrong on the way:
-    right if either the model or the behaviour's probabilities are.
-    """
-    error = logged.reward + logged.discount * logged.next_value - logged.q
-    correction = _weigh(logged.ratio, error, counts, weighted) @ logged.discounts
-    return fitted(logged, counts) + correction
+    weight = relative_weights(logged.ratio) if weighted else np.exp(log_weights(logged.ratio))
+    total = counts @ weight if weighted else counts.sum(axis=1, keepdims=True)
+    means = counts @ (weight * logged.reward) / np.maximum(total, _TINY)  # (B, T)
+    return np.asarray(means @ logged.discounts, np.float64)
 
 
 def fitted(logged: OpeEpisodes, counts: F64) -> F64:
@@ -115,13 +93,6 @@ def fitted(logged: OpeEpisodes, counts: F64) -> F64:
 def observed(logged: OpeEpisodes, counts: F64) -> F64:
     """What the behaviour policies got themselves; `counts` (B, n) -> (B,)."""
     return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
-
-
-def _weigh(ratio: F64, values: F64, counts: F64, weighted: bool) -> F64:
-    """The weighted mean of `values` (n, T) over episodes, at each step: (B, T)."""
-    weight = relative_weights(ratio) if weighted else np.exp(log_weights(ratio))
-    total = counts @ weight if weighted else counts.sum(axis=1, keepdims=True)
-    return np.asarray(counts @ (weight * values) / np.maximum(total, _TINY), np.float64)
 
 
 def effective_episodes(ratio: F64) -> F64:
@@ -196,9 +167,8 @@ def estimate(
         (LOGGED, logged, observed),
         (FQE, logged, fitted),
         (PDWIS, near, per_decision),
-        (WDR, near, doubly_robust),
     ):
-        if name in (PDWIS, WDR) and refused is not None:
+        if name == PDWIS and refused is not None:
             answers.append(OpeEstimate(name, None, refused=refused))
             continue
         value = float(estimator(of, once(len(logged)))[0])
@@ -214,7 +184,6 @@ __all__ = [
     "EssGate",
     "OpeEpisodes",
     "OpeEstimate",
-    "doubly_robust",
     "estimate",
     "fitted",
     "per_decision",

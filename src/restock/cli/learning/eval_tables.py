@@ -94,7 +94,7 @@ def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json
     for row in result.rows:
         if row["condition"] == "all" and row["estimator"] == "pdwis" and row["refused"]:
             longest = f"; --horizon {row['ess_steps']} is enough" if row["ess_steps"] else ""
-            say(f"{row['measure']}: pdwis and wdr are refused: {row['refused']}{longest}")
+            say(f"{row['measure']}: pdwis is refused: {row['refused']}{longest}")
     if any(row["estimator"] == "fqe" for row in result.rows):
         say(
             "fqe is the value of the starts by the fitted model: it has no interval, as the error "

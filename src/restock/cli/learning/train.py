@@ -148,8 +148,6 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
                 nonlocal seen
                 if event == "evaluation":
                     say(_evaluation_line(values, session.wall_s))
-                elif event == "guard":
-                    say(_guard_line(values))
                 elif event == "teacher":
                     say(_silence_line(values))
                 elif event == "off_policy":
@@ -216,14 +214,6 @@ def _progress_note(values: dict[str, Any]) -> str:
         f"{values['phase']}: {values['env_steps_per_s']:,.0f} steps/s,"
         f" {values['updates_per_s']:,.0f} updates/s{success}"
     )
-
-
-def _guard_line(values: dict[str, Any]) -> str:
-    fallen = ", ".join(
-        f"{fall.condition} fell from {fall.best:.2f} to {fall.now:.2f}" for fall in values["falls"]
-    )
-    done = {"stop": "stopped here", "rollback": "back to the best policy so far"}
-    return f"guard: {fallen}; {done[values['action']]}"
 
 
 def _silence_line(values: dict[str, Any]) -> str:

@@ -13,7 +13,6 @@ ESTIMATORS = (
     ("logged", "as the logs were driven"),
     ("fqe", "the policy, by a fitted model (fqe)"),
     ("pdwis", "by importance weights (pdwis)"),
-    ("wdr", "by both (wdr)"),
 )
 
 

@@ -101,11 +101,6 @@ def replay_card(facts: Facts) -> dict[str, Any]:
             *("measure", "estimator", "value", "low", "high", "refused", "episodes"),
             *("ess", "horizon", "epsilon", "estimated_share"),
         ),
-        "offline_start": _columns(
-            facts.offline_start,
-            *("candidate", "chosen", "measure", "value", "low", "high", "refused", "model"),
-            *("episodes", "reach", "estimated_share"),
-        ),
         "left_out": dict(panel.header.left_out) if panel is not None else None,
         "evaluation": facts.evaluation or None,
         "imbalance": evaluation_bias(facts) or None,
@@ -154,17 +149,6 @@ _TABLES = (
         "Off-policy evaluation on held-out logs, before it drove",
         "off_policy",
         {"measure": "measure", "estimator": "estimator", "value": "value [95 %]"},
-    ),
-    (
-        "What might have driven first, on held-out logs",
-        "offline_start",
-        {
-            "candidate": "policy",
-            "chosen": "chosen",
-            "measure": "measure",
-            "value": "value [95 %]",
-            "reach": "steps weighted",
-        },
     ),
 )
 
@@ -215,7 +199,7 @@ def as_markdown(card: dict[str, Any]) -> str:
     lines += ["| | |", "| --- | --- |"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in facts.items()]
     for title, key, columns in _TABLES:
-        if card[key] or key not in ("off_policy", "offline_start"):
+        if card[key] or key != "off_policy":
             lines += ["", f"## {title}", "", *_table(card[key], columns)]
     lines += ["", "## Missions that the twin gave", ""]
     lines += _table(card["practice"]["arms"], _PRACTICE)

@@ -71,7 +71,6 @@ class Facts:
     labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
     reliability: Rows = field(default_factory=list)  # of their probabilities
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
-    offline_start: Rows = field(default_factory=list)  # what might have driven first, over all
     clones: list[CloneQuality] = field(default_factory=list)  # of who drove in the logs
     clean: dict[str, dict[str, Any]] = field(default_factory=dict)  # measures by policy, pooled
     practice: Rows = field(default_factory=list)  # an interval x arm of missions
@@ -159,9 +158,6 @@ def gather(path: Path) -> Facts:
     facts.clones = read_clones(path)
     facts.fed = fed_shares(run)
     facts.off_policy = _off_policy(run, facts.twin)
-    facts.offline_start = [
-        row for row in run.table("offline_start").to_pylist() if row["condition"] == "all"
-    ]
     facts.practice = run.table("practice").to_pylist()
     taught = run.table("teacher").to_pylist()
     facts.teacher = [row for row in taught if _clocks(row) == _clocks(taught[-1])]

@@ -11,9 +11,7 @@ _NAMES = {
     "logged": "the logs' drivers",
     "fqe": "fitted Q evaluation (FQE)",
     "pdwis": "per-decision weighted importance sampling (PDWIS)",
-    "wdr": "weighted doubly robust (WDR)",
 }
-BEST_FIRST = ("wdr", "pdwis")  # estimators with an interval
 NOTHING_DROVE = (
     "This run learned from the logs alone: it was not driven, in a twin or on a robot, so there "
     "is no success to show."
@@ -29,8 +27,8 @@ def headline(facts: Facts) -> str:
         return "Trained on the logs alone, not yet evaluated"
     measure = "success" if any(name == "success" for name, _ in rows) else "return"
     logged = rows.get((measure, "logged"))
-    judged = next((rows[measure, e] for e in BEST_FIRST if known(rows.get((measure, e)))), None)
-    if logged is None or judged is None:
+    judged = rows.get((measure, "pdwis"))  # the estimator with an interval
+    if logged is None or judged is None or judged["value"] is None:
         return "Trained on the logs alone: there are too few to evaluate it"
     return (
         f"By held-out logs alone: {measure} {estimate(judged)}, the logs' drivers "
@@ -42,11 +40,6 @@ def holds_out(facts: Facts) -> bool:
     """Whether the panel left some rows for evaluation."""
     left_out = {} if facts.panel is None else facts.panel.header.left_out
     return any("evaluation split" in why for why, rows in left_out.items() if rows)
-
-
-def known(row: dict[str, object] | None) -> bool:
-    """Whether an estimate was not refused."""
-    return row is not None and row["value"] is not None
 
 
 def judged_section(facts: Facts) -> Section:
