@@ -9,7 +9,6 @@ from restock.replay.panel.panel import Panel
 from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig
 from restock.train.feed.imitation import cloned
-from restock.train.feed.practice import MOVING
 from restock.train.loop import TrainResult
 from restock.train.prepare import Prepared, rows_by_policy
 from restock.train.run.fed_shares import SHORT
@@ -128,16 +127,16 @@ def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
 
 
 def unmoved(practised: list[dict[str, Any]], config: TrainConfig) -> str | None:
-    """Why the shares of a practice that was to follow success were never other than at first.
+    """Explain why success-based practice never changed its shares; None if it did, or was off.
 
-    `practised` are the rows of the run's table `practice`; None where they moved, or are not to.
+    `practised` are the rows of the run's table `practice`.
     """
     practice = config.practice
     drawn = {(row["arm"], row["wanted_share"]) for row in practised}
-    if practice.rule not in MOVING or len(drawn) > len({arm for arm, _ in drawn}):
+    if practice.rule != "success" or len(drawn) > len({arm for arm, _ in drawn}):
         return None
     return (
-        f'practice.rule="{practice.rule}" never changed the shares of the missions: it may at the'
+        'practice.rule="success" never changed the shares of the missions: it may at the'
         f" end of every practice.every_env_steps={practice.every_env_steps:,}, by arms or kinds of"
         f" which practice.warmup_episodes={practice.warmup_episodes:,} missions have ended"
     )

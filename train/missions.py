@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
-from restock.ingest.task.task import Task
 from restock.replay.fleet.missions_file import MissionOrder, read_missions
 from restock.replay.panel.panel import Panel
 from restock.train.dqn.config import PracticeConfig, TrainConfig
-from restock.train.evaluation.evaluate import run_episodes
 from restock.train.evaluation.logged_ways import EVERY, logged_missions
-from restock.train.evaluation.references import reference
-from restock.train.feed.logs import Coded
 from restock.train.feed.practice import Practice
-from restock.train.feed.practice_shares import logged_shares
 from restock.train.twin.env.episode_queue import MissionArms, MissionOrders
-from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import open_floors
 from restock.train.twin.floors.planner import planners
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
 MISSIONS = "env.missions"
-REFERENCE_SEED = 70_000  # of the first mission that a reference drives of each arm
 
 
 def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
@@ -86,40 +77,15 @@ def mission_arms(config: TrainConfig) -> MissionArms:
     )
 
 
-def check_missions(config: TrainConfig, profile: Profile, panel: Panel | None) -> None:
+def check_missions(config: TrainConfig, profile: Profile) -> None:
     """What the twin is to drive is refused now, before anything is written, if it cannot be.
 
     Raises:
-        ConfigError: an order, arm, share or floor of practice that the floors cannot hold.
+        ConfigError: an order, arm or floor of practice that the floors cannot hold.
     """
     if not mission_orders(config) and config.practice == PracticeConfig():
         return
-    logged = None
-    if panel is not None:
-        meta = panel.meta
-        observed, episode = Coded.of(meta["condition"]), Coded.of(meta["episode_id"])
-        logged = logged_shares(observed, episode, list(config.env.conditions))
-    arms, goal = mission_arms(config).arms, profile.task.goal != "none"
-    Practice(config.practice, arms, goal=goal, logged=logged)
+    Practice(config.practice, mission_arms(config).arms, goal=profile.task.goal != "none")
 
 
-def reference_success(config: TrainConfig, env: Twin, task: Task) -> dict[str, float]:
-    """Success by arm of `practice.reference`, on a pool of missions that every run has the same."""
-    arms, missions = mission_arms(config), config.practice.reference_missions
-    specs = [
-        arms.spec(number, REFERENCE_SEED + mission)
-        for number in range(len(arms.arms))
-        for mission in range(missions)
-    ]
-    results = run_episodes(
-        env,
-        reference(config.practice.reference),
-        specs,
-        control_period_s=task.control_period_s,
-        time_limit_steps=task.time_limit_steps,
-    )
-    success = np.array([bool(result.success) for result in results]).reshape(-1, missions)
-    return {arm.name: float(of.mean()) for arm, of in zip(arms.arms, success, strict=True)}
-
-
-__all__ = ["check_missions", "mission_arms", "mission_orders", "reference_success"]
+__all__ = ["check_missions", "mission_arms", "mission_orders"]

@@ -17,7 +17,7 @@ from restock.train.dqn.config import TrainConfig
 from restock.train.feed.logs import check_terms
 from restock.train.ring_capacity import row_bytes
 
-_NATURAL = ("floor", "floors", "warmup_episodes", "half_life_episodes", "max_change")
+_NATURAL = ("floor", "warmup_episodes")
 _CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
 _BEHAVIOURS = 4  # online, a gradient, Adam's two
 

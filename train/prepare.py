@@ -38,7 +38,6 @@ from restock.train.loop import Notify, TrainResult
 from restock.train.missions import (
     check_missions,
     mission_orders,
-    reference_success,
     ways_to_evaluate,
 )
 from restock.train.new_run import check_new_run
@@ -149,18 +148,10 @@ class Prepared:
             logs=_logs(self.panel, self.config, self.document) if self.panel is not None else None,
             teacher=teacher,
             resume=self.resumed is not None,
-            reference=self._reference() if self.resumed is None else None,
         )
         if self.resumed is None and self.config.env.twin and self.config.schedule.seconds:
             refuse_short_budget(session, self.config.schedule.seconds)
         return session
-
-    def _reference(self) -> dict[str, float] | None:
-        """The success of whom practice by regret is against; None of another rule."""
-        if self.config.practice.rule != "regret":
-            return None
-        env = make_twin(self.config, self.profile, _EVALUATION_ENVS, nthread=0)
-        return reference_success(self.config, env, self.profile.task)
 
 
 @interrupts_raised
@@ -245,7 +236,7 @@ def prepare_new(
     panel = open_panel(panel_path, config, profile) if panel_path is not None else None
     if not config.env.twin:
         config = without_twin(config, panel)
-    check_missions(config, profile, panel)
+    check_missions(config, profile)
     config = resolve_teacher(config, profile, panel)
     drivers = None if panel is None else sorted(rows_by_policy(panel))
     refuse_nothing_to_learn(config.teacher, drivers)

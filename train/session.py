@@ -301,13 +301,11 @@ def open_session(
     teacher: AskedTeacher | None = None,
     resume: bool = False,
     episodes: Sequence[EpisodeSpec] | None = None,
-    reference: Mapping[str, float] | None = None,
     exposures: Sequence[Condition] = (),
 ) -> Session:
     """Put the parts of a run together, new or as its latest checkpoint left them.
 
-    `episodes` are what evaluations drive, None: as drawn by the config's seeds. `reference` is the
-    success by arm of whom practice by regret is against.
+    `episodes` are what evaluations drive, None: as drawn by the config's seeds.
     """
     torch.set_num_threads(config.threads)
     seed = config.seed
@@ -372,9 +370,7 @@ def open_session(
             config.practice,
             env,
             config.env.conditions,
-            logs,
             goal=task.goal != "none",
-            reference=reference,
         ),
         imitation=Imitation(
             config.teacher,
@@ -397,5 +393,4 @@ def open_session(
         session.blocks = UpdateBlocks(
             config, learner, batches, session.imitation, session.log_terms
         )
-    session.practice.check_reference()
     return session

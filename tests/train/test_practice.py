@@ -13,22 +13,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.finished_runs import document, make_run
-from support.toy_run import assert_same_run, config, logs, session
+from support.toy_run import assert_same_run, config, session
 from support.toy_twin import ToyTwin
 
 from restock.cli import main
 from restock.errors import ConfigError, RunError
-from restock.ingest.profile.profile import load_profile
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.comparison.arms import differences
 from restock.train.describe import unmoved
 from restock.train.dqn.config import PracticeConfig, load_config, parse_config
+from restock.train.feed import practice as practice_module
 from restock.train.feed.collector import EndedEpisode
-from restock.train.feed.practice import Practice
-from restock.train.feed.practice_shares import logged_shares, moved, unordered, with_floors
+from restock.train.feed.practice import (
+    HALF_LIFE_EPISODES,
+    MAX_CHANGE,
+    Practice,
+    moved,
+    unordered,
+    with_floor,
+)
 from restock.train.loop import train
-from restock.train.missions import reference_success
-from restock.train.prepare import make_twin, prepare_new, prepare_resumed
+from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.run.run import Run
 from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
@@ -61,61 +66,49 @@ parts = st.lists(st.floats(0, 1), min_size=1, max_size=12)
 
 
 @st.composite
-def floors_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two sets of weights and floors that sum to at most 1."""
+def floor_of(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
+    """Two sets of weights, and a floor that leaves room for all."""
     count = draw(st.integers(1, 12))
     some = st.lists(st.floats(0, 1), min_size=count, max_size=count)
-    floors = np.array(draw(some))
-    floors *= draw(st.floats(0, 1)) / max(floors.sum(), 1.0)
-    weights = [np.array(draw(some)) for _ in range(2)]
-    return (*(w + (0 if w.sum() > 1e-6 else 1) for w in weights), floors)  # type: ignore[return-value]
+    first, second = (np.array(draw(some)) for _ in range(2))
+    floor = draw(st.floats(0, 1)) / count
+    return *(w + (0 if w.sum() > 1e-6 else 1) for w in (first, second)), floor  # type: ignore[return-value]
 
 
-@given(floors_of())
-def test_shares_sum_to_one_keep_their_floors_and_the_proportions_of_the_rest(given: Any) -> None:
-    weights, _, floors = given
-    shares = with_floors(weights, floors)
+@given(floor_of())
+def test_shares_sum_to_one_and_keep_their_floor(given: Any) -> None:
+    weights, _, floor = given
+    shares = with_floor(weights, floor)
     assert math.isclose(shares.sum(), 1.0)
-    assert (shares >= floors - 1e-9).all()
-    free = np.flatnonzero(shares > floors + 1e-9)
+    assert (shares >= floor - 1e-9).all()
+    free = np.flatnonzero(shares > floor + 1e-9)
     if weights[free].sum() > 0:
         np.testing.assert_allclose(
             shares[free] / shares[free].sum(), weights[free] / weights[free].sum(), atol=1e-9
         )
 
 
-@given(floors_of(), st.floats(0.001, 1))
-def test_a_share_moves_at_most_so_far_and_sum_and_floors_hold(given: Any, most: float) -> None:
-    first, second, floors = given
-    before, wanted = with_floors(first, floors), with_floors(second, floors)
+@given(floor_of(), st.floats(0.001, 1))
+def test_a_share_moves_at_most_so_far(given: Any, most: float) -> None:
+    first, second, floor = given
+    before, wanted = with_floor(first, floor), with_floor(second, floor)
     after = moved(before, wanted, most)
     assert np.abs(after - before).max() <= most + 1e-12
     assert math.isclose(after.sum(), 1.0)
-    assert (after >= floors - 1e-9).all()
+    assert (after >= floor - 1e-9).all()
     assert np.abs(wanted - after).max() <= np.abs(wanted - before).max() + 1e-12
 
 
 def test_fixed_rules_give_what_they_say() -> None:
     assert practice(rule="natural").shares.tolist() == [0.6, 0.2, 0.15, 0.05]
     assert practice(rule="even").shares.tolist() == [0.25] * 4
-    given = practice(rule="shares", shares={"nominal": 1, "blocked_aisle": 1})  # a kind's arms as
-    np.testing.assert_allclose(given.shares, [0.5, 0, 0.375, 0.125])  # they are natural
-    one = practice(rule="shares", shares={"blocked_aisle (full)": 2}, floor=0.1)
-    np.testing.assert_allclose(one.shares, [0.1, 0.1, 0.1, 0.7])
-    held = practice(rule="even", floors={"nominal": 0.7})
-    np.testing.assert_allclose(held.shares, [0.7, 0.1, 0.1, 0.1])
 
 
-def test_as_the_logs_are_counts_episodes_that_met_a_kind() -> None:
-    rows = logs()
-    shares = logged_shares(rows.condition, rows.episode, ["nominal", "wheel_slip"])
-    assert shares == {"nominal": 0.0, "wheel_slip": 1.0}  # its one episode slipped
-    found = Practice(PracticeConfig(rule="logs"), ARMS, logged={"nominal": 3, "wheel_slip": 1})
-    np.testing.assert_allclose(found.shares, [0.75, 0.25, 0, 0])
-
-
-def test_success_practises_what_fails_once_it_is_believed() -> None:
-    found = practice(rule="success", warmup_episodes=4, max_change=1.0, floor=0.1)
+def test_success_practises_what_fails_once_it_is_believed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(practice_module, "MAX_CHANGE", 1.0)
+    found = practice(rule="success", warmup_episodes=4, floor=0.1)
     np.testing.assert_allclose(found.shares, 0.25)  # nothing is known: all count as failing
     found.note(ended("nominal", True, 50) + ended("wheel_slip", False, 50))
     found.note(ended("blocked_aisle", True, 3, "partial"))  # too few to be believed
@@ -142,32 +135,16 @@ def test_an_arm_with_too_few_missions_goes_by_its_kind() -> None:
     assert rates[9] == 1.0  # never driven
 
 
-def test_regret_practises_what_the_reference_does_better() -> None:
-    reference = dict(zip((arm.name for arm in ARMS), (1.0, 0.9, 0.0, 0.6), strict=True))
-    settings = PracticeConfig(rule="regret", warmup_episodes=1, max_change=1.0, floor=0.05)
-    found = Practice(settings, ARMS, reference=reference)
-    found.note(ended("nominal", True, 99) + ended("wheel_slip", False, 99))
-    found.note(ended("blocked_aisle", False, 99, "partial"))  # as the reference: nobody can
-    found.note(ended("blocked_aisle", False, 99, "full"))
-    rows = found.advance(at(1000))
-    assert [row["reference"] for row in rows] == [1.0, 0.9, 0.0, 0.6]
-    nominal, slip, partial, full = found.shares
-    assert (nominal, partial) == pytest.approx((0.05, 0.05))
-    assert slip / full == pytest.approx((0.9 - 0.02) / (0.6 - 0.02), rel=0.03)
-    with pytest.raises(ConfigError, match="needs the success of a reference driver"):
-        practice(rule="regret").check_reference()
-
-
 def test_old_episodes_fade_by_their_half_life() -> None:
-    found = practice(rule="success", half_life_episodes=10)
+    found = practice(rule="success")
     found.note(ended("nominal", False, 200))
-    found.note(ended("nominal", True, 10))
+    found.note(ended("nominal", True, round(HALF_LIFE_EPISODES)))
     assert found.failure_rate[0] == pytest.approx(0.5, abs=0.04)
 
 
 def test_shares_move_at_interval_ends_and_by_no_more_than_the_limit() -> None:
     reported: list[list[float]] = []
-    settings = PracticeConfig(rule="success", every_env_steps=100, max_change=0.02)
+    settings = PracticeConfig(rule="success", every_env_steps=100)
     found = Practice(settings, ARMS, reported.append)
     found.note(ended("nominal", True, 30))
     assert found.advance(at(99)) == []
@@ -175,7 +152,8 @@ def test_shares_move_at_interval_ends_and_by_no_more_than_the_limit() -> None:
     found.advance(at(250))
     assert len(reported) == 3  # at first, and twice after
     steps = np.abs(np.diff(reported, axis=0)).max(axis=1)
-    np.testing.assert_allclose(steps, 0.02)
+    assert steps[0] == pytest.approx(MAX_CHANGE)
+    assert steps[1] <= MAX_CHANGE + 1e-9
 
 
 def test_ordered_missions_are_arms_or_count_as_their_kinds() -> None:
@@ -207,26 +185,18 @@ def test_a_run_too_short_for_its_shares_to_move_says_so() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"rule": "shares", "shares": {"fog": 1.0}}, "'fog' is not a kind of missions"),
-        ({"rule": "shares", "shares": {"nominal": 0.0}}, "a share above 0"),
-        ({"rule": "shares", "shares": {"nominal": 1e308, "wheel_slip": 1e308}}, "a finite number"),
-        ({"rule": "even", "shares": {"nominal": 1.0}}, 'shares need the rule "shares"'),
         ({"rule": "success", "floor": 0.3}, r"floors of 4 arms sum to 1\.2, above 1"),
-        ({"floors": {"nominal": 0.7, "wheel_slip": 0.4}}, "floors must sum to at most 1"),
-        ({"rule": "logs"}, "this run has no logs"),
         ({"rule": "missions"}, "but none is given"),
     ],
 )
 def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises((ConfigError, ValueError), match=message):
+    with pytest.raises(ConfigError, match=message):
         practice(**settings)
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("practice={rule='shares', shares={fog=1}}", "'fog' is not a kind"),
-        ("practice={rule='shares', shares={near_collision=1}}", "'near_collision' is not a kind"),
         ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
         ("practice.rule='missions'", "env.missions a missions file"),
         ("practice={rule='success', floor=0.5}", "above 1"),
@@ -262,7 +232,7 @@ class KindsToy(ToyTwin):
         self._shares = np.array(list(conditions.values()))
 
 
-PRACTICE = {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2, "max_change": 0.3}
+PRACTICE = {"rule": "success", "every_env_steps": 100, "warmup_episodes": 2}
 
 
 @pytest.fixture
@@ -345,7 +315,7 @@ def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path
     settings = [
         *("env.num_envs=4", "schedule.env_steps=1600", "schedule.warmup_env_steps=200"),
         *("replay.batch_size=16", "record.checkpoint_every_env_steps=800", "evaluation.episodes=1"),
-        "practice={rule='success', every_env_steps=200, warmup_episodes=1, max_change=0.5}",
+        "practice={rule='success', every_env_steps=200, warmup_episodes=1}",
     ]
     first = prepare_new(tmp_path / "run", None, None, settings).open()
     train(first)
@@ -358,22 +328,6 @@ def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path
     assert all(again.run.table(name).equals(table) for name, table in before.items())
     assert len(set(before["practice"]["wanted_share"].to_pylist())) > 5
     np.testing.assert_array_equal(first.ring.rows, again.ring.rows)
-
-
-@pytest.mark.long
-def test_a_reference_drives_the_same_pool_of_every_arm_whatever_the_seed() -> None:
-    given = [
-        "practice={rule='regret', reference='planner', reference_missions=3}",
-        "env.conditions={nominal=1, blocked_aisle=1}",
-    ]
-    profile = load_profile("warehouse_amr")
-    found = []
-    for seed in (0, 1):
-        settings = load_config(None, [*given, f"seed={seed}"])
-        found.append(reference_success(settings, make_twin(settings, profile, 9), profile.task))
-    assert found[0] == found[1]
-    assert list(found[0]) == ["nominal", "blocked_aisle (partial)", "blocked_aisle (full)"]
-    assert found[0]["nominal"] == 1.0  # the planner knows the dry, empty floor
 
 
 # -- the gate -------------------------------------------------------------------------------------

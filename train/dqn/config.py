@@ -7,7 +7,6 @@ later. Every field has its meaning in a comment; `docs/train.md` explains the ch
 from __future__ import annotations
 
 import copy
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -165,28 +164,12 @@ class EnvConfig(Checked, frozen=True):
 class PracticeConfig(Checked, frozen=True):
     """Which missions the twin gives next: see `restock.train.feed.practice`."""
 
-    rule: Literal["natural", "even", "shares", "logs", "missions", "success", "regret"] = "natural"
+    rule: Literal["natural", "even", "missions", "success"] = "natural"
     # What tells missions of one kind apart: "block", "layout", fields of a schedule's ranges.
     by: tuple[str, ...] = ("block",)
-    shares: dict[str, NonNegative] = msgspec.field(default_factory=dict)  # share per kind or arm
     floor: Share | None = None  # least share of an arm; None: FLOOR if shares move, else 0
-    floors: dict[str, Share] = msgspec.field(default_factory=dict)  # least share per kind or arm
     every_env_steps: Count = 1_000  # length of an interval of practice
     warmup_episodes: NonNegativeInt = 5  # episodes of an arm before its rate is used
-    half_life_episodes: Positive = 20.0  # an arm's episode that is this old counts half
-    max_change: Annotated[float, Meta(gt=0, le=1)] = 0.1  # largest change of a share per interval
-    reference: Literal["operator", "planner"] = "operator"  # driver with which regret is computed
-    reference_missions: Count = 20  # missions per arm that it drives before training
-
-    def check(self) -> None:
-        if self.rule == "shares" and sum(self.shares.values()) <= 0:
-            raise ValueError(f"shares must have a share above 0, got {self.shares}")
-        if math.isinf(sum(self.shares.values())):
-            raise ValueError(f"shares must sum to a finite number, got {self.shares}")
-        if self.rule != "shares" and self.shares:
-            raise ValueError(f'shares need the rule "shares", but the rule is "{self.rule}"')
-        if sum(self.floors.values()) > 1:
-            raise ValueError(f"floors must sum to at most 1, got {self.floors}")
 
 
 class EvaluationConfig(Checked, frozen=True):

@@ -3,13 +3,11 @@
 An arm is a kind of missions (`restock.train.twin.env.episode_queue`). The rules:
 
 - natural: as `env.conditions`, `env.missions` and the floors say; the twin is left as it is;
-- even: every arm alike; shares: as given; logs: the kinds as often as the logs' episodes met them;
-  missions: the ordered missions alone, each at its part;
+- even: every arm alike;
+- missions: the ordered missions alone, each at its part;
 - success: an arm's weight is its rate of failures, while the agent explores. The failures and
   successes of an arm fade by a half-life; an arm with too few episodes goes by its kind's rate, and
-  a kind with too few counts as if all failed;
-- regret: what the agent's rate of success lacks to that of a reference driver on the same arm
-  (prioritised level replay, arXiv:2010.03934, by arm). What nobody can do is not practised.
+  a kind with too few counts as if all failed.
 
 Weights become shares that sum to 1, none below its floor, and a share moves at most so far in an
 interval. Nothing is drawn here: the twin draws its missions from its own seed.
@@ -19,6 +17,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -30,27 +29,26 @@ from restock.errors import ConfigError, RunError
 from restock.state import Stateful
 from restock.train.dqn.config import PracticeConfig
 from restock.train.feed.collector import EndedEpisode
-from restock.train.feed.logs import Logs
-from restock.train.feed.practice_shares import logged_shares, moved, unordered, with_floors
 from restock.train.twin.env.episode_queue import MissionArm
 from restock.train.twin.env.interface import ArmedTwin, KindsTwin, Twin
 
-MOVING = ("success", "regret")  # rules whose shares follow what happens
-FLOOR = 0.05  # of an arm under those, unless the config says otherwise
+FLOOR = 0.05  # of an arm under the rule "success", unless the config says otherwise
 WHERE = "practice"
+HALF_LIFE_EPISODES = 20.0  # an arm's episode that is this old counts half
+MAX_CHANGE = 0.1  # of a share per interval
 
 
 class Practice(Stateful):
     """Counts ended missions by arm; at the end of an interval it sets the twin's shares.
 
     Raises:
-        ConfigError: the rule's shares or floors do not fit the arms, or it lacks what it needs.
+        ConfigError: the rule's floors do not fit the arms, or it lacks what it needs.
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("names",)
     STATE: ClassVar[tuple[str, ...]] = (
         *("shares", "_episodes", "_failures", "_seen"),
-        *("_interval_episodes", "_interval_successes", "_closed_at", "reference"),
+        *("_interval_episodes", "_interval_successes", "_closed_at"),
     )
 
     def __init__(
@@ -60,52 +58,37 @@ class Practice(Stateful):
         set_shares: Callable[[Sequence[float]], None] | None = None,
         *,
         goal: bool = True,
-        logged: Mapping[str, float] | None = None,
-        reference: Mapping[str, float] | None = None,
     ) -> None:
-        """`logged` are the kinds' shares of the logs' episodes; `goal`: success is defined.
-
-        `reference` is the success by arm of whom regret is against.
-        """
+        """`goal`: success is defined."""
         self.config, self._set = config, set_shares
         # Where nothing is chosen, ordered missions count as what they are.
         self.arms = unordered(arms) if config.rule == "natural" else list(arms)
         count = len(self.arms)
         self.names = [arm.name for arm in self.arms]
         self.natural: F64 = np.array([arm.share for arm in self.arms])
-        self.floors = self._resolved_floors()
-        if config.rule in MOVING and not goal:
+        self.floor = self._resolved_floor()
+        if config.rule == "success" and not goal:
             raise ConfigError(
-                f'the rule "{config.rule}" needs success, but the task has no goal',
+                'the rule "success" needs success, but the task has no goal',
                 where=f"{WHERE}.rule",
-                remedy='use "even" or "shares"',
+                remedy='use "even"',
             )
         self._episodes, self._failures = np.zeros(count), np.zeros(count)  # fading
         self._seen: Ints = np.zeros(count, np.int64)  # ended so far
         self._interval_episodes: Ints = np.zeros(count, np.int64)
         self._interval_successes: Ints = np.zeros(count, np.int64)
         self._closed_at = 0  # environment steps
-        self.reference: F64 = np.full(count, np.nan)
-        if reference is not None:
-            self.reference = np.array([reference[name] for name in self.names])
-        self._fixed = self._fixed_weights(logged)
+        self._fixed = self._fixed_weights()
         self.shares: F64 = (
-            self.natural if config.rule == "natural" else with_floors(self.weights, self.floors)
+            self.natural if config.rule == "natural" else with_floor(self.weights, self.floor)
         )
         self._tell()
 
     @classmethod
     def of(
-        cls,
-        config: PracticeConfig,
-        env: Twin,
-        conditions: Mapping[str, float],
-        logs: Logs | None,
-        *,
-        goal: bool,
-        reference: Mapping[str, float] | None = None,
+        cls, config: PracticeConfig, env: Twin, conditions: Mapping[str, float], *, goal: bool
     ) -> Practice:
-        """For a twin, of `conditions` (`env.conditions`); a restored one has its `reference`.
+        """Make the practice of a twin with `conditions` (`env.conditions`).
 
         Raises:
             ConfigError: the twin cannot be given shares, or as the class.
@@ -115,16 +98,11 @@ class Practice(Stateful):
             for kind, share in conditions.items()
             if share
         ]
-        logged = None
-        if logs is not None:
-            logged = logged_shares(logs.condition, logs.episode, [arm.kind for arm in kinds])
         if isinstance(env, ArmedTwin):
-            arms = list(env.mission_arms(config.by))
-            tell = env.set_mission_shares
-            return cls(config, arms, tell, goal=goal, logged=logged, reference=reference)
+            return cls(config, list(env.mission_arms(config.by)), env.set_mission_shares, goal=goal)
         if isinstance(env, KindsTwin):
             tell = partial(_set_kinds, env, [arm.kind for arm in kinds])
-            return cls(config, kinds, tell, goal=goal, logged=logged, reference=reference)
+            return cls(config, kinds, tell, goal=goal)
         if config.rule != "natural":
             raise ConfigError(
                 f'the rule "{config.rule}" chooses missions, and {type(env).__name__} cannot be'
@@ -132,13 +110,13 @@ class Practice(Stateful):
                 where=f"{WHERE}.rule",
                 remedy='give it `set_conditions(shares)`, or use "natural"',
             )
-        return cls(config, kinds, goal=goal, logged=logged)
+        return cls(config, kinds, goal=goal)
 
     # -- what happens ---------------------------------------------------------------------------
 
     def note(self, episodes: Sequence[EndedEpisode]) -> None:
         """Count ended missions."""
-        fades = 0.5 ** (1 / self.config.half_life_episodes)
+        fades = 0.5 ** (1 / HALF_LIFE_EPISODES)
         for episode in episodes:
             place = self._place(episode)
             if place is None:
@@ -151,7 +129,7 @@ class Practice(Stateful):
             self._interval_successes[place] += success
 
     def advance(self, steps: Mapping[str, int], *, last: bool = False) -> list[dict[str, Any]]:
-        """At the end of an interval, its rows for the run's `practice`; the next one's shares.
+        """Return an interval's rows of the run's `practice` at its end, and set the next shares.
 
         Call while no step of the twin is out. `last`: the run ends here, in whatever interval.
         """
@@ -162,33 +140,26 @@ class Practice(Stateful):
         rows = [{**steps, **row} for row in self._rows()]
         self._closed_at = env_steps
         self._interval_episodes[:] = self._interval_successes[:] = 0
-        if self.config.rule in MOVING and not last:
-            self.shares = moved(
-                self.shares, with_floors(self.weights, self.floors), self.config.max_change
-            )
+        if self._fixed is None and not last:
+            self.shares = moved(self.shares, with_floor(self.weights, self.floor), MAX_CHANGE)
             self._tell()
         return rows
 
     @property
     def weights(self) -> F64:
-        """(K,) what the rule goes by, before floors: above 0 somewhere."""
-        if self._fixed is not None:
-            return self._fixed
-        if self.config.rule == "success":
-            return self.failure_rate
-        regret = np.maximum(self.reference - (1 - self.failure_rate), 0.0)
-        return regret if regret.any() else np.ones(len(self.arms))
+        """Weights of the arms by the rule, before the floor, (K,): above 0 somewhere."""
+        return self.failure_rate if self._fixed is None else self._fixed
 
     @property
     def believed(self) -> Bools:
-        """(K,) whether an arm has ended often enough."""
+        """Whether each arm has ended often enough, (K,)."""
         return self._seen >= self.config.warmup_episodes
 
     @property
     def failure_rate(self) -> F64:
-        """(K,) of an arm's fading episodes, with half a failure more in one more (Jeffreys).
+        """Failure rate of each arm's fading episodes, with Jeffreys' prior, (K,).
 
-        That of its kind where it has too few; 1 where the kind has.
+        That of its kind if it has too few episodes; 1 if the kind has too few.
         """
         kinds = np.unique([arm.kind for arm in self.arms], return_inverse=True)[1]
 
@@ -200,25 +171,16 @@ class Practice(Stateful):
         rate = np.where(known, (failures + 0.5) / (episodes + 1), 1.0)
         return np.where(self.believed, (self._failures + 0.5) / (self._episodes + 1), rate)
 
-    def check_reference(self) -> None:
-        """Raises ConfigError where regret is against nobody."""
-        if self.config.rule == "regret" and np.isnan(self.reference).any():
-            raise ConfigError(
-                'the rule "regret" needs the success of a reference driver on each arm',
-                where=f"{WHERE}.rule",
-                remedy='train with Restock\'s own twin, which measures it, or use "success"',
-            )
-
     def restored(self) -> None:
-        """The twin draws by the shares of then; another rule than then goes by its own."""
+        """Give the twin the restored shares; those of a fixed rule are computed again."""
         if self.config.rule == "natural":
             self.shares = self.natural
         elif self._fixed is not None:
-            self.shares = with_floors(self._fixed, self.floors)
+            self.shares = with_floor(self._fixed, self.floor)
         self._tell()
 
     def mismatch(self, name: str, value: Any) -> Exception:
-        """The run practised other arms."""
+        """Return the error for a run that practised other arms."""
         return RunError(
             f"practised {', '.join(map(str, value or ()))}; now there are {', '.join(self.names)}",
             where=WHERE,
@@ -245,9 +207,6 @@ class Practice(Stateful):
                 if self._interval_episodes[place]
                 else None,
                 "success_rate": 1 - float(rate[place]) if self.believed[place] else None,
-                "reference": None
-                if np.isnan(self.reference[place])
-                else float(self.reference[place]),
                 "weight": float(weights[place]),
                 "total_episodes": int(self._seen[place]),
             }
@@ -255,7 +214,7 @@ class Practice(Stateful):
         ]
 
     def _place(self, episode: EndedEpisode) -> int | None:
-        """Which arm an episode was of; None where of none."""
+        """Return the number of an episode's arm; None if it belongs to none."""
         if episode.arm >= 0:
             return episode.arm
         values = json.loads(episode.perturbation_values)
@@ -266,74 +225,87 @@ class Practice(Stateful):
 
     # -- the rule -------------------------------------------------------------------------------
 
-    def _fixed_weights(self, logged: Mapping[str, float] | None) -> F64 | None:
-        """Of a rule whose weights do not change; None of one whose do."""
-        config = self.config
-        if config.rule == "natural":
+    def _fixed_weights(self) -> F64 | None:
+        """Return the weights of a rule that never changes them, (K,); None for "success"."""
+        rule = self.config.rule
+        if rule == "natural":
             return self.natural
-        if config.rule == "even":
+        if rule == "even":
             return np.ones(len(self.arms))
-        if config.rule == "shares":
-            return self._by_name(config.shares, "shares")
-        if config.rule == "missions":
-            weights = np.where([arm.order >= 0 for arm in self.arms], self.natural, 0.0)
-            if not weights.any():
-                raise ConfigError(
-                    'the rule "missions" practises the missions of a file, but none is given',
-                    where=f"{WHERE}.rule",
-                    remedy="give env.missions a file of `restock coverage gaps --missions-out`",
-                )
-            return weights
-        if config.rule == "logs":
-            if not logged:
-                raise ConfigError(
-                    'the rule "logs" practises with the shares of the logs, but this run has no '
-                    "logs"
-                    " of the kinds that the twin has",
-                    where=f"{WHERE}.rule",
-                    remedy="give --panel, or use another rule",
-                )
-            return self._by_name(logged, "the logs' shares")
-        return None
-
-    def _by_name(self, given: Mapping[str, float], key: str) -> F64:
-        """(K,) values of arms or of whole kinds, split among a kind's arms as they are natural."""
-        found = np.zeros(len(self.arms))
-        for name, value in given.items():
-            if name in self.names:
-                found[self.names.index(name)] += value
-                continue
-            of_kind = np.array([arm.kind == name and arm.order < 0 for arm in self.arms])
-            if not of_kind.any():
-                raise ConfigError(
-                    f"{name!r} is not a kind of missions that this run can practise",
-                    where=f"{WHERE}.{key}",
-                    remedy=f"choose from {', '.join(self._known())}",
-                )
-            parts = np.where(of_kind, self.natural, 0.0)
-            found += value * parts / parts.sum()
-        return found
-
-    def _known(self) -> list[str]:
-        """The names that shares and floors may give: kinds, then arms."""
-        return list(dict.fromkeys([*(a.kind for a in self.arms if a.order < 0), *self.names]))
-
-    def _resolved_floors(self) -> F64:
-        config = self.config
-        least = config.floor
-        if least is None:
-            least = FLOOR if config.rule in MOVING else 0.0
-            # Many arms (floors, orders) leave less for each: half is always free to move.
-            least = min(least, 0.5 / max(len(self.arms), 1))
-        given = self._by_name(config.floors, "floors")
-        floors: F64 = np.maximum(np.full(len(self.arms), least), given)
-        if floors.sum() > 1 + 1e-9:
+        if rule == "success":
+            return None
+        weights = np.where([arm.order >= 0 for arm in self.arms], self.natural, 0.0)
+        if not weights.any():
             raise ConfigError(
-                f"the floors of {len(self.arms)} arms sum to {floors.sum():.3g}, above 1",
-                where=f"{WHERE}.floor",
-                remedy=f"give at most {1 / len(self.arms):.3g} where all have the same",
+                'the rule "missions" practises the missions of a file, but none is given',
+                where=f"{WHERE}.rule",
+                remedy="give env.missions a file of `restock coverage gaps --missions-out`",
             )
-        return floors
+        return weights
+
+    def _resolved_floor(self) -> float:
+        config, count = self.config, len(self.arms)
+        if config.floor is None:
+            # Many arms (floors, orders) leave less for each: half is always free to move.
+            least = FLOOR if config.rule == "success" else 0.0
+            return min(least, 0.5 / max(count, 1))
+        if count * config.floor > 1 + 1e-9:
+            raise ConfigError(
+                f"the floors of {count} arms sum to {count * config.floor:.3g}, above 1",
+                where=f"{WHERE}.floor",
+                remedy=f"give at most {1 / count:.3g}",
+            )
+        return config.floor
+
+
+def with_floor(weights: F64, floor: float) -> F64:
+    """Return shares (K,) in proportion to weights, none below `floor`; they sum to 1.
+
+    Those that would be below it get it, the others share the rest, evenly if they have no weight.
+    `floor` is at most 1 / K, `weights` sum to more than 0.
+    """
+    held = np.zeros(len(weights), np.bool_)
+    shares: F64 = np.full(len(weights), floor)
+    while not held.all():
+        rest = max(1.0 - floor * int(held.sum()), 0.0)
+        weight = np.where(held, 0.0, weights)
+        if not weight.sum() > 0:
+            weight = (~held).astype(np.float64)
+        part = rest * weight / weight.sum()
+        below = ~held & (part < floor)
+        if not below.any():
+            shares = np.where(held, floor, part)
+            break
+        held |= below
+    whole: F64 = shares / shares.sum()
+    return whole
+
+
+def moved(shares: F64, wanted: F64, most: float) -> F64:
+    """Move shares toward those wanted, no share by more than `most`; they still sum to 1.
+
+    All go the same part of their way, so what holds for both (a floor, a sum) holds for the result.
+    """
+    farthest = float(np.abs(wanted - shares).max())
+    part = 1.0 if farthest <= most else most / farthest
+    return np.add(shares, part * (wanted - shares))
+
+
+def unordered(arms: Sequence[MissionArm]) -> list[MissionArm]:
+    """Return the arms without those of orders, whose shares go to their kinds' own."""
+    own = [arm for arm in arms if arm.order < 0]
+    for order in (arm for arm in arms if arm.order >= 0):
+        total = sum(arm.share for arm in own if arm.kind == order.kind)
+        if not total:
+            own.append(MissionArm(order.kind, order.kind, order.share))
+            continue
+        own = [
+            replace(arm, share=arm.share * (1 + order.share / total))
+            if arm.kind == order.kind
+            else arm
+            for arm in own
+        ]
+    return own
 
 
 def _set_kinds(env: KindsTwin, kinds: Sequence[str], shares: Sequence[float]) -> None:

@@ -287,7 +287,7 @@ TABLES: dict[str, pa.Schema] = {
     "practice": _schema(
         "one interval of practice x arm: the missions that the twin should give, and gave",
         *_STEPS,
-        ("rule", _S, "natural | even | shares | logs | missions | success | regret"),
+        ("rule", _S, "natural | even | missions | success"),
         ("arm", _S, "kind of missions, with its block, floor or part of a range"),
         ("condition", _S, "kind of episode of the arm"),
         ("natural_share", _F, "share of the missions by `env`"),
@@ -300,7 +300,6 @@ TABLES: dict[str, pa.Schema] = {
             _F,
             "success over episodes, with decreasing weights of older ones; null: too few",
         ),
-        ("reference", _F, "success of the reference driver for the regret; null with other rules"),
         (
             "weight",
             _F,
