@@ -29,8 +29,9 @@ from harness import finish, option_parser
 
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import parse_config
+from restock.train.feed.training_twin import make_twin
 from restock.train.loop import TrainingInterrupted, train
-from restock.train.prepare import make_twin, prepare_new
+from restock.train.prepare import prepare_new
 
 ENVS, BATCH, WARMUP, UPDATES_PER_STEP = 16, 128, 1_600, 0.125
 TARGET = 2.0  # times its environment steps a second on the same vector environment, at least

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
+import numpy as np
 from torch import Tensor
 
+from restock.arrays import Bools
 from restock.errors import ExitCode, RestockError
 from restock.interrupts import interrupts_raised
 from restock.train.dqn.algorithm import Loss
@@ -30,11 +32,11 @@ from restock.train.evaluation.policies import GreedyPolicy
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.probe import Probe
 from restock.train.feed.teacher import TeacherFailed
-from restock.train.finite import check_loss, check_parameters
+from restock.train.feed.update_blocks import Made
+from restock.train.run.not_finite import LEAVE_OUT, TRAIN_SLOWER, refuse
 from restock.train.run.run import resuming
 from restock.train.session import Interval, Session
 from restock.train.twin.env.interface import epsilon_greedy
-from restock.train.update_blocks import Made
 
 _OFFLINE_BLOCK = 64  # updates between two looks at the clock and at Ctrl-C
 # Of a budget in seconds, what may have passed when the teacher's rows are cloned, and when the
@@ -296,7 +298,7 @@ def _note(
         steps["gradient_steps"], steps["env_steps"], batch, loss, last_sync, tail=tail
     )
     value = float(loss.value.detach())
-    check_loss(session, batch, loss, value, phase)
+    _check_loss(session, batch, loss, value, phase)
     session.batches.learnt(batch, loss.td)
     interval.updates += 1
     interval.loss += value
@@ -329,7 +331,7 @@ def _conservative_weight(session: Session, phase: str) -> float:
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     """One row of `progress`, with the feed's sums and the probe's measures."""
-    check_parameters(session)
+    _check_parameters(session)
     progress, learner, interval = session.progress, session.learner, session.interval
     means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
     if session.probe is None and phase == "online":
@@ -421,7 +423,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
 
     Without a twin nothing drives: what is learnt by now is kept.
     """
-    check_parameters(session)
+    _check_parameters(session)
     if not session.config.env.twin:
         session.progress.evaluated_at = session.progress.env_steps
         session.save_best(Score({}, 0.0, 0.0))
@@ -456,7 +458,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
 
 
 def _save(session: Session) -> None:
-    check_parameters(session)
+    _check_parameters(session)
     session.save()
 
 
@@ -501,3 +503,48 @@ def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
             where=str(session.run.path),
             remedy=f"continue with {resuming(session.run.path)}",
         )
+
+
+def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, phase: str) -> None:
+    """Check the update just made, whose batch `session.feed` has kept.
+
+    Raises:
+        NotFinite: `value`, its loss, is not finite; names the rows.
+    """
+    if math.isfinite(value):
+        return
+    bad_rows = ~np.isfinite(batch.rows.cpu().numpy()).all(axis=1)
+    td = loss.td.cpu().numpy()
+    bad = bad_rows | ~np.isfinite(td)
+    if not bad.any():  # finite one by one, and too large together
+        bad = np.abs(td) == np.abs(td).max()
+    what = f"the loss is {value} ({phase})"
+    if bad_rows.any():
+        _stop_not_finite(session, what, bad_rows, "hold values that are not finite", LEAVE_OUT)
+    if bad.all():
+        why = "have such TD errors, after an update that left no parameter whole"
+        _stop_not_finite(session, what, bad, why, TRAIN_SLOWER, before=True)
+    _stop_not_finite(session, what, bad, "have such TD errors, or the largest", TRAIN_SLOWER)
+
+
+def _check_parameters(session: Session) -> None:
+    """Check the parameters before they are recorded, evaluated or kept.
+
+    Raises:
+        NotFinite: one is not finite; names the rows of the last batch.
+    """
+    if session.learner.is_finite:
+        return
+    everything = np.ones(len(session.feed.last_batch()), np.bool_)
+    what = "the gradient was not finite, and with it the network's parameters"
+    _stop_not_finite(session, what, everything, "gave it", TRAIN_SLOWER)
+
+
+def _stop_not_finite(
+    session: Session, what: str, bad: Bools, why: str, remedy: str, *, before: bool = False
+) -> NoReturn:
+    """Leave the run's tables whole, write down the rows, and raise."""
+    session.write_held()
+    rows_before = session.feed.last_batch(before=True) if before else []
+    rows, path = session.feed.last_batch(), session.run.path
+    refuse(what, bad, why, remedy, rows, path, session.steps, rows_before)

@@ -27,24 +27,25 @@ from restock.train.dqn.kernel import update_path
 from restock.train.dqn.learner import open_device
 from restock.train.dqn.target import describe
 from restock.train.evaluation.evaluate import evaluation_time_s
-from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.fresh_strata import FreshStrata
+from restock.train.evaluation.logged_ways import ways_to_evaluate
+from restock.train.feed.collector import FreshStrata, conditions_in_twin
 from restock.train.feed.imitation import refuse_nothing_to_learn
 from restock.train.feed.logs import Logs
 from restock.train.feed.teacher import AskedTeacher, Teacher, open_teacher
-from restock.train.finite import STOPPED
-from restock.train.logs_alone import NoTwin, without_twin
+from restock.train.feed.training_twin import check_missions, make_twin
 from restock.train.loop import Notify, TrainResult
-from restock.train.missions import (
-    check_missions,
-    mission_orders,
-    ways_to_evaluate,
+from restock.train.resolve import (
+    check_new_run,
+    mirrors,
+    planned_draws,
+    resolve_config,
+    resolve_ring_capacity,
+    resolve_teacher,
+    without_twin,
 )
-from restock.train.new_run import check_new_run
-from restock.train.resolve import mirrors, planned_draws, resolve_config, resolve_teacher
-from restock.train.ring_capacity import resolve_ring_capacity
 from restock.train.run.checkpoint import check_earlier, go_back
 from restock.train.run.fed_panel import run_panel
+from restock.train.run.not_finite import STOPPED
 from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
 from restock.train.run.run_lock import RunLock
 from restock.train.run.run_profile import (
@@ -60,7 +61,6 @@ from restock.train.twin.env.interface import Twin
 from restock.train.twin.floors.floors import layouts_of_split, open_floors
 from restock.train.twin.missions.registry import KINDS
 from restock.train.twin.physics.episode import EpisodeSpec
-from restock.train.twin.physics.perturbation import find_perturbation
 
 _EVALUATION_ENVS = 16
 
@@ -344,35 +344,6 @@ def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
             remedy=f"use --set loss.discount={panel.discount}, or mix with that discount",
         )
     return panel
-
-
-def make_twin(
-    config: TrainConfig,
-    profile: Profile,
-    num_envs: int,
-    nthread: int = 1,
-    layouts: str | None = None,
-) -> Twin:
-    """The warehouse, as training uses it; on other floors where `layouts` names them."""
-    if not config.env.twin:
-        return NoTwin(profile.task)
-    from restock.train.twin.env.vector_env import WarehouseVectorEnv
-
-    twin: Twin = WarehouseVectorEnv(
-        num_envs,
-        perturbation=find_perturbation(config.env.perturbation, where="env.perturbation"),
-        conditions=config.env.conditions,
-        seed=config.seed,
-        nthread=nthread,
-        task=profile.task,
-        robot=profile.robot,
-        layouts=layouts or config.env.layouts,
-        # Evaluation has its own floors and fixed episodes.
-        missions=() if layouts is not None else mission_orders(config),
-        missions_share=config.env.missions_share,
-        nav_command=profile.inputs.nav_command is not None,
-    )
-    return twin
 
 
 def rows_by_policy(panel: Panel) -> Counter[str]:

@@ -1,17 +1,32 @@
-"""What a config leaves open, settled by the panel and the profile before a run begins."""
+"""Settle what a config leaves open, by panel and profile, and refuse what cannot be trained.
+
+Refused before anything is written: settings that name what the panel does not have, settings
+without effect, and a run that the machine's memory cannot hold.
+"""
 
 from __future__ import annotations
 
+import os
+from dataclasses import asdict
+from itertools import pairwise
+from typing import Any
+
 import msgspec
+import numpy as np
 
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import Profile
 from restock.ingest.task.task import Mirror, Task
+from restock.replay.mixture.packed_row import row_width
 from restock.replay.panel.panel import Panel
+from restock.replay.ring.ring import META
 from restock.replay.sampling.share_controller import PlannedDraws
+from restock.replay.store.capacity import capacity_of_rows
+from restock.toml import changed
 from restock.train.dqn.config import TeacherConfig, TrainConfig, refuse_untaught
 from restock.train.feed.imitation import cloned
-from restock.train.missions import mission_orders
+from restock.train.feed.logs import check_terms
+from restock.train.feed.training_twin import mission_orders
 from restock.train.twin.env.interface import AFTER_LOGS
 from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturbation
 
@@ -112,3 +127,133 @@ def mirrors(teacher: TeacherConfig, task: Task) -> bool:
             "table",
         ) from error
     return teacher.mirror is True or teacher.source == "operator"
+
+
+MAX_BYTES = 2 << 30  # of a ring that "auto" chooses
+_SLOT_BYTES = 18  # of a row's stratum, its place there, and its age
+
+
+def resolve_ring_capacity(
+    config: TrainConfig, panel: Panel | None
+) -> tuple[TrainConfig, dict[str, Any] | None]:
+    """The config with a number of rows, and what `config.json` says of how it was chosen.
+
+    Raises:
+        ConfigError: it is to be chosen, and there is no panel to choose it by.
+    """
+    if config.replay.ring_capacity != "auto":
+        return config, None
+    if panel is None:
+        raise ConfigError(
+            'replay.ring_capacity = "auto" is chosen from the rows of a panel, but there is none',
+            remedy="give --panel, or a number of rows",
+        )
+    capacity = capacity_of_rows(panel.meta)
+    rows, reason = capacity.recommended, capacity.reason
+    least = max(config.replay.batch_size, config.env.num_envs * config.loss.n_step)
+    most = MAX_BYTES // row_bytes(panel.observation_size)
+    if rows < least:
+        rows, reason = least, f"{reason}; a batch and the environments' steps need {least:,}"
+    if rows > most:
+        rows, reason = most, f"{reason}; {MAX_BYTES >> 30} GiB hold {most:,}"
+    replay = msgspec.structs.replace(config.replay, ring_capacity=rows)
+    chosen = {"asked": "auto", "ring_rows": rows, "reason": reason, **asdict(capacity)}
+    return msgspec.structs.replace(config, replay=replay), chosen
+
+
+def row_bytes(observation_size: int) -> int:
+    """What one row of a ring takes."""
+    meta = sum(np.dtype(kind).itemsize for kind in META.values())
+    return row_width(observation_size) * 4 + meta + _SLOT_BYTES
+
+
+_NATURAL = ("floor", "warmup_episodes")
+_CRITICS = 6  # copies of the network: online, target, averaged, a gradient, Adam's two
+_BEHAVIOURS = 4  # online, a gradient, Adam's two
+
+
+def check_new_run(config: TrainConfig, task: Task, panel: Panel | None) -> None:
+    """Refuse what would fail, or have no effect, once the run has begun.
+
+    Raises:
+        ConfigError: as the module says; names the setting.
+    """
+    _refuse_no_effect(config)
+    check_terms(config.loss, panel)
+    _refuse_too_large(config, task)
+
+
+def _refuse_no_effect(config: TrainConfig) -> None:
+    practice = config.practice
+    if practice.rule == "natural" and (keys := changed(practice, _NATURAL)):
+        raise ConfigError(
+            f'has no effect under the rule "{practice.rule}"',
+            where=f"practice.{keys[0]}",
+            remedy="leave it out, or set practice.rule",
+        )
+    if config.env.missions is None and changed(config.env, ("missions_share",)):
+        raise ConfigError(
+            "has no effect without missions",
+            where="env.missions_share",
+            remedy="leave it out, or name a missions file with env.missions",
+        )
+
+
+def _refuse_too_large(config: TrainConfig, task: Task) -> None:
+    """Raises ConfigError where the run's largest arrays exceed the machine's memory."""
+    critic = _parameters(task.observation_size, config.network.hidden, len(task.actions))
+    behaviour = _parameters(task.observation_size, config.teacher.hidden, len(task.actions))
+    taken = {
+        "replay.ring_capacity": config.replay.ring_rows * row_bytes(task.observation_size),
+        "network.hidden": 4 * _CRITICS * critic,
+        "teacher.hidden": 4 * _BEHAVIOURS * behaviour if config.teacher.filters else 0,
+    }
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    needed, largest = sum(taken.values()), max(taken, key=taken.__getitem__)
+    if needed > memory:
+        raise ConfigError(
+            f"the run needs at least {needed / 1e9:,.1f} GB of memory, {taken[largest] / 1e9:,.1f}"
+            f" of them for {largest}; this machine has {memory / 1e9:,.1f}",
+            where=largest,
+            remedy="give less",
+        )
+
+
+def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
+    return sum((a + 1) * b for a, b in pairwise((inputs, *hidden, outputs)))
+
+
+def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
+    """The config of a run whose `env.twin` is false: no environment step, nobody in the twin asked.
+
+    Raises:
+        ConfigError: it has no panel, or something of it needs a twin.
+    """
+    where = "env.twin"
+    if panel is None:
+        raise ConfigError(
+            "false means learning from the logs alone, but there is no panel",
+            where=where,
+            remedy="give --panel",
+        )
+    if config.teacher.source not in (None, "logs", "none"):
+        raise ConfigError(
+            f"false, but the teacher {config.teacher.source!r} needs the twin",
+            where=where,
+            remedy='use teacher.source = "logs" or "none"',
+        )
+    teacher = config.teacher
+    if teacher.source is None:
+        teacher = msgspec.structs.replace(teacher, source="none")
+    schedule = msgspec.structs.replace(config.schedule, env_steps=0)
+    env = msgspec.structs.replace(config.env, overlap=False)
+    practice = msgspec.structs.replace(config.practice, rule="natural")
+    return msgspec.structs.replace(
+        config, teacher=teacher, schedule=schedule, env=env, practice=practice
+    )
+
+
+__all__ = [
+    "check_new_run",
+    "resolve_ring_capacity",
+]

@@ -59,14 +59,15 @@ MAY_IMPORT = {
     ),
     "train": (
         "dqn evaluation evaluation/off_policy feed run twin/missions twin/env twin/floors"
-        " twin/physics replay/fleet replay/mixture replay/panel replay/ring replay/sampling"
-        " replay/store ingest/profile ingest/store ingest/task"
+        " twin/physics replay/mixture replay/panel replay/ring replay/sampling"
+        " replay/store ingest/profile ingest/task"
     ),
     "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
     "train/run": "replay replay/panel ingest/profile ingest/task",
     "train/feed": (
-        "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel replay/ring"
-        " replay/plan replay/sampling ingest/task"
+        "dqn run twin/drivers twin/env twin/floors replay/mixture replay/panel"
+        " replay/ring replay/plan replay/sampling ingest/task ingest/profile ingest/store"
+        " replay/fleet twin/physics"
     ),
     "train/evaluation/off_policy": "dqn replay/panel replay/store ingest/store ingest/task",
     "train/evaluation": (
@@ -125,9 +126,10 @@ MAY_IMPORT = {
         " train/comparison train/twin/missions"
     ),
     "cli/learning": (
-        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/store"
-        " replay/trace train train/comparison train/diagnosis train/dqn train/evaluation train/run"
-        " train/study train/twin/calibration train/twin/floors train/twin/physics train/view"
+        "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"
+        " train train/comparison train/diagnosis train/dqn train/evaluation train/run"
+        " train/study train/twin/floors train/twin/physics train/view ingest/task"
+        " replay/panel train/feed train/twin/env replay/store train/twin/calibration"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"

@@ -11,6 +11,7 @@ import pytest
 from support.stores import recording_transitions, write_store
 
 from restock import cli
+from restock.cli.learning.describe_run import describe_run
 from restock.errors import ArgumentError, ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
@@ -18,8 +19,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.capacity import capacity_of_rows, recommend_capacity
 from restock.replay.store.store import Store
-from restock.train import ring_capacity
-from restock.train.describe import describe_run
+from restock.train import resolve
 from restock.train.prepare import prepare_new
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
@@ -138,8 +138,8 @@ def test_a_run_takes_the_number_and_says_why(panel: Panel, tmp_path: Path) -> No
 def test_a_ring_that_is_chosen_stays_in_memory(
     panel: Panel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    size = ring_capacity.row_bytes(panel.observation_size)
-    monkeypatch.setattr(ring_capacity, "MAX_BYTES", 40 * size)
+    size = resolve.row_bytes(panel.observation_size)
+    monkeypatch.setattr(resolve, "MAX_BYTES", 40 * size)
     auto = ["replay.ring_capacity=auto", "replay.batch_size=8", "env.num_envs=2"]
     prepared = prepare_new(tmp_path / "run", panel.path, None, auto)
     assert prepared.config.replay.ring_rows == 40

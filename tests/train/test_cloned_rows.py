@@ -12,6 +12,7 @@ import pytest
 from support.paths import ROOT
 from support.toy_run import config, logs, session
 
+from restock.cli.learning.describe_run import describe_run
 from restock.errors import ConfigError
 from restock.ingest.pipeline import ingest
 from restock.ingest.profile.profile import load_profile
@@ -20,7 +21,6 @@ from restock.replay.mixture.mixture import load_mixture
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
-from restock.train.describe import describe_run
 from restock.train.dqn.config import TeacherConfig
 from restock.train.feed.imitation import cloned, of_policies, of_successes
 from restock.train.feed.logs import Coded

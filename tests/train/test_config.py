@@ -14,7 +14,8 @@ from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.train.dqn.config import TrainConfig, load_config, parse_config
 from restock.train.dqn.target import Hard, Polyak
-from restock.train.prepare import make_twin, prepare_new
+from restock.train.feed.training_twin import make_twin
+from restock.train.prepare import prepare_new
 
 
 def test_the_config_refuses_unknown_keys_with_their_path() -> None:

@@ -17,6 +17,7 @@ from support.toy_twin import CONDITIONS as TOY_CONDITIONS
 from support.toy_twin import TASK as TOY_TASK
 
 from restock.cli.data.mix import TRAINING
+from restock.cli.learning.describe_run import describe_forecast
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import held
 from restock.replay.mixture.mixture import parse_mixture
@@ -24,9 +25,8 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.audit import load_audits, load_thresholds
-from restock.train.describe import describe_forecast
 from restock.train.dqn.config import TrainConfig
-from restock.train.feed.fresh_strata import FreshStrata
+from restock.train.feed.collector import FreshStrata
 from restock.train.feed.logs import Logs
 from restock.train.loop import TrainingInterrupted, time_left, train
 from restock.train.prepare import refuse_short_budget

@@ -17,9 +17,9 @@ from support.long import one_in
 from support.toy_run import SMALL, assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, CONDITIONS, TASK, ToyTwin
 
+from restock.cli.learning.describe_run import no_update
 from restock.errors import ConfigError, RunError
 from restock.ingest.task.conditions import Condition
-from restock.train.describe import no_update
 from restock.train.dqn.learner import Learner
 from restock.train.evaluation.evaluate import EpisodeResult, fixed_episodes
 from restock.train.evaluation.evaluation_buffer import EvaluationBuffer

@@ -17,10 +17,10 @@ from support.toy_run import assert_same_run, config, session
 from support.toy_twin import ToyTwin
 
 from restock.cli import main
+from restock.cli.learning.describe_run import unmoved
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
 from restock.train.comparison.arms import differences
-from restock.train.describe import unmoved
 from restock.train.dqn.config import PracticeConfig, load_config, parse_config
 from restock.train.feed import practice as practice_module
 from restock.train.feed.collector import EndedEpisode

@@ -19,6 +19,7 @@ from support.toy_run import assert_same_run, config, logs, run_to_end, session
 from support.toy_twin import CELLS, TASK
 from torch import Tensor, tensor
 
+from restock.cli.learning.describe_run import describe_run
 from restock.errors import ConfigError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.task.task import Mirror
@@ -28,7 +29,6 @@ from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import Facts
 from restock.state import restored, saved
 from restock.train.comparison.arms import differences
-from restock.train.describe import describe_run
 from restock.train.dqn.algorithm import td_target
 from restock.train.dqn.behaviour import (
     UNKNOWN,

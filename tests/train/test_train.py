@@ -22,11 +22,11 @@ from support.stores import recording_transitions
 
 import restock
 from restock.cli import main
+from restock.cli.learning.describe_run import describe_run
 from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.replay.mixture.mixture import parse_mixture
 from restock.replay.panel.build import build_panel
-from restock.train.describe import describe_run
 from restock.train.dqn.config import ScheduleConfig, TrainConfig
 from restock.train.evaluation.regression import compare_with_baseline, regressed
 from restock.train.prepare import prepare_new

@@ -18,9 +18,9 @@ from restock.cli.failures import as_restock_error
 from restock.errors import MixtureError
 from restock.replay.ring.ring import FreshRing
 from restock.train.feed.logs import Logs
+from restock.train.feed.update_blocks import LONGEST, DeviceTable, UpdateBlocks
 from restock.train.loop import train
 from restock.train.session import Session
-from restock.train.update_blocks import LONGEST, DeviceTable, UpdateBlocks
 
 OFFLINE = {"env_steps": 0, "offline_updates": 3 * LONGEST + 5}
 # What the policy would do in audited rows is asked at the end of a block.

@@ -22,9 +22,9 @@ from scipy.sparse import csgraph
 
 import restock  # noqa: F401 - registers the environment
 from restock.cli import main
+from restock.cli.learning.describe_run import describe_run
 from restock.errors import ConfigError, RunError
 from restock.ingest.profile.profile import load_profile
-from restock.train.describe import describe_run
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.floor_report import describe_floor
 from restock.train.twin.env.navigation import BlockFinder

@@ -22,8 +22,7 @@ from restock.train.dqn.learner import Learner
 from restock.train.dqn.target import value_lag
 from restock.train.evaluation.evaluate import EpisodeResult, run_episodes
 from restock.train.feed.collector import Collector
-from restock.train.feed.log_fidelity import LogFidelity
-from restock.train.feed.probe import Probe
+from restock.train.feed.probe import LogFidelity, Probe
 from restock.train.twin.env.interface import Policy, Step, Twin
 from restock.train.twin.physics.episode import EpisodeSpec
 

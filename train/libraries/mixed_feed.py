@@ -28,9 +28,9 @@ from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
 from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Logs
-from restock.train.finite import NotFinite, check_fed
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.libraries.library_run import PartialTables, create_run, episode_row
+from restock.train.run.not_finite import NotFinite, check_fed
 from restock.train.run.run import Run, check_free, now_ns
 from restock.train.run.run_profile import profile_of_panel
 

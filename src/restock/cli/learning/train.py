@@ -16,7 +16,7 @@ import tyro
 from restock.words import quoted
 
 if TYPE_CHECKING:
-    from restock.train.flush_fresh import Flushed
+    from restock.train.feed.flush_fresh import Flushed
     from restock.train.loop import TrainResult
     from restock.train.prepare import Prepared
 
@@ -69,9 +69,9 @@ class TrainCommand:
     """Print the outcome as JSON."""
 
     def run(self) -> int:
+        from restock.cli.learning.describe_run import describe_run
         from restock.cli.output import print_json, say
         from restock.errors import RestockError
-        from restock.train.describe import describe_run
         from restock.train.dqn.config import apply_overrides, parse_config
         from restock.train.prepare import prepare_new, prepare_resumed
 
@@ -114,11 +114,11 @@ class TrainCommand:
 
 def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
     """Train to the end; then flush the twin's episodes, where a store is given."""
+    from restock.cli.learning.describe_run import describe_run
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter
     from restock.interrupts import went_on_after_interrupt
-    from restock.train.describe import describe_run
-    from restock.train.flush_fresh import flush
+    from restock.train.feed.flush_fresh import flush
     from restock.train.loop import TrainingInterrupted, nothing_to_do, train
     from restock.train.run.run import resuming
 
@@ -236,8 +236,8 @@ def _print(
 ) -> None:
     from dataclasses import asdict
 
+    from restock.cli.learning.describe_run import fed_table, no_update, unmoved
     from restock.cli.output import print_json, print_table, say
-    from restock.train.describe import fed_table, no_update, unmoved
     from restock.train.run.fed_shares import fed_shares, shortfalls
     from restock.train.run.run import Run
 
