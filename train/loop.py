@@ -331,7 +331,7 @@ def _conservative_weight(session: Session, phase: str) -> float:
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:
     """One row of `progress`, with the feed's sums and the probe's measures."""
-    _check_parameters(session)
+    check_parameters(session)
     progress, learner, interval = session.progress, session.learner, session.interval
     means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
     if session.probe is None and phase == "online":
@@ -423,7 +423,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
 
     Without a twin nothing drives: what is learnt by now is kept.
     """
-    _check_parameters(session)
+    check_parameters(session)
     if not session.config.env.twin:
         session.progress.evaluated_at = session.progress.env_steps
         session.save_best(Score({}, 0.0, 0.0))
@@ -458,7 +458,7 @@ def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> Non
 
 
 def _save(session: Session) -> None:
-    _check_parameters(session)
+    check_parameters(session)
     session.save()
 
 
@@ -527,7 +527,7 @@ def _check_loss(session: Session, batch: ReplayBatch, loss: Loss, value: float, 
     _stop_not_finite(session, what, bad, "have such TD errors, or the largest", TRAIN_SLOWER)
 
 
-def _check_parameters(session: Session) -> None:
+def check_parameters(session: Session) -> None:
     """Check the parameters before they are recorded, evaluated or kept.
 
     Raises:

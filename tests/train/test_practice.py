@@ -198,7 +198,7 @@ def test_what_no_arm_can_follow_is_refused(settings: dict[str, Any], message: st
     ("override", "message"),
     [
         ("practice.by=['friction_scale']", "cannot be distinguished by 'friction_scale'"),
-        ("practice.rule='missions'", "env.missions a missions file"),
+        ("practice.rule='missions'", "give env.missions a file"),
         ("practice={rule='success', floor=0.5}", "above 1"),
     ],
 )
