@@ -18,13 +18,17 @@ import numpy as np
 
 from restock.errors import RecordingError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.driven.command_hold import CommandHold, limit_of
-from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.clock_choice import drivable
-from restock.ingest.propose.evidence.commands import Commands, commanded, settled_at_most
+from restock.ingest.propose.evidence.commands import (
+    CommandHold,
+    Commands,
+    commanded,
+    limit_of,
+    settled_at_most,
+)
 from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.gather import Evidence, gather
-from restock.ingest.propose.evidence.goal_choice import GoalChoice
+from restock.ingest.propose.evidence.gather import Evidence, GoalChoice, gather
+from restock.ingest.propose.evidence.robot_choice import DriveEvidence
 from restock.ingest.propose.kinds import RobotTraits, robot_kinds, robot_traits
 from restock.ingest.propose.proposal_lines import profile_lines
 from restock.ingest.propose.propose import (

@@ -6,16 +6,19 @@ import json
 import textwrap
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
-from restock.errors import visible
+from restock.errors import ConfigError, visible
 from restock.ingest.containers.topic_reading import TopicInfo
+from restock.ingest.live.node_topics import with_node_topics
 from restock.ingest.profile.inputs import FALLBACKS
-from restock.ingest.propose.evidence.cameras import camera_lines
+from restock.ingest.profile.profile import parse_profile
+from restock.ingest.propose.evidence.candidates import camera_lines
 from restock.ingest.propose.evidence.clock_choice import ClockChoice
 from restock.ingest.propose.evidence.footprint import Footprint
 from restock.ingest.propose.evidence.gather import Evidence
-from restock.ingest.propose.evidence.motion_choice import fix_lines, fix_noise_lines
+from restock.ingest.propose.evidence.pose_choice import fix_lines, fix_noise_lines
 from restock.ingest.propose.evidence.roles import (
     KINDS,
     LATCHED,
@@ -24,12 +27,57 @@ from restock.ingest.propose.evidence.roles import (
     clouds_alone,
     robots_in,
 )
-from restock.ingest.propose.node_lines import node_lines
 from restock.ingest.propose.task_lines import actions_of, task_lines
 from restock.ingest.propose.trial import Trial
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import unseen
 from restock.ingest.task.signals import Noise
+from restock.toml import toml_value
+
+
+def node_lines(seen: Evidence, lines: Sequence[str]) -> list[str]:
+    """The tables for those of the node's topics that were recorded, besides the proposal's own.
+
+    Args:
+        seen: with the node's topics.
+        lines: the TOML of the proposal so far; where it lacks an input there is nothing to add to.
+    """
+    if not seen.node_topics:
+        return []
+    try:
+        profile = parse_profile("\n".join(lines), where="the proposal")
+    except ConfigError:
+        return []
+    full, heard = with_node_topics(profile), seen.node_topics.items()
+    tables: list[tuple[str, msgspec.Struct]] = [
+        (f"[command_sources.{name}]  # who drives while it is true", source)
+        for name, source in full.command_sources.items()
+        if name not in profile.command_sources and (source.topic, source.type) in heard
+    ]
+    signals = {
+        name: signal
+        for name, signal in full.signals.items()
+        if name not in profile.signals and (signal.topic, signal.type) in heard
+    }
+    tables += [(f"[signals.{name}]", signal) for name, signal in signals.items()]
+    tables += [
+        ("[[condition]]", condition)
+        for condition in full.own_conditions
+        if condition not in profile.own_conditions and "limiter_rule" in signals
+    ]
+    added = [line for header, table in tables for line in [header, *_given(table), ""]]
+    return ["# Published by Restock's node, or for it:", "", *added] if added else []
+
+
+def _given(table: msgspec.Struct) -> list[str]:
+    """The keys of a table that are not at their defaults."""
+    values = msgspec.to_builtins(table)
+    return [
+        f"{one.name} = {toml_value(values[one.encode_name])}"
+        for one in msgspec.structs.fields(table)
+        if values[one.encode_name] not in (one.default, {})
+    ]
+
 
 # The fields of what nothing fills, for a person to name.
 BY_HAND = {"command": ("speed_mps", "yaw_rate_radps"), "pose": ("x_m", "y_m", "yaw_rad")}

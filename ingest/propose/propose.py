@@ -17,8 +17,7 @@ from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.clock_choice import by_log_time
 from restock.ingest.propose.evidence.footprint import UPSIDE_DOWN, Footprint
-from restock.ingest.propose.evidence.gather import Evidence, gather, without_first
-from restock.ingest.propose.evidence.goal_choice import GoalChoice
+from restock.ingest.propose.evidence.gather import Evidence, GoalChoice, gather, without_first
 from restock.ingest.propose.evidence.roles import (
     REQUIRED,
     clouds_alone,
@@ -164,10 +163,6 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
         advice.append(Advice("inputs.scan", clouds))
     if reported := lidar_guess(seen.footprint):
         advice.append(Advice("task.body.lidar_yaw_rad", reported.replace("A GUESS", "a guess")))
-    if others := [topic.name for topic, _ in seen.roles["scan"][1:]]:
-        used = seen.roles["scan"][0][0].name
-        text = f"{used} alone is used: add further lidars by hand ({', '.join(others[:3])}?)"
-        advice.append(Advice("inputs.scan", text))
     if seen.footprint.upside_down and seen.roles["scan"]:
         advice.append(Advice("inputs.scan", UPSIDE_DOWN))
     return Proposal(

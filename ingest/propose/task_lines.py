@@ -11,12 +11,11 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.profile.inputs import Input
 from restock.ingest.profile.signal_paths import pressed_in
 from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, Footprint
+from restock.ingest.propose.evidence.footprint import DESCRIBED, GUESS, TIGHT_PER_WIDTH, Footprint
 from restock.ingest.propose.evidence.gather import Evidence
 from restock.ingest.propose.evidence.lidars import range_lines
-from restock.ingest.propose.evidence.robot_lines import RobotProposal
+from restock.ingest.propose.evidence.robot_choice import RobotProposal
 from restock.ingest.propose.evidence.roles import Roles
-from restock.ingest.propose.evidence.scanned_outline import TIGHT_PER_WIDTH
 from restock.ingest.propose.trial import Trial
 from restock.ingest.steps.needs import field_paths
 from restock.ingest.task.robot import Robot

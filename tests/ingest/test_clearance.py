@@ -142,7 +142,7 @@ def test_only_a_scan_can_be_upside_down() -> None:
 
 
 @pytest.mark.parametrize(
-    ("last", "told"),
+    ("last", "reported"),
     [
         ("", "missing 'angle_increment_rad'"),
         (', angle_max_rad = "angle_max", angle_increment_rad = "b"', "angle_max_rad beside"),

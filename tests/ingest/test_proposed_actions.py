@@ -14,7 +14,7 @@ from support.paths import SHARED
 from restock.cli import main
 from restock.ingest.profile.profile import load_profile, parse_profile
 from restock.ingest.propose.evidence.commands import Commands
-from restock.ingest.propose.evidence.robot_lines import RobotProposal
+from restock.ingest.propose.evidence.robot_choice import RobotProposal
 from restock.ingest.propose.task_lines import actions_of
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task, nearest_action

@@ -16,7 +16,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import parse_profile
 from restock.ingest.propose.evidence.footprint import footprint_of
-from restock.ingest.propose.evidence.robot_lines import propose_robot
+from restock.ingest.propose.evidence.robot_choice import propose_robot
 from restock.ingest.propose.evidence.roles import robots_in
 from restock.ingest.propose.proposal_lines import in_one_recording
 from restock.ingest.propose.propose import propose_profile

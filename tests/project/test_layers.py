@@ -31,13 +31,8 @@ MAY_IMPORT = {
     "ingest/task": "",
     "ingest/urdf": "",
     "ingest/profile": "decoding task",
-    "ingest/propose": (
-        "containers decoding live profile propose/driven propose/evidence steps task urdf"
-    ),
-    "ingest/propose/evidence": (
-        "camera containers decoding live profile propose/driven steps task urdf"
-    ),
-    "ingest/propose/driven": "steps task",
+    "ingest/propose": ("containers decoding live profile propose/evidence steps task urdf"),
+    "ingest/propose/evidence": ("camera containers decoding live profile steps task urdf"),
     "ingest/live": "decoding profile steps task",
     "ingest/steps": "camera containers decoding profile task",
     "ingest/store": "containers decoding profile steps task",

@@ -1,11 +1,23 @@
-"""What the commands of a recording say of its robot: how fast, which way, how long each holds.
+"""What the commands of a recording say: who drives, how fast, how long each holds.
 
-And whether the robot turned by them as a car does.
+A multiplexer's output repeats its inputs: where a topic changes to what another one has just said,
+and not the other way about, it comes after it.
+
+Some drivers stop a robot that hears nothing for half a second; others drive on until they are told
+otherwise. Where commands come seldom that decides the row count, so it is read from the poses: of
+every gap after a command to move, whether the robot still moved when the gap ended, or since when
+it stood. A command to stop holds until the next one whatever the driver does.
+
+And how fast the robot really went where it was commanded to go fastest: a driver scales down or
+cuts off what its wheels cannot do. Commands beyond that are no actions of the robot: a twin that
+obeyed them would not move as the robot did.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,21 +26,264 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.inputs import is_motion
-from restock.ingest.propose.driven.command_hold import (
-    CommandHold,
-    command_hold,
-    limit_of,
-    settled_speeds,
-)
-from restock.ingest.propose.driven.steering import (
+from restock.ingest.propose.evidence.clock_choice import Gaps
+from restock.ingest.propose.evidence.robot_choice import (
     DriveEvidence,
+    RobotProposal,
     drive_evidence,
     shown_wheelbase_m,
 )
-from restock.ingest.propose.evidence.clock_choice import Gaps
-from restock.ingest.propose.evidence.robot_lines import RobotProposal
-from restock.ingest.propose.evidence.roles import Kind, Roles
+from restock.ingest.propose.evidence.roles import BY_HAND, NAVIGATION, Kind, Roles
 from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.signals import wrap_angle
+
+PASSED_WITHIN_S = 0.5
+MIN_PASSED, MIN_SHARE, HALF = 5, 0.02, 0.5  # changes that one topic took over from another
+_STEERED = "wheelbase_m"
+Fit = tuple[TopicInfo, Kind]
+
+
+@dataclass(frozen=True)
+class CommandChoice:
+    """The sources of the command that drives, as TOML; and who drives where no source says."""
+
+    lines: list[str] = field(default_factory=list)
+    policy: str = "unknown"
+    why: str = "the driver, if no topic tells"
+
+    def toml(self, wheelbase_m: float) -> list[str]:
+        """The tables; a source that steers does so about the command's wheelbase."""
+        steered = f"wheelbase_m = {round(wheelbase_m, 4):g}  # as of the command"
+        return [steered if line == _STEERED else line for line in self.lines]
+
+
+@dataclass(frozen=True)
+class _Told:
+    fit: Fit
+    log_time_ns: Ints  # (N,) ascending
+    values: F64  # (N, 2) speed and turn
+
+    def passed_on(self, output: _Told) -> int:
+        """How many changes of `output` are to what this topic said last."""
+        changed = np.flatnonzero((np.diff(output.values, axis=0) != 0).any(axis=1)) + 1
+        at = np.searchsorted(self.log_time_ns, output.log_time_ns[changed], "right") - 1
+        age_s = (output.log_time_ns[changed] - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
+        same = (self.values[np.maximum(at, 0)] == output.values[changed]).all(axis=1)
+        return int((same & (at >= 0) & (age_s <= PASSED_WITHIN_S)).sum())
+
+    @property
+    def changes(self) -> int:
+        return int((np.diff(self.values, axis=0) != 0).any(axis=1).sum())
+
+
+def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[Fit], CommandChoice]:
+    """The topics that may drive, what comes last first; and the sources of the first's commands."""
+    if not fitting:
+        return [], CommandChoice()
+    reported = [one for one in (_read(recording, fit) for fit in fitting) if len(one.values)]
+    if not reported:
+        return list(fitting), CommandChoice()
+    first = reported[0]
+    for _ in reported:  # down a chain of multiplexers
+        later = [one for one in reported if one is not first and _feeds(first, one, HALF)]
+        if not later:
+            break
+        first = max(later, key=first.passed_on)
+    chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
+    sources: dict[str, _Told] = {}
+    inputs = [one for one in reported if one is not first and _feeds(one, first, MIN_SHARE)]
+    for one in sorted(inputs, key=lambda one: -one.passed_on(first)):
+        sources.setdefault(_policy(one.fit[0].name), one)
+    lines = [line for name, one in sources.items() for line in _lines(name, one, first)]
+    named = _policy(first.fit[0].name)
+    if not sources and named in ("teleop", "navigation"):
+        return chosen, CommandChoice(lines, named, f"by the name of {first.fit[0].name}")
+    return chosen, CommandChoice(lines)
+
+
+def _read(recording: Recording, fit: Fit) -> _Told:
+    topic, kind = fit
+    paths = list(kind.fields.values())
+    columns = recording.read({topic.name: paths})[topic.name]
+    values = np.stack([np.asarray(columns.fields[path], np.float64) for path in paths], axis=1)
+    order = np.argsort(columns.log_time_ns, kind="stable")
+    return _Told(fit, columns.log_time_ns[order], values[order])
+
+
+def _age_s(one: _Told) -> float:
+    """Four periods of it."""
+    gaps = np.diff(one.log_time_ns) * 1e-9
+    return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
+
+
+def _feeds(one: _Told, output: _Told, share: float) -> bool:
+    passed = one.passed_on(output)
+    enough = passed >= max(MIN_PASSED, share * output.changes)
+    return enough and passed > output.passed_on(one)
+
+
+def _policy(topic: str) -> str:
+    """Who drives by a topic of this name."""
+    name = topic.lower()
+    if any(word in name for word in BY_HAND):
+        return "teleop"
+    if any(word in name for word in NAVIGATION):
+        return "navigation"
+    parts = [part for part in name.split("/") if part and part not in ("cmd_vel", "input")]
+    return parts[-1][:64] if parts else name
+
+
+def _lines(name: str, one: _Told, output: _Told) -> list[str]:
+    topic, kind = one.fit
+    fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
+    return [
+        f"# {one.passed_on(output):,} of {output.changes:,} changes of {output.fit[0].name} "
+        "follow its last message:",
+        f"[command_sources.{json.dumps(name)}]  # the behaviour policy of rows with its command",
+        f"topic = {json.dumps(topic.name)}",
+        f'type = "{topic.type}"',
+        f"fields = {{ {fields} }}",
+        *([_STEERED] if "steering_rad" in kind.fields else []),
+        f"max_age_s = {_age_s(one):g}",
+        "",
+    ]
+
+
+MIN_GAP_S = 0.4  # shorter ones say little
+WITHIN_S = 0.5  # that a robot has moved in, at the end of a gap
+MOVES = 0.25  # of what was commanded: less is standing
+STANDS_M, STANDS_RAD = 0.05, 0.2  # within a gap after a command to stop
+MAX_S = 60.0
+MAX_GAP_S = 3600.0  # between two commands; longer: their log times are wrong
+SETTLED_S = 1.0  # commanded so fast for so long: latency and ramp are over
+NEARLY = 0.8  # of the fastest command counts as it
+MIN_SAMPLES = 10
+HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached its limit
+
+
+@dataclass(frozen=True)
+class CommandHold:
+    """What a recording shows of how long its robot goes on with a command; in log time."""
+
+    age_s: float | None = None  # None: nothing is known
+    stops_hold: bool = False  # a command to stop holds until the next
+    comments: tuple[str, ...] = ()
+
+
+def command_hold(
+    time_s: F64, speed_mps: F64, yaw_rate_radps: F64, poses: PoseSeries
+) -> CommandHold:
+    """What the gaps between commands (N,) show; `poses` are on the same clock, from the same 0."""
+    at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
+    if not len(time_s) or len(at) < 2:
+        return CommandHold()
+    turned = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
+    # The way, summed up: a robot that comes back to where it was has moved.
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(poses.x_m), np.diff(poses.y_m)))])
+    within = max(WITHIN_S, 3 * float(np.median(np.diff(at))))
+    ends = np.append(time_s[1:], at[-1])
+    on, stopped, stood, went = [], [], 0, 0
+    for begin, end, speed, turn in zip(time_s, ends, speed_mps, yaw_rate_radps, strict=True):
+        if not MIN_GAP_S <= end - begin <= MAX_GAP_S or at[0] > begin or at[-1] < end - within:
+            continue
+        if speed == 0 and turn == 0:
+            settled = min(begin + 1.0, end)  # it brakes first
+            moved = [float(np.ptp(np.interp([settled, end], at, c))) for c in (way, turned)]
+            still = moved[0] <= STANDS_M and moved[1] <= STANDS_RAD
+            stood, went = stood + still, went + (not still)
+            continue
+        moving = _last_moving(at, way, turned, begin, end, speed, turn, within)
+        if moving is None:
+            continue  # it never began to: held up, or not this robot's command
+        if moving >= end - within / 2:
+            on.append(end - begin)
+        else:
+            stopped.append(moving - begin)
+    return _judge(on, stopped, stood, went)
+
+
+def _last_moving(
+    at: F64,
+    way: F64,
+    turned: F64,
+    begin: float,
+    end: float,
+    speed: float,
+    turn: float,
+    within: float,
+) -> float | None:
+    """Until when in a gap the robot did a good part of what the command says; None: never."""
+    checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
+    checked = np.append(checked, end)
+    since = np.maximum(checked - within, begin)
+    span = np.maximum(checked - since, 1e-3)
+    gone = (np.interp(checked, at, way) - np.interp(since, at, way)) / span
+    spun = (np.interp(checked, at, turned) - np.interp(since, at, turned)) / span
+    drives = gone >= MOVES * abs(speed) if speed else spun * np.sign(turn) >= MOVES * abs(turn)
+    # Poses that stay away for longer say nothing.
+    seen = np.searchsorted(at, checked, "right") > np.searchsorted(at, since, "left")
+    moving = np.flatnonzero(drives & seen)
+    if not len(moving):
+        return None
+    # Up to the first break: what it does after that is not this command's (a hand, another driver).
+    broken = np.flatnonzero(~drives & seen & (checked > checked[moving[0]]))
+    return float(checked[broken[0] - 1] if len(broken) else checked[moving[-1]])
+
+
+def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> CommandHold:
+    comments = []
+    age = None
+    if on:
+        age = min(max(on), MAX_S)
+        comments.append(
+            f"the robot drove on to the end of {len(on)} of {len(on) + len(stopped)} gaps of"
+            f" {MIN_GAP_S:g} s and more between commands, the longest of {max(on):.1f} s"
+        )
+    if stopped:
+        middle = float(np.median(stopped))
+        age = middle if age is None else age
+        comments.append(f"it stood in {len(stopped)} of them from {middle:.1f} s on (median)")
+    holds = went <= stood
+    if stood:
+        comments.append(f"it stood through {stood} of {stood + went} gaps after a command to stop")
+    return CommandHold(age, holds, tuple(comments))
+
+
+def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
+    """What was measured (K,) where the fastest commands had settled, positive along the command.
+
+    Args:
+        told_s, told: time and value of the commands (N,), in order.
+        at_s, measured: of the odometry (M,), on the same clock.
+        fastest: that was commanded now and then; above 0.
+    """
+    if not len(reported):
+        return np.zeros(0)
+    fast = np.abs(reported) >= NEARLY * fastest
+    # Since when the commands have been fast, one way, without a break.
+    begins = np.append(
+        True, (fast[1:] != fast[:-1]) | (np.sign(reported[1:]) != np.sign(reported[:-1]))
+    )
+    since_s = told_s[np.maximum.accumulate(np.where(begins, np.arange(len(reported)), 0))]
+    index = np.searchsorted(told_s, at_s, "right") - 1
+    row = np.maximum(index, 0)
+    settled = (index >= 0) & fast[row] & (at_s - since_s[row] >= SETTLED_S)
+    settled &= at_s - told_s[row] < SETTLED_S  # the command is no old one
+    along = (measured * np.sign(reported[row]))[settled]
+    return np.asarray(along[np.isfinite(along)], np.float64)
+
+
+def limit_of(settled: F64, fastest: float) -> float | None:
+    """The limit that settled speeds (K,) show; None where the robot does about what it is told.
+
+    Ahead and about share the wheels, so that the quickest tenth is taken, where the other motion
+    asked least of them.
+    """
+    if len(settled) < MIN_SAMPLES:
+        return None
+    reached = float(np.percentile(settled, 90))
+    return float(f"{reached:.3g}") if 0.01 < reached < HELD_BACK * fastest else None
+
 
 MOSTLY, RARELY = 98, 2  # percentiles of speeds: what is beyond is an outlier
 APART = 0.25  # of the fastest command; a command that is further from every action is far off it

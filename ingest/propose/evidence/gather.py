@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,44 +11,56 @@ import numpy as np
 from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import TopicInfo
 from restock.ingest.profile.conventions import conventions_of
-from restock.ingest.profile.inputs import Input, is_motion
-from restock.ingest.propose.driven.command_hold import CommandHold
-from restock.ingest.propose.driven.steering import DriveEvidence
-from restock.ingest.propose.evidence.cameras import CameraTopic, camera_topics
-from restock.ingest.propose.evidence.candidates import Candidate, candidates
+from restock.ingest.profile.inputs import HINDSIGHT, Input, is_motion
+from restock.ingest.propose.evidence.candidates import (
+    CameraTopic,
+    Candidate,
+    camera_topics,
+    candidates,
+)
 from restock.ingest.propose.evidence.clock_choice import (
     PAUSE,
     ClockChoice,
     Gaps,
     choose_clock,
 )
-from restock.ingest.propose.evidence.command_choice import CommandChoice, choose_command
 from restock.ingest.propose.evidence.commands import (
+    CommandChoice,
+    CommandHold,
     Commands,
+    choose_command,
     how_it_turned,
     leaves_the_floor,
     read_commands,
     wheelbase_of,
 )
-from restock.ingest.propose.evidence.footprint import GUESS, Footprint, footprint_of
-from restock.ingest.propose.evidence.frame_guess import (
-    FrameGuess,
-    transform_edges,
-    transform_frames,
+from restock.ingest.propose.evidence.footprint import (
+    GUESS,
+    Footprint,
+    ScannedOutline,
+    footprint_of,
+    scanned_outline,
 )
-from restock.ingest.propose.evidence.goal_choice import GoalChoice
 from restock.ingest.propose.evidence.lidars import (
     lidar_place,
     moved_in_frame,
     scans_of,
     with_lidar,
 )
-from restock.ingest.propose.evidence.motion_choice import (
+from restock.ingest.propose.evidence.pose_choice import (
+    FrameGuess,
     MotionChoice,
     choose_motion,
     pose_series,
+    transform_edges,
+    transform_frames,
 )
-from restock.ingest.propose.evidence.robot_lines import RobotProposal, propose_robot, urdf_footprint
+from restock.ingest.propose.evidence.robot_choice import (
+    DriveEvidence,
+    RobotProposal,
+    propose_robot,
+    urdf_footprint,
+)
 from restock.ingest.propose.evidence.roles import (
     KINDS,
     LATCHED,
@@ -63,12 +76,67 @@ from restock.ingest.propose.evidence.roles import (
     topics_for,
     usable_topics,
 )
-from restock.ingest.propose.evidence.scanned_outline import ScannedOutline, scanned_outline
 from restock.ingest.steps.clocks import STAMP
 from restock.ingest.steps.frames import plain
 from restock.ingest.steps.input_columns import estimate_reduction
 from restock.ingest.steps.motion import PoseSeries
+from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 from restock.ingest.urdf.description import BASE_FRAMES
+
+RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
+MIN_ROWS = 100  # with a goal in hindsight, where these are wanted and the rest is left out
+
+
+@dataclass(frozen=True)
+class GoalChoice:
+    """The goal of a proposal; `source` None: the task has none."""
+
+    source: GoalSource | None
+    why: str = ""  # there is none
+    hindsight_wanted: bool = False  # also where most of the drive has none
+
+    @classmethod
+    def of(cls, *, logged: bool, hindsight_wanted: bool = False) -> GoalChoice:
+        """Where goals and plans were not recorded, they come in hindsight."""
+        return cls("logged" if logged else "hindsight", hindsight_wanted=hindsight_wanted)
+
+    def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
+        """The choice after a trial: no goal where hindsight finds none for most of the drive, or,
+        where it is wanted, for all but a few rows."""
+        without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
+        enough = self.hindsight_wanted and transitions >= MIN_ROWS
+        if self.source != "hindsight" or without <= transitions or enough:
+            return self
+        return GoalChoice(
+            None, f"in hindsight, {without:,} ticks have no goal and {transitions:,} have one"
+        )
+
+    def task_lines(self, length_m: float) -> list[str]:
+        """What [task] says of it, for a robot of this length."""
+        if self.source is None:
+            why = f"; {self.why}" if self.why else ""
+            progress = "progress is forward displacement"
+            return [f'goal = "none"  # no goal and plan seen{why}: {progress}']
+        lines = ['goal = "route"']
+        if self.source == "hindsight":
+            radius_m = min(max(length_m / 3, RADIUS_M[0]), RADIUS_M[1])
+            lines.append(f"goal_radius_m = {round(radius_m, 2):g}  # a third of a robot's length")
+        return lines
+
+    def fallback(self, role: str) -> str:
+        """What there is instead of `goal` or `plan`."""
+        return HINDSIGHT[role] if self.source == "hindsight" else "progress without a goal"
+
+    def table_lines(self) -> list[str]:
+        """The [goal] of the profile, where it needs one."""
+        if self.source != "hindsight":
+            return []
+        return [
+            "[goal]  # no goal and plan seen",
+            'source = "hindsight"  # where a drive stopped, turned back or passed often',
+            "",
+        ]
+
 
 # Input -> the field without which a topic is of no use for it.
 MEASURED = {"imu": "yaw_rate_radps", "wheels": "speed_mps", "pose": "x_m"}

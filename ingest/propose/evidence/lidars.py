@@ -12,10 +12,9 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.tables import Clock, Frames
-from restock.ingest.propose.evidence.footprint import Footprint
-from restock.ingest.propose.evidence.frame_guess import named_frames, transform_topics
+from restock.ingest.propose.evidence.footprint import OWN_SPREAD_M, Footprint, ScannedOutline
+from restock.ingest.propose.evidence.pose_choice import named_frames, transform_topics
 from restock.ingest.propose.evidence.roles import Kind
-from restock.ingest.propose.evidence.scanned_outline import OWN_SPREAD_M, ScannedOutline
 from restock.ingest.steps.align import align
 from restock.ingest.steps.clearance import BEAMS
 from restock.ingest.steps.frames import Edges, Tree, frame_id_path, plain, upward

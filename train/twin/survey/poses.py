@@ -17,7 +17,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
 from restock.ingest.profile.profile import Profile
 from restock.ingest.profile.tables import Frames
-from restock.ingest.propose.evidence.frame_guess import transform_edges, transform_frames
+from restock.ingest.propose.evidence.pose_choice import transform_edges, transform_frames
 from restock.ingest.propose.evidence.roles import (
     KINDS,
     topics_for,

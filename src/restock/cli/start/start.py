@@ -189,7 +189,7 @@ class StartCommand:
 
             open_device(self.device)
         if self.urdf is not None:
-            from restock.ingest.propose.evidence.robot_lines import check_urdf
+            from restock.ingest.propose.evidence.robot_choice import check_urdf
 
             check_urdf(self.urdf)
         if self.map is not None:

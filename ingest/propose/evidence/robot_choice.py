@@ -1,24 +1,229 @@
-"""The `[robot]` of a proposed profile: what its description and its scans say of the robot."""
+"""The `[robot]` of a proposed profile, by its description, its scans and how it turned.
+
+A robot with two driven sides turns on the spot; one that steers never does, however it is told to.
+So where nothing describes the robot, its drive shows: in turns on the spot, or in commands for such
+turns that it did not follow, though it drove otherwise. Where it was never told to, its logs do not
+tell: a robot that only ever drove in wide circles may have two driven sides.
+"""
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from restock.arrays import F64, Bools, Ints
 from restock.errors import ConfigError
 from restock.ingest.containers.recording import Recording
-from restock.ingest.propose.driven.steering import DriveEvidence
 from restock.ingest.propose.evidence.footprint import Footprint, descriptions, of_urdf, outline
 from restock.ingest.propose.evidence.lidars import SeenScans, View
 from restock.ingest.propose.evidence.roles import shared
+from restock.ingest.steps.motion import PoseSeries, motion_at
 from restock.ingest.task.robot import OUTLINE, USUAL_STEERING_RAD, Lidar, Robot
+from restock.ingest.task.signals import wrap_angle
 from restock.ingest.urdf.described_robot import described_robot, read_urdf
 from restock.ingest.urdf.description import Description, read_description
 from restock.toml import toml_value
+
+TICK_NS = 100_000_000  # between two looks at the motion
+KNOWN_S, UNKNOWN_NS = 1.0, 2_000_000_000  # after a pose: its motion is; it is surely not any more
+DELAYS_S = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)  # from a command to the motion
+SETTLED_S = 1.0  # a command is no older
+ANSWERED_S = 0.5  # after its end in which a turn still answers it
+SPOT_M = 0.1  # the circle of a turn on the spot, at most: no car is so small
+TURNS_RADPS = 0.15  # less is a slope of noise
+MIN_PIVOT_S, MIN_PIVOT_RAD = 0.5, 0.5  # of one turn on the spot, and of all
+STANDS_MPS, MUCH = 0.02, 0.3  # of a command to turn on the spot; of the sharpest turn that is told
+MIN_ASKED_RAD, MIN_SPELLS, FOLLOWS = 2.0, 2, 0.15  # of such commands, how much was followed
+MIN_HALF_RAD = 1.0  # … of which following half is turning on the spot
+MIN_DRIVEN_M = 0.05  # else it may not have been able to move
+MIN_TURNS = 20  # moments of driving in a turn
+WHEELBASES_M = (0.05, 10.0)  # of what drives
+UNEXPLAINED = 0.5  # of the squared yaw rates, at most
+
+
+@dataclass(frozen=True)
+class DriveEvidence:
+    """What drives show of whether their robot steers as a car; `joined` over several drives."""
+
+    driven_m: float = 0.0
+    pivoted_rad: float = 0.0  # in turns on the spot
+    asked_rad: float = 0.0  # by commands to turn on the spot
+    spells: int = 0  # of such commands
+    followed_rad: float = 0.0  # of what they asked for
+    curved_rad: float = 0.0  # turned while it drove
+    tightest_m: float | None = None  # the circle of its tightest turn
+
+    @property
+    def pivots(self) -> bool:
+        """It turns on the spot."""
+        turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.asked_rad)
+        half = self.asked_rad >= MIN_HALF_RAD and self.followed_rad >= self.asked_rad / 2
+        return turned or half
+
+    @property
+    def steers(self) -> bool:
+        """Told to turn on the spot it did not, though it can move."""
+        reported = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
+        drove = self.driven_m >= MIN_DRIVEN_M
+        followed = self.followed_rad >= FOLLOWS * self.asked_rad
+        return reported and drove and not followed and not self.pivots
+
+    @property
+    def why(self) -> str:
+        """What it showed, as the rest of a sentence about the robot."""
+        if self.pivots:
+            turned = max(self.pivoted_rad, self.followed_rad)
+            return f"it turned on the spot, by {turned:.1f} rad in all"
+        requested = (
+            f"commanded to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
+        )
+        requested += f" {max(self.followed_rad, 0.0):.1f}"
+        if self.steers:
+            return f"{requested}, though it drove {self.driven_m:.1f} m"
+        if self.asked_rad:
+            return f"{requested}: too little to tell"
+        turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
+        return f"in {turns} it never turned on the spot, and was never commanded to"
+
+    @staticmethod
+    def joined(drives: Sequence[DriveEvidence]) -> DriveEvidence:
+        """The evidence of several drives of one robot together."""
+
+        circles = [one.tightest_m for one in drives if one.tightest_m is not None]
+        return DriveEvidence(
+            driven_m=sum(one.driven_m for one in drives),
+            pivoted_rad=sum(one.pivoted_rad for one in drives),
+            asked_rad=sum(one.asked_rad for one in drives),
+            spells=sum(one.spells for one in drives),
+            followed_rad=sum(one.followed_rad for one in drives),
+            curved_rad=sum(one.curved_rad for one in drives),
+            tightest_m=min(circles, default=None),
+        )
+
+
+def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries) -> DriveEvidence:
+    """What one drive shows of whether its robot steers as a car.
+
+    Args:
+        told_s, told_mps, told_radps: of the commands (N,), in order, on the clock of `poses`.
+        poses: of the robot, from the same 0.
+    """
+    if len(told_s) < 2 or len(poses) < 3:
+        return DriveEvidence()
+    changes = np.flatnonzero((np.diff(poses.x_m) != 0) | (np.diff(poses.yaw_rad) != 0))
+    pace_s = float(np.median(np.diff(poses.stamp_ns[changes]))) * 1e-9 if len(changes) > 2 else 0.1
+    window_s = float(np.clip(3 * pace_s, 0.3, 2.0))  # a pose that is held is no standing still
+    ticks = _looks(poses.stamp_ns)
+    motion = motion_at(poses, ticks, window_s, KNOWN_S)
+    known = motion.problem == ""
+    speed, turn = (np.where(known, c, 0.0) for c in (motion.forward_mps, motion.yaw_rate_radps))
+    sideways = np.where(known, motion.lateral_mps, 0.0)
+    tick_s = TICK_NS * 1e-9
+    way = np.hypot(speed, sideways)
+    spot = (np.abs(turn) >= TURNS_RADPS) & (way <= SPOT_M * np.abs(turn))
+    spot = _spells_of(spot, round(max(MIN_PIVOT_S, window_s) / tick_s))
+    sharp = float(np.percentile(np.abs(told_radps), 98))
+    fast = float(np.percentile(np.abs(told_mps), 98))
+    requested, spells, followed = _on_the_spot(told_s, told_mps, told_radps, poses, sharp)
+    drives = (way >= max(0.05, 0.2 * fast)) & (np.abs(speed) >= 0.9 * way)
+    moves = (way >= STANDS_MPS) & ~spot
+    curves = drives & (np.abs(turn) >= TURNS_RADPS)
+    circles = np.abs(speed[curves] / turn[curves])
+    return DriveEvidence(
+        driven_m=float(way[moves].sum() * tick_s),
+        pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
+        asked_rad=requested,
+        spells=spells,
+        followed_rad=followed,
+        curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
+        tightest_m=float(np.percentile(circles, 5)) if len(circles) >= MIN_TURNS else None,
+    )
+
+
+def _looks(stamp_ns: Ints) -> Ints:
+    """Moments TICK_NS apart from the first pose to the last, but those long after one: a single
+    message that is logged at the wrong time may lie years before the others."""
+    gaps = np.flatnonzero(np.diff(stamp_ns) > UNKNOWN_NS)
+    begins = np.concatenate([stamp_ns[:1], stamp_ns[gaps + 1]]) - stamp_ns[0]
+    ends = np.concatenate([stamp_ns[gaps] + UNKNOWN_NS, stamp_ns[-1:]]) - stamp_ns[0]
+    spans = zip(-(-begins // TICK_NS), -(-ends // TICK_NS), strict=True)
+    numbers = np.concatenate([np.arange(*span) for span in spans])
+    looks: Ints = stamp_ns[0] + numbers * TICK_NS
+    return looks
+
+
+def _spells_of(flags: Bools, least: int) -> Bools:
+    """Only those (T,) of at least so many one after another."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    kept = np.zeros_like(flags)
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        kept[begin:end] = end - begin >= least
+    return kept
+
+
+def _on_the_spot(
+    told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries, sharp: float
+) -> tuple[float, int, float]:
+    """How far it was told to turn on the spot (rad), in how many spells, and how far it did."""
+    at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
+    heading = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
+    side = np.sign(told_radps) * (
+        (np.abs(told_mps) <= STANDS_MPS) & (np.abs(told_radps) >= max(MUCH * sharp, TURNS_RADPS))
+    )
+    hold = np.minimum(np.append(np.diff(told_s), SETTLED_S), SETTLED_S)
+    begins = np.flatnonzero(np.append(True, np.diff(side) != 0))
+    requested, spells, followed = 0.0, 0, 0.0
+    for first, behind in zip(begins, np.append(begins[1:], len(side)), strict=True):
+        begin, end = told_s[first], told_s[behind - 1] + hold[behind - 1]
+        if not side[first] or begin < at[0] or end > at[-1]:
+            continue
+        turned = np.diff(np.interp([begin, end + ANSWERED_S], at, heading))[0] * side[first]
+        requested += float((np.abs(told_radps) * hold)[first:behind].sum())
+        followed += float(turned)
+        spells += 1
+    return requested, spells, followed
+
+
+def shown_wheelbase_m(
+    told_s: F64, told_rad: F64, poses: PoseSeries, steering_rad: float | None
+) -> float | None:
+    """Return the wheelbase by which steering angles (N,) explain how the robot turned; None if they
+    do not.
+
+    Args:
+        told_s, told_rad: time and angle of the commands, in order, on the clock of `poses`.
+        steering_rad: the largest angle; None: the usual one.
+    """
+    most = steering_rad or USUAL_STEERING_RAD
+    ticks = _looks(poses.stamp_ns)
+    window_s = max(0.3, 4e-9 * float(np.median(np.diff(poses.stamp_ns))))
+    motion = motion_at(poses, ticks, window_s, KNOWN_S)
+    middle_s = ticks * 1e-9 - window_s / 2
+    best_m, least = None, UNEXPLAINED
+    for delay_s in DELAYS_S:
+        index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
+        row = np.maximum(index, 0)
+        used = (index >= 0) & (motion.problem == "") & (np.abs(motion.forward_mps) > 0.05)
+        used &= (middle_s - told_s[row] < SETTLED_S) & (np.abs(told_rad[row]) > 0.03)
+        turned = motion.yaw_rate_radps[used]
+        if used.sum() < MIN_TURNS or not turned.any():
+            continue
+        # The yaw rate times the wheelbase, by the angle.
+        by_angle = motion.forward_mps[used] * np.tan(np.clip(told_rad[row[used]], -most, most))
+        base_m = float((by_angle**2).sum() / (turned @ by_angle))
+        if not WHEELBASES_M[0] <= base_m <= WHEELBASES_M[1]:
+            continue
+        left = float(((turned - by_angle / base_m) ** 2).sum() / (turned**2).sum())
+        if left < least:
+            best_m, least = base_m, left
+    return best_m
+
 
 BY_TURNS = "by which its steering angles explain best how it turned: MEASURE IT"
 WHEELBASE_PART = 0.6  # of the outline's length, where nothing says
