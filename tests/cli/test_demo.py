@@ -16,8 +16,7 @@ from support.stores import recording_transitions
 from restock import cli
 from restock.cli.start import stages
 from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
-from restock.cli.start.settings import Settings
-from restock.cli.start.stage import Stage
+from restock.cli.start.stages import Settings, Stage
 from restock.errors import RestockError
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.profile.profile_text import profile_toml

@@ -10,7 +10,7 @@ from support.paths import ROOT
 
 from restock import cli
 from restock.cli.start import stages, story
-from restock.cli.start.settings import Settings
+from restock.cli.start.stages import Settings
 from restock.replay.panel.panel import Panel
 from restock.train.run.fed_shares import fed_shares
 from restock.train.run.kept_evaluations import FILE

@@ -32,7 +32,7 @@ from restock.cli.start.decisions import (
     practice_settings,
     updates_settings,
 )
-from restock.cli.start.settings import Settings
+from restock.cli.start.stages import Settings
 from restock.cli.start.work import Work
 from restock.ingest.containers.discover import recordings_in
 from restock.ingest.profile.profile import load_profile

@@ -188,3 +188,20 @@ def test_it_says_that_damage_is_unseen_until_messages_are_read(
     assert "is lost" in entry["damage"][0]
     assert main(["info", str(path), "--clocks"]) == 3
     assert "--clocks reads" not in capsys.readouterr().out
+
+
+def test_equal_names_of_metadata_records_are_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from mcap.writer import Writer as McapWriter
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        for name in ("rosbag2", "site", "rosbag2"):
+            writer.add_metadata(name, {"a": "b"})
+        writer.finish()
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "metadata records, 3: rosbag2 (2), site\n" in text

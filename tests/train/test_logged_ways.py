@@ -18,7 +18,7 @@ from support.stores import recording_transitions, with_clear_view, write_store
 from restock.arrays import F64
 from restock.cli import main
 from restock.cli.start.decisions import no_ways
-from restock.cli.start.settings import Settings
+from restock.cli.start.stages import Settings
 from restock.files import read_table
 from restock.replay.panel.panel import Panel
 from restock.train.evaluation.evaluation_plan import plan_evaluation

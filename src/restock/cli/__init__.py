@@ -244,9 +244,11 @@ def command_of(name: str) -> type[Any]:
 
 
 def _settle_pandas() -> None:
-    """Arrow asks at the first list that it gets whether it is a pandas object, and to know that
-    imports pandas wherever it is installed: half of what a short command takes. No command makes
-    any, so it asks now, and finds none. Who needs pandas itself (Stable-Baselines3) imports it."""
+    """Keep Arrow from importing pandas, which takes half the time of a short command.
+
+    Arrow looks for pandas at the first list that it gets. No command makes pandas objects, so it
+    looks now, and finds none. A library that needs pandas (Stable-Baselines3) imports it as usual.
+    """
     import pyarrow as pa
 
     with hidden("pandas"):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,8 +18,6 @@ if TYPE_CHECKING:
     from restock.cli.data.machine import Finding
 
 NAMED = 10  # attachments, metadata records and their entries that are listed
-HEAD = 18  # bytes: the longest head of a zstd frame
-_MODE = re.compile(r"^\s*compression_mode:\s*[\"']?(\w*)", re.MULTILINE)
 LONGEST = 60  # characters of an entry's value that are shown
 
 
@@ -110,7 +106,6 @@ class InfoCommand:
                             clocks=self.clocks,
                             watch=advance.part,
                         )
-                        entry["compression"] = compression_of(entry, salvage=self.salvage)
                 except RecordingError as error:
                     sys.stderr.write(f"restock: {error}\n")
                     code = ExitCode.USAGE
@@ -130,97 +125,6 @@ def _is_store(path: str) -> bool:
     return "://" in path or (path != "" and Path(path).is_dir() and is_store(Location.of(path)))
 
 
-def compression_of(entry: Mapping[str, Any], *, salvage: bool = False) -> dict[str, Any] | None:
-    """How rosbag2 compressed a described recording: `mode` (file or message), `format`, how many of
-    its files or messages, `stored_bytes`, and `plain_bytes` (None where messages do not say).
-
-    None where it compressed neither; MCAP chunks are another matter. Messages are looked at only
-    where there may be compressed ones: rosbag2's metadata says so, or there is no metadata.
-    """
-    from restock.ingest.containers.discover import container_of
-
-    files = [Path(name) for name in entry["files"]]
-    packed = [file for file in files if container_of(file) is None]
-    if packed:
-        return _document("file", map(_file_sizes, packed))
-    if not _may_have_messages(entry, files[0]):
-        return None
-    return _document("message", (size for file in files for size in _message_sizes(file, salvage)))
-
-
-def _may_have_messages(entry: Mapping[str, Any], file: Path) -> bool:
-    from restock.ingest.containers.discover import MAX_METADATA, METADATA
-
-    if entry["format"] == "ros1" or any(chunks["compression"] for chunks in entry["chunks"]):
-        return False
-    said = ""
-    with suppress(OSError), (file.parent / METADATA).open(encoding="utf-8", errors="replace") as it:
-        said = it.read(MAX_METADATA)
-    if said and (Path(entry["path"]).is_dir() or file.name in said):
-        return any(mode.upper() == "MESSAGE" for mode in _MODE.findall(said))
-    return entry["format"] == "rosbag2-sqlite3" or "rosbag2" in entry["metadata"]
-
-
-def _file_sizes(file: Path) -> tuple[int, int]:
-    """rosbag2 does not always know a file's size when it starts: then it is decompressed for it.
-    That was done once, to describe it: it is not implausibly large."""
-    import zstandard
-
-    from restock.ingest.containers.formats.compression import BLOCK
-
-    with file.open("rb") as content:
-        size = _plain_size(content.read(HEAD))
-        if size is None:
-            content.seek(0)
-            decoder, size = zstandard.ZstdDecompressor().decompressobj(), 0
-            with suppress(zstandard.ZstdError):  # damaged: up to there
-                while not decoder.eof and (block := content.read(BLOCK)):
-                    size += len(decoder.decompress(block))
-    return file.stat().st_size, size
-
-
-def _message_sizes(file: Path, salvage: bool) -> Iterator[tuple[int, int | None]]:
-    """The compressed messages of a file; none where there is none among the first that are read."""
-    from restock.ingest.containers.discover import container_of
-    from restock.ingest.containers.formats.compression import ZSTD_MAGIC
-    from restock.ingest.containers.formats.storage import unwatched
-
-    container = container_of(file)
-    if container is None:
-        return
-    with closing(container.open(file, salvage=salvage, watch=unwatched)) as storage:
-        for _, batch in storage.batches(list(storage.channels)):
-            payloads = [one for one in batch.payloads() if one.startswith(ZSTD_MAGIC)]
-            if not payloads:
-                return
-            yield from ((len(one), _plain_size(one[:HEAD])) for one in payloads)
-
-
-def _plain_size(head: bytes) -> int | None:
-    """What the head of a zstd frame says of its content, if it does."""
-    import zstandard
-
-    try:
-        size = zstandard.frame_content_size(head)
-    except zstandard.ZstdError:
-        return None
-    return size if size >= 0 else None
-
-
-def _document(mode: str, sizes: Iterable[tuple[int, int | None]]) -> dict[str, Any] | None:
-    every = list(sizes)
-    if not every:
-        return None
-    plain = [size for _, size in every if size is not None]
-    return {
-        "mode": mode,
-        "format": "zstd",
-        "number": len(every),
-        "stored_bytes": sum(stored for stored, _ in every),
-        "plain_bytes": sum(plain) if len(plain) == len(every) else None,
-    }
-
-
 def _size(count: int) -> str:
     """Bytes, in MB; in kB where they are less than one."""
     return f"{count / 1e6:.1f} MB" if count >= 999_950 else f"{count / 1e3:.1f} kB"
@@ -236,14 +140,6 @@ def _packed(chunks: dict[str, Any]) -> str:
     kind = chunks["compression"] or "not compressed"
     number = counted(chunks["chunks"], "chunk")
     return visible(f"{number}, {kind}: {_share(stored, plain if chunks['compression'] else None)}")
-
-
-def _compressed(compression: dict[str, Any]) -> str:
-    """How rosbag2 compressed the recording, in a line."""
-    number = compression["number"]
-    what = counted(number, compression["mode"])
-    share = _share(compression["stored_bytes"], compression["plain_bytes"])
-    return f"{what} compressed with {compression['format']}: {share}"
 
 
 def _names(names: list[str]) -> str:
@@ -296,11 +192,8 @@ def _print(entry: dict[str, Any]) -> None:
     coded = ["encoding"] if mixed and entry["format"] != "ros1" else []
     qos = ["offered QoS"] if any(row["offered QoS"] for row in rows) else []
     shown = ["topic", "type", *coded, "messages", "rate Hz", *clock, *qos]
-    if (compression := entry["compression"]) is not None:
-        sys.stdout.write(_compressed(compression) + "\n")
-    inside = "inside, " if compression is not None else ""
     for packed in entry["chunks"]:
-        sys.stdout.write(f"{inside}{_packed(packed)}\n")
+        sys.stdout.write(f"{_packed(packed)}\n")
     output.print_table(rows, shown)
     if not clocked:
         sys.stdout.write("not decoded, so damage may be unseen: --clocks reads every message\n")

@@ -10,9 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from restock.cli.start.outcomes import of_nominal
-from restock.cli.start.settings import Settings
-from restock.cli.start.stage import Document, Stop
+from restock.cli.start.outcomes import Document, of_nominal
+from restock.cli.start.stages import Settings, Stop
 from restock.cli.start.work import FOLDER, Ended
 from restock.errors import ConfigError, StoreError
 from restock.files import read_json

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from restock.cli.start import stages, story
-from restock.cli.start.settings import Settings
-from restock.cli.start.stage import Stage
+from restock.cli.start.stages import Settings, Stage
 from restock.cli.start.work import escape
 from restock.errors import ConfigError, ExitCode, RestockError
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from restock.cli.start.stage import Document
 from restock.stats import interval_text
 from restock.words import counted
 
+Document = Mapping[str, Any]  # what a verb prints with --json; empty where it has not run
 ESTIMATORS = (
     ("logged", "as the logs were driven"),
     ("fqe", "the policy, by a fitted model (fqe)"),

@@ -12,8 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from restock.cli.start.settings import Settings
-from restock.cli.start.stages import fed_uniformly, from_logs_alone
+from restock.cli.start.stages import Settings, fed_uniformly, from_logs_alone
 from restock.stats import wilson
 from restock.words import policy_words, quoted
 

@@ -30,8 +30,8 @@ from restock.cli.start.decisions import (
     updates_settings,
     wrong_outline,
 )
-from restock.cli.start.settings import Settings
-from restock.cli.start.stage import Document, Stop
+from restock.cli.start.outcomes import Document
+from restock.cli.start.stages import Settings, Stop
 from restock.cli.start.work import Ended, Work, escape
 from restock.words import counted
 

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from restock.cli.start.outcomes import errors
-from restock.cli.start.stage import Document, Stage
+from restock.cli.start.outcomes import Document, errors
+from restock.cli.start.stages import Stage
 from restock.errors import ExitCode, RestockError, visible
 from restock.files import read_json, write_text
 
