@@ -18,7 +18,7 @@ Bools = NDArray[np.bool_]
 
 
 def splitmix64(states: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """A mixing of 64-bit numbers (Steele, Lea and Flood, OOPSLA 2014), alike on every machine."""
+    """Mix 64-bit numbers, alike on every machine (Steele, Lea and Flood, OOPSLA 2014)."""
     mixed = (states ^ (states >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     result: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))

@@ -19,7 +19,7 @@ def reported(text: str, keep: str = "") -> str:
 
 
 def visible(text: str, keep: str = "") -> str:
-    """The text with control characters (but those in `keep`) written out, as in `\\x1b[2J`.
+    """Write out control characters of a text (but those in `keep`), as in `\\x1b[2J`.
 
     A terminal obeys them: a topic's name could clear the screen, or pass for another line. So
     are those that reorder text.
@@ -35,7 +35,7 @@ def visible(text: str, keep: str = "") -> str:
 
 
 def print_traceback(error: Exception) -> None:
-    """The traceback of an error that becomes a message, on stderr where the environment asks."""
+    """Print an error's traceback on stderr if the environment asks for it."""
     if os.environ.get(TRACEBACK):
         import traceback  # slow to import
 

@@ -31,7 +31,7 @@ def read_table(
     error: type[RestockError] = RestockError,
     remedy: str | None = None,
 ) -> pa.Table:
-    """The rows of a Parquet file; checksums of its pages are verified where it has them.
+    """Read a Parquet file, and verify the checksums of its pages if it has them.
 
     Columns of `schema` that it lacks are null. One that `schema` lacks is refused: its name may be
     damaged, which no checksum covers.
@@ -58,7 +58,7 @@ def read_table(
 def read_json(
     path: Path, *, error: type[RestockError] = RestockError, remedy: str | None = None
 ) -> dict[str, Any]:
-    """The JSON object in a file.
+    """Read the JSON object in a file.
 
     Raises:
         RestockError: (of the kind `error`) there is no such file, or it holds no JSON object.
@@ -84,7 +84,7 @@ def _unreadable(
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says first; libraries say the rest below it, and the system a number before."""
+    """Return the first line of an error, without the system's error number."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return next((line for line in said.splitlines() if line.strip()), type(error).__name__)
 
@@ -125,7 +125,7 @@ def write_bytes(path: Path, content: bytes, *, exclusive: bool = False) -> None:
 
 
 def _takes_a_stream(path: Path) -> bool:
-    """Whether it is no file that can be replaced: /dev/stdout, /dev/null, a named pipe."""
+    """Return whether the path cannot be replaced: /dev/stdout, /dev/null, a named pipe."""
     if path.is_symlink() and str(path.readlink()).startswith("/proc/self/fd"):
         return True
     return path.exists() and not path.is_file() and not path.is_dir()
@@ -191,7 +191,7 @@ def _within(path: Path, run: Path | None = None) -> str | None:
 
 
 def is_undecoded(letter: str) -> bool:
-    """Whether it stands for a byte that Python could not decode, of a path or a command line."""
+    """Return whether a character stands for a byte of a path that Python could not decode."""
     return "\udc80" <= letter <= "\udcff"
 
 
@@ -203,7 +203,7 @@ def _temporary(path: Path, *, replaces: bool = True) -> Path:
 
 
 def temporary_name(path: Path) -> Path:
-    """Where a file is written before it is put in place: beside it, under this process's name."""
+    """Return where a file is written first: beside its place, under this process's name."""
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
@@ -224,9 +224,9 @@ def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
 
 @contextmanager
 def building(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that no other builder has; what is left of it at the end goes away.
+    """Yield a folder beside `out` for one builder, and remove what is left of it at the end.
 
-    Those of builders that were killed go away first.
+    Folders of builders that were killed are removed first.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     prefix = f".{out.name}.building~"
@@ -245,14 +245,14 @@ def building(out: Path) -> Iterator[Path]:
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return how many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def is_running(process: int) -> bool:
-    """Whether this machine has a process of that id."""
+    """Return whether this machine has a process of that id."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

@@ -1,5 +1,4 @@
-"""Libraries that are slow to import, or optional: those of an extra, what is to happen once one is
-imported, and what none may look for."""
+"""Libraries that are optional or slow to import, and what to do once one is imported."""
 
 from __future__ import annotations
 
@@ -18,8 +17,10 @@ from restock.errors import ConfigError
 def import_extra(
     name: str, extra: str, use: str, *, where: str | None = None, instead: str | None = None
 ) -> Any:
-    """The module `name` of one of Restock's optional extras. `use` ends in what is needed ("an .rrd
-    file is written by Rerun"); `instead` is what does without it.
+    """Import the module `name` of an optional extra.
+
+    `use` ends in what is needed ("an .rrd file is written by Rerun"); `instead` is what works
+    without it.
 
     Raises:
         ConfigError: it cannot be imported; says which extra has it.
@@ -34,7 +35,7 @@ def import_extra(
 
 
 def install_command(extra: str = "") -> str:
-    """How pip adds an extra, or what Restock needs, to the Restock that is installed here."""
+    """Return the pip command that adds an extra, or a missing requirement, to this Restock."""
     import json
     from importlib.metadata import PackageNotFoundError, distribution
 
@@ -49,7 +50,7 @@ def install_command(extra: str = "") -> str:
 
 
 def installed(name: str) -> bool:
-    """Whether the module `name` can be imported, without importing it."""
+    """Return whether the module `name` can be imported, without importing it."""
     try:
         return importlib.util.find_spec(name) is not None
     except ValueError:  # what stands in its place says nothing of itself: it was blocked
@@ -91,7 +92,7 @@ class _After:
 
 @contextmanager
 def hidden(name: str) -> Iterator[None]:
-    """The module `name` cannot be found while the block runs, unless it is imported already."""
+    """Hide the module `name` from imports in this block, unless it is imported already."""
     finder = _Hides(name)
     sys.meta_path.insert(0, finder)
     try:

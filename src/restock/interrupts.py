@@ -23,11 +23,11 @@ _interrupted = False
 
 @contextmanager
 def kill_as_interrupt() -> Iterator[None]:
-    """A kill (SIGTERM) and the end of the terminal (SIGHUP) do what Ctrl-C does at that moment: by
-    default a KeyboardInterrupt, in a training a checkpoint. What is ignored (`nohup`) stays so.
+    """Let a kill (SIGTERM) and the end of the terminal (SIGHUP) do what Ctrl-C does.
 
-    Each interrupt is noted: a library that calls into Python may turn it into an error of its own
-    (see `was_interrupted`).
+    By default that is a KeyboardInterrupt, in a training a checkpoint. What is ignored (`nohup`)
+    stays ignored. Each interrupt is noted, because a library that calls into Python may turn it
+    into an error of its own (see `was_interrupted`).
     """
     handlers = {"SIGTERM": _interrupt, "SIGHUP": _interrupt, "SIGINT": _note_interrupt}
     usual = {
@@ -53,14 +53,16 @@ def kill_as_interrupt() -> Iterator[None]:
 
 
 def was_interrupted() -> bool:
-    """Whether an interrupt came, and nothing went on on purpose since. DuckDB and Arrow report a
-    KeyboardInterrupt in a Python function that they call as an error of theirs: who would take an
-    error for a damaged file asks here first."""
+    """Return whether an interrupt came that nobody has dealt with.
+
+    DuckDB and Arrow report a KeyboardInterrupt in a Python function that they call as an error of
+    theirs. Ask here before taking such an error for a damaged file.
+    """
     return _interrupted
 
 
 def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
-    """The function, which ends an interrupt with KeyboardInterrupt whatever DuckDB made of it."""
+    """Make a function raise KeyboardInterrupt whatever DuckDB made of it."""
 
     @wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -76,7 +78,7 @@ def interrupts_raised(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _by_interrupt(error: BaseException | None, before: BaseException | None) -> bool:
-    """Whether it, or what led to it, is a KeyboardInterrupt or what DuckDB makes of one."""
+    """Return whether an error, or its cause, is an interrupt or what DuckDB makes of one."""
     while error is not None and error is not before:
         said = str(error)
         if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in said:
@@ -88,18 +90,18 @@ def _by_interrupt(error: BaseException | None, before: BaseException | None) -> 
 
 
 def went_on_after_interrupt() -> None:
-    """An interrupt has been dealt with: a later error is none of its doing."""
+    """Note that an interrupt was dealt with, and did not cause later errors."""
     global _interrupted
     _interrupted = False
 
 
 @contextmanager
 def ended_with_us(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """A process that must not outlive the block: where the block fails it is interrupted, once, and
-    waited for. It needs a session of its own, or Ctrl-C reaches it from the terminal too.
+    """Interrupt a process, once, and wait for it, if the block fails.
 
-    It is interrupted by a kill (see `kill_as_interrupt`): in the background of a script Ctrl-C is
-    ignored, and so it is in what is started there.
+    The process needs a session of its own, or Ctrl-C in the terminal reaches it too. It is
+    interrupted by a kill (see `kill_as_interrupt`), because Ctrl-C is ignored in the background of
+    a script and in what is started there.
     """
     _running.add(process)
     try:

@@ -31,12 +31,12 @@ else:
 
 
 def is_used() -> bool:
-    """Whether compiled code does what it can."""
+    """Return whether compiled code is used where it can be."""
     return IS_THERE and os.environ.get(SWITCH, "").lower() not in ("0", "no", "false", "off")
 
 
 def state() -> str:
-    """For people: `in use (AVX-512)`, or why it is not."""
+    """Describe the compiled code for people: `in use (AVX-512)`, or why it is not."""
     if not IS_THERE:
         return f"not in use: {_why_not}"
     if not is_used():

@@ -34,7 +34,7 @@ class Stateful:
         return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts everything where `state_dict` found it. Raises `mismatch` for another's state.
+        """Restore everything that `state_dict` saved; raise `mismatch` for another's state.
 
         Raises:
             RunError: no mapping, or one without one of these names: another version saved it.
@@ -53,7 +53,7 @@ class Stateful:
         self.restored()
 
     def expect_state(self, state: Mapping[str, Any], names: Sequence[str]) -> None:
-        """Raises RunError for a state that is no mapping, or that lacks one of these names."""
+        """Raise RunError if a state is not a mapping or lacks one of these names."""
         own = type(self).__name__
         if not isinstance(state, Mapping):
             raise RunError(
@@ -67,15 +67,15 @@ class Stateful:
             )
 
     def restored(self) -> None:
-        """Called after `load_state_dict`."""
+        """Finish after `load_state_dict`; subclasses override it."""
 
     def mismatch(self, name: str, value: Any) -> Exception:
-        """What is raised where a saved state has another `value` of a name in `SAME`."""
+        """Return the error for a saved state with another `value` of a name in `SAME`."""
         return ValueError(f"the saved state is of another {type(self).__name__}: {name} {value}")
 
 
 def saved(value: Any) -> Any:
-    """A value as arrays and JSON values, sharing no memory with it."""
+    """Return a value as arrays and JSON values that share no memory with it."""
     if isinstance(value, np.random.Generator):
         return value.bit_generator.state
     if isinstance(value, Stateful):
@@ -102,13 +102,13 @@ def saved(value: Any) -> Any:
 
 
 def first_mismatch(error: RuntimeError) -> str:
-    """What PyTorch says first of weights of another network, below the name of the class."""
+    """Return the first line of PyTorch's complaint about weights of another network."""
     lines = str(error).splitlines()
     return lines[min(1, len(lines) - 1)].strip()
 
 
 def restored(current: Any, state: Any) -> Any:
-    """What `state` says, of the kind that `current` is: objects are changed in place."""
+    """Return the saved `state` as the kind that `current` is; objects are changed in place."""
     if isinstance(current, np.random.Generator):
         current.bit_generator.state = state
         return current

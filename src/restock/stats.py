@@ -32,7 +32,7 @@ class ConfidenceInterval:
     high: float
 
     def within(self, least: float, most: float = math.inf) -> ConfidenceInterval:
-        """The same, its ends cut at the range of the quantity."""
+        """Return the interval with its ends cut at the range of the quantity."""
         low, high = np.clip([self.low, self.high], least, most).tolist()
         return ConfidenceInterval(self.value, low, high)
 
@@ -41,12 +41,12 @@ NOT_KNOWN = ConfidenceInterval(float("nan"), float("nan"), float("nan"))
 
 
 def interval_text(value: float, low: float | None, high: float | None, form: str = ".2f") -> str:
-    """A value with the ends of its interval where there is one: `.52 [.41, .63]`."""
+    """Format a value with the ends of its interval, if it has one: `.52 [.41, .63]`."""
     return f"{value:{form}}" + ("" if low is None else f" [{low:{form}}, {high:{form}}]")
 
 
 def no_interval_text(why: str | None) -> str:
-    """What follows a value that has no interval: ` (no interval: WHY)`."""
+    """Return the note for a value without an interval: ` (no interval: WHY)`."""
     return f" (no interval: {why})" if why else ""
 
 
@@ -72,7 +72,7 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
 
 
 def iqm(values: NDArray[Any]) -> float:
-    """The interquartile mean: of the middle half of all values (arXiv:2108.13264)."""
+    """Return the interquartile mean: that of the middle half (arXiv:2108.13264)."""
     from scipy.stats import trim_mean
 
     return float(trim_mean(np.asarray(values, np.float64), 0.25, axis=None))
@@ -123,7 +123,7 @@ def improvement_of_arms(
 
 
 def percentiles(draws: NDArray[Any], confidence: float = 0.95) -> tuple[float, float]:
-    """The percentile interval of a statistic's bootstrap draws (R,)."""
+    """Return the percentile interval of a statistic's bootstrap draws (R,)."""
     low, high = np.quantile(draws, _tails(confidence))
     return float(low), float(high)
 
@@ -136,7 +136,7 @@ def bootstrap(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> tuple[float, float]:
-    """A stratified bootstrap interval of `statistic` over all values together.
+    """Return a stratified bootstrap interval of `statistic` over all values together.
 
     Each stratum (a condition, say) is resampled within itself, so that every resample holds the
     same number of values of each: what varies is the episodes, not the mix.
@@ -158,7 +158,7 @@ def mean_over_strata(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> ConfidenceInterval:
-    """The mean of the strata's means, each (n,) counting the same however many values it has.
+    """Return the mean of the strata's means, each (n,) weighted alike whatever its size.
 
     Given paired differences it is a paired bootstrap: pairs are drawn whole.
     """
@@ -207,7 +207,7 @@ def difference_of_arms(
 
 
 def _interaction(arm: F64) -> float:
-    """The variance of (runs, episodes) that neither the run nor the episode explains."""
+    """Return the variance of (runs, episodes) that neither the run nor the episode explains."""
     left = arm - arm.mean(axis=1, keepdims=True) - arm.mean(axis=0, keepdims=True) + arm.mean()
     return float((left**2).sum() / ((arm.shape[0] - 1) * (arm.shape[1] - 1)))
 
@@ -232,7 +232,7 @@ def paired_t(
 
 
 def nothing_varies(values: NDArray[Any]) -> bool:
-    """Whether all values (n,) are the same, but for rounding."""
+    """Return whether all values (n,) are the same, but for rounding."""
     return bool(np.allclose(values, values[0], rtol=1e-9, atol=1e-12))
 
 
@@ -250,7 +250,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def which_adjusted(primary: bool) -> str:
-    """Which p values of contrasts `holm` adjusted, as a sentence."""
+    """Say which contrasts' p values `holm` adjusted."""
     if primary:
         return (
             "The primary contrast was named before the runs; p of the others is adjusted for their"
@@ -263,14 +263,14 @@ def which_adjusted(primary: bool) -> str:
 
 
 def cluster_counts(clusters: int, resamples: int, rng: np.random.Generator) -> F64:
-    """How often a bootstrap over whole clusters draws each of them, (R, C)."""
+    """Draw how often a bootstrap over whole clusters takes each of them, (R, C)."""
     return rng.multinomial(clusters, np.full(clusters, 1 / clusters), resamples).astype(np.float64)
 
 
 def for_few_clusters(
     interval: ConfidenceInterval, clusters: int, confidence: float = 0.95
 ) -> ConfidenceInterval:
-    """The percentile interval of a bootstrap over C clusters, with its ends moved outwards.
+    """Return the percentile interval of a bootstrap over C clusters, widened for small C.
 
     That interval is too narrow where C is small: a draw's variance is (C - 1) / C of the true one,
     and the spread is itself estimated. So its ends are moved away from the value, by Student's t
@@ -359,7 +359,7 @@ def _quantile_rows(values: F64, weights: F64, shares: Sequence[float]) -> F64:
 
 
 def _intervals(at: F64, draws: F64, confidence: float) -> list[ConfidenceInterval]:
-    """Of statistics (Q,) with their draws (R, Q)."""
+    """Return the intervals of statistics (Q,) with their draws (R, Q)."""
     low, high = np.quantile(draws, _tails(confidence), axis=0)
     return [
         ConfidenceInterval(float(value), float(least), float(most))

@@ -43,7 +43,7 @@ class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     def check(self) -> None:
-        """Raises ValueError where values do not go together."""
+        """Raise ValueError if values cannot be combined."""
 
     def __post_init__(self) -> None:
         try:
@@ -58,7 +58,7 @@ class Checked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str, Any]:
-    """The values of a TOML file.
+    """Read the values of a TOML file.
 
     Raises:
         ConfigError: the file cannot be read, or is not TOML in UTF-8.
@@ -74,7 +74,7 @@ def read_toml(path: Path, *, remedy: str | None = "check the path") -> dict[str,
 
 
 def parse_toml(text: str, *, where: str) -> dict[str, Any]:
-    """The values of a TOML text; `where` names it in errors.
+    """Parse the values of a TOML text; `where` names it in errors.
 
     Raises:
         ConfigError: it is not TOML, or nested too deep for what reads its values.
@@ -128,7 +128,7 @@ def typed(
 
 
 def toml_value(value: Any) -> str:
-    """A string, number, boolean, list or mapping as TOML on one line."""
+    """Return a string, number, boolean, list or mapping as TOML on one line."""
     if isinstance(value, Mapping):
         items = (f"{_key(key)} = {toml_value(item)}" for key, item in value.items())
         return "{" + ", ".join(items) + "}"
@@ -146,7 +146,7 @@ def _key(name: str) -> str:
 
 @functools.cache
 def _ranges(kind: type) -> dict[str, kinds.Type]:
-    """The fields of a struct that are numbers to check, or hold some."""
+    """Return the fields of a struct that are numbers to check, or contain some."""
     info = kinds.type_info(kind)
     assert isinstance(info, kinds.StructType)
     return {f.name: f.type for f in info.fields if _ranged(f.type)}
@@ -359,7 +359,7 @@ def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def changed(settings: msgspec.Struct, names: Sequence[str] = (), **default: Any) -> list[str]:
-    """The settings (of all, or of these names) that are not at their defaults.
+    """Return the settings (all, or those of these names) that are not at their defaults.
 
     `default`: those that are not the struct's own.
     """

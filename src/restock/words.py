@@ -29,7 +29,7 @@ def uncertain_labels(conditions: Iterable[str], recordings: int) -> str:
 
 
 def by_priority(conditions: Iterable[str]) -> str:
-    """How rows that hold several conditions are counted once; `conditions` come in that order."""
+    """Say how rows that hold several conditions are counted once, in the given order."""
     return (
         "By priority, a row that holds several conditions counts once, for the first of "
         + ", ".join(conditions)
@@ -38,17 +38,17 @@ def by_priority(conditions: Iterable[str]) -> str:
 
 
 def figure(value: float) -> str:
-    """A measured number in three figures: `1,204`, `12.2`, `0.741`."""
+    """Format a measured number in three figures: `1,204`, `12.2`, `0.741`."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def quoted(path: object) -> str:
-    """A path as it is typed into a shell, in a command that a message suggests."""
+    """Quote a path for a command that a message suggests."""
     return shlex.quote(str(path))
 
 
 def verdict_said(verdict: str, *, decides: bool) -> str:
-    """Of a check of what two runs were fed: where it does not decide, a difference is allowed."""
+    """Say what a check of two runs' feeds means: differences may be allowed."""
     allowed = {"incomparable": "differs: allowed", "inconclusive": "may differ: allowed"}
     return verdict if decides else allowed.get(verdict, verdict)
 
@@ -69,7 +69,7 @@ def policy_words(policies: Iterable[str]) -> dict[str, str]:
 
 
 def _policy_in_words(name: str, parts: int) -> str:
-    """With so many parts of its path, where it has one."""
+    """Shorten a policy's name to so many parts of its path."""
     kind, _, path = name.partition(":")
     if kind == "limited":
         return f"{_policy_in_words(path, parts)}, limited"

@@ -256,15 +256,18 @@ def _settle_pandas() -> None:
 
 
 def _start_no_blas_threads() -> None:
-    """NumPy's OpenBLAS starts a thread a core while it is imported, and they wait for work in a
-    loop: a tenth of the CPU time of a short command on two cores, more on more. What it computes
-    then depends on the number of cores no more. A number that the environment gives stands."""
+    """Let NumPy's OpenBLAS start one thread, unless the environment sets a number.
+
+    By default it starts one for each core while it is imported, and they wait in a loop: a tenth of
+    the CPU time of a short command on two cores. With one thread, results do not depend on the
+    number of cores.
+    """
     if "numpy" not in sys.modules:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _without_ros(args: list[str]) -> list[str]:
-    """The flags before `--ros-args`; rclpy reads the rest from the command line itself."""
+    """Return the arguments before `--ros-args`; rclpy reads the others itself."""
     return args[: args.index("--ros-args")] if "--ros-args" in args else args
 
 

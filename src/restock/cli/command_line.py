@@ -32,7 +32,7 @@ _METAVARS = {str: "TEXT", int: "N", float: "X"}
 
 
 def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
-    """The dataclass with its types written so that its help is plain and its parsing quick.
+    """Return the dataclass with types for which tyro's help is plain and its parsing quick.
 
     Args:
         explained: its help is about to be printed: also read what each option says.
@@ -59,7 +59,7 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
 
 
 def _texts(command: type[Any]) -> dict[str, str]:
-    """What stands below each field, in one line: tyro would keep the line breaks of the source."""
+    """Return the text below each field in one line, without the source's line breaks."""
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(command))).body
     assert isinstance(tree, ast.ClassDef)
     texts = {}
@@ -74,7 +74,7 @@ def _texts(command: type[Any]) -> dict[str, str]:
 
 
 def _joined(text: str) -> str:
-    """A docstring with each paragraph in one line; what it indents, such as examples, stays."""
+    """Join each paragraph of a docstring into one line; indented examples stay."""
     paragraphs = text.split("\n\n")
     return "\n\n".join(one if one.startswith(" ") else " ".join(one.split()) for one in paragraphs)
 
@@ -110,7 +110,7 @@ def refuse_empty_paths(command: Any) -> None:
 
 
 def _prepared(hint: Any, default: Any) -> Any:
-    """A type with its metavar and its hint on the default, unless it says its own."""
+    """Return a type with its metavar and its hint on the default, unless it has its own."""
     bare, *extras = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     if typing.get_origin(bare) in (types.UnionType, typing.Union):
         kinds = [kind for kind in typing.get_args(bare) if kind is not type(None)]
@@ -128,8 +128,10 @@ def _prepared(hint: Any, default: Any) -> Any:
 
 
 def _one_of(literal: Any) -> tyro.constructors.PrimitiveConstructorSpec[str | None]:
-    """An option that takes one of a few names, or is left out. tyro's own takes None, too, and its
-    complaint has that among the names, in an order that changes."""
+    """Describe an option that takes one of a few names, or is left out.
+
+    tyro's own also takes None, and lists it among the names, in an order that changes.
+    """
     names = typing.get_args(literal)
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,

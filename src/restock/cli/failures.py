@@ -99,7 +99,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
 
 
 def _out_of_memory(error: BaseException | None) -> str:
-    """What DuckDB says where it may take no more memory, or ""; other errors may quote it."""
+    """Return DuckDB's message if it ran out of memory, even inside other errors, or ""."""
     while error is not None:
         if type(error).__name__ == "OutOfMemoryException":  # its package need not be imported
             return first_line(error)
@@ -108,12 +108,12 @@ def _out_of_memory(error: BaseException | None) -> str:
 
 
 def _undecoded(error: UnicodeEncodeError) -> bool:
-    """Whether it is of bytes that Python could not decode, of a path or of the command line."""
+    """Return whether the error is about bytes of a path that Python could not decode."""
     return all(map(is_undecoded, error.object[error.start : error.end]))
 
 
 def _in_gl(error: Exception) -> bool:
-    """Whether it came through the module in which MuJoCo loads what MUJOCO_GL names."""
+    """Return whether the error comes from the library that MUJOCO_GL names."""
     names = (frame.f_globals.get("__name__") for frame, _ in traceback.walk_tb(error.__traceback__))
     return GL in os.environ and any(
         str(name).startswith("mujoco.") and str(name).endswith("gl_context") for name in names
@@ -121,7 +121,7 @@ def _in_gl(error: Exception) -> bool:
 
 
 def _at(error: Exception) -> str:
-    """The innermost line of Restock that it came through."""
+    """Return the innermost line of Restock in the error's traceback."""
     lines = [
         f"in {frame.f_globals.get('__name__')}:{number}; "
         for frame, number in traceback.walk_tb(error.__traceback__)

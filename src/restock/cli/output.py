@@ -51,7 +51,7 @@ def _console_type() -> type[Console]:
 
 
 def stdout() -> Console:
-    """The console for data. Prose is not wrapped when it is not a terminal."""
+    """Return the console for data, which wraps prose only on a terminal."""
     console = _console_type()
     if sys.stdout.isatty():
         return console(file=sys.stdout, highlight=False)
@@ -66,12 +66,12 @@ def table_width() -> int:
 
 
 def stderr() -> Console:
-    """The console for progress and messages."""
+    """Return the console for progress and messages."""
     return _console_type()(file=sys.stderr, highlight=False)
 
 
 def say(message: str) -> None:
-    """One line of progress, to stderr: no markup, for it may hold a path or a command."""
+    """Print one line of progress to stderr, without markup: it may hold a path or a command."""
     stderr().print(visible(message, keep="\n"), markup=False, emoji=False, soft_wrap=True)
 
 
@@ -85,7 +85,7 @@ def say_unverified(store: Store) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value that JSON can hold: NaN and infinities become null, numpy scalars numbers."""
+    """Return a value that JSON can hold: NaN becomes null, NumPy scalars become numbers."""
     if hasattr(value, "item") and not hasattr(value, "__len__"):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -104,12 +104,12 @@ def plain(value: Any) -> Any:
 
 
 def print_json(value: Any) -> None:
-    """One JSON document, to stdout."""
+    """Print one JSON document to stdout."""
     sys.stdout.write(json.dumps(plain(value), indent=1, ensure_ascii=False) + "\n")
 
 
 def print_csv(rows: Sequence[Row], columns: Sequence[str] | None = None) -> None:
-    """A header and a line a row, to stdout."""
+    """Print a header and a line for each row to stdout."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(names)
@@ -132,7 +132,7 @@ def print_skipped(reasons: Mapping[str, str | None]) -> None:
 def print_table(
     rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str | None = None
 ) -> None:
-    """A table on stdout, its title above it; numbers to the right.
+    """Print a table under its title, with numbers to the right.
 
     As wide as the terminal, or PIPE_WIDTH: longer cells are wrapped. In a file or a pipe words and
     cells up to SHORT are not: if columns leave too little room, the table is wider. Words that say
@@ -178,7 +178,7 @@ def print_parted(
     key: Sequence[str],
     title: str | None = None,
 ) -> None:
-    """A table, and where it is too wide others below it with the other columns, each with `key`."""
+    """Print a table, split into several with the columns of `key` if it is too wide."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     for place, group in enumerate(_grouped(rows, names, key, table_width())):
         if place:
@@ -225,7 +225,7 @@ def _numeric(rows: Sequence[Row], name: str) -> bool:
 
 
 def print_wrapped(text: str) -> None:
-    """A paragraph after an empty line, wrapped as tables are: to the terminal, or PIPE_WIDTH."""
+    """Print a paragraph after an empty line, wrapped to the width of tables."""
     lines = _wrapped(text, table_width())
     stdout().print("\n".join(["", *lines]), markup=False, soft_wrap=True)
 
@@ -235,14 +235,14 @@ def _wrapped(text: str, columns: int) -> list[str]:
 
 
 def too_wide(rows: Sequence[Row], columns: Sequence[str] | None = None) -> bool:
-    """Whether a table of these rows would have to be fitted into the terminal, or a pipe."""
+    """Return whether a table of these rows must be fitted into the window or a pipe."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     widths = (max([len(name), *(len(cell(row[name])) for row in rows)]) + GAP for name in names)
     return sum(widths) > table_width()
 
 
 def reported(rows: Sequence[Row], columns: Sequence[str] | None = None) -> list[str]:
-    """The columns that any row has a value in, for tables whose columns often have none."""
+    """Return the columns in which any row has a value."""
     names = list(columns if columns is not None else rows[0] if rows else ())
     return [name for name in names if any(row[name] not in (None, "") for row in rows)]
 
@@ -253,7 +253,7 @@ def _styled(text: str) -> str:
 
 
 def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
-    """Whether every row is one line of PIPE_WIDTH; else a table is laid out by rich."""
+    """Return whether every row fits on one line of PIPE_WIDTH, so that rich is not needed."""
     if not rows or any("\n" in name for name in names):
         return False
     total = 1 - 3
@@ -266,7 +266,7 @@ def _fits(rows: Sequence[Row], names: Sequence[str]) -> bool:
 
 
 def print_plain(rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """A table for files and pipes, as `print_table` lays it out: a line a row, however wide."""
+    """Print a table for files and pipes: one line for each row, however wide."""
     numeric = [_numeric(rows, name) for name in columns]
     texts = [
         [cell(row[name]).replace(r"\[", "[").replace("\n", r"\n") for name in columns]
@@ -310,7 +310,7 @@ CLOCK_COLUMNS = ["log - stamp s", "clock"]
 
 
 def clock_cells(clock: Row | None) -> dict[str, str]:
-    """A topic's clocks for a table: how far log time is ahead of its stamps, and what is odd."""
+    """Return how far log time is ahead of a topic's stamps, and what is odd about them."""
     from restock.ingest.steps.clocks import odd
 
     offset = None if clock is None else clock["offset_ns"]
@@ -326,14 +326,14 @@ class Advance:
         self._part: tuple[str, TaskID] | None = None
 
     def __call__(self, amount: float = 1.0, note: str = "") -> None:
-        """So much more of the whole is done; the part at hand is over."""
+        """Advance the whole, and end the part at hand."""
         if self._bar is None or self._task is None:
             return
         self._bar.update(self._task, advance=amount, note=cell(visible(note)))
         self._end_part()
 
     def part(self, doing: str, done: float, whole: float) -> None:
-        """How far the part at hand is."""
+        """Show how far the part at hand is."""
         if self._bar is None:
             return
         if self._part is None or self._part[0] != doing:
@@ -349,7 +349,7 @@ class Advance:
 
 @contextmanager
 def progress(description: str, total: float | None) -> Iterator[Advance]:
-    """A progress bar on a terminal, silence elsewhere. Yields what moves it.
+    """Show a progress bar on a terminal, nothing elsewhere; yield what moves it.
 
     Without a total it shows that something moves, and for how long.
     """

@@ -14,7 +14,7 @@ from restock.errors import ConfigError
 
 
 def substitute_what_cannot_be_shown() -> None:
-    """A terminal or pipe that is not UTF-8 gets what it can show: no reason to stop a verb."""
+    """Replace characters that a terminal or pipe cannot show, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             with suppress(OSError):  # a stream that became a pipe under Python's eyes

@@ -1,4 +1,4 @@
-"""`restock audit`: is the coverage good enough?"""
+"""`restock audit`: check the coverage of a store, a panel and a run."""
 
 from __future__ import annotations
 
@@ -290,7 +290,7 @@ def _document(part: str, finding: Finding) -> dict[str, Any]:
 
 
 def _print(findings: list[Finding], shown: int) -> None:
-    """What was found, each with its first rows and advice; then what found nothing, by name."""
+    """Print each finding with its first rows and advice, then the names of the others."""
     from restock.cli import output
 
     reported = [finding for finding in findings if finding.rows]
@@ -320,7 +320,7 @@ def _print(findings: list[Finding], shown: int) -> None:
 
 
 def _print_reward(reward: RewardAudit) -> None:
-    """Returns by driver, whether more success earns more, and what to do where it does not."""
+    """Print returns by driver, and whether more success earns a higher return."""
     from restock.cli import output
 
     outcomes: dict[tuple[str, str], list[str]] = {}
@@ -379,7 +379,7 @@ def _interval(value: float, ends: list[float]) -> str:
 
 
 def _summary(findings: list[Finding]) -> str:
-    """How many of each, and what would have let the skipped ones run."""
+    """Count findings by status, and say what would have let the skipped audits run."""
     past_tense = {"fail": "failed", "warn": "warned", "info": "informed", "pass": "passed"}
     counts = [
         f"{count} {word}"

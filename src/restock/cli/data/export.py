@@ -93,7 +93,7 @@ class ExportCommand:
             output.stdout().print(line, markup=False)
 
     def _cameras(self) -> list[str] | None:
-        """As `export_dataset` takes them."""
+        """Return cameras as `export_dataset` takes them."""
         if self.cameras == "all":
             return None
         names = [name.strip() for name in self.cameras.split(",")]

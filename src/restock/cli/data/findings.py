@@ -33,7 +33,7 @@ class Part(NamedTuple):
 
 
 def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
-    """A difference of two stores (`StoreDifference.document`) as findings.
+    """Return the difference of two stores (`StoreDifference.document`) as findings.
 
     What the old store had and the new one lacks is a failure; changed definitions and labels are a
     warning, for they may be meant; what came is for information.
@@ -96,7 +96,7 @@ def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
 
 
 def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Finding]:
-    """What `restock eval --baseline` says of a run (`regression`), a finding a row of it."""
+    """Return a finding for each row of a run's regression against a baseline."""
     found = []
     for row in rows:
         severity: Severity = "error" if row["verdict"] in ("worse", "refused") else "warning"
@@ -116,8 +116,10 @@ def of_regression(rows: Sequence[dict[str, Any]], *, baseline: str) -> list[Find
 
 
 def refused(name: str, error: RestockError, *, option: str) -> list[Finding]:
-    """What could not be looked at, as a failure: a pipeline must not pass over it. `option` is the
-    one that asked for it, with its value."""
+    """Return a failure for what could not be compared, which a pipeline must not pass over.
+
+    `option` is the option that asked for it, with its value.
+    """
     row = {"what": error.what, "where": error.where or ""}
     where = f"{error.where}: " if error.where and error.where not in option else ""
     advice = error.remedy or f"correct {option.split()[0]}, or leave it out"
@@ -135,7 +137,7 @@ def _finding(
 
 
 def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
-    """A summary for people, of Markdown as pipelines show it: failures first."""
+    """Write a summary as Markdown for a pipeline's page, failures first."""
     every = [(part.name, one) for part in parts for one in part.findings]
     every.sort(key=lambda pair: WORST_FIRST.index(pair[1].status))
     failed = sum(one.status in failing for _, one in every)
@@ -172,7 +174,7 @@ def markdown(title: str, parts: Sequence[Part], *, failing: set[str]) -> str:
 
 
 def _cell(value: Any) -> str:
-    """A value in a Markdown table: one line, and nothing that a page would take for markup."""
+    """Return a value for a Markdown table: one line, without markup."""
     text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
     text = " ".join(text.split())
     text = text if len(text) <= 100 else f"{text[:99]}…"

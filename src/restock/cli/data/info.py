@@ -1,4 +1,4 @@
-"""`restock info`: what is in these recordings or stores, and does this machine do?"""
+"""`restock info`: describe recordings, stores, or this machine."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _share(stored: int, plain: int | None) -> str:
 
 
 def _packed(chunks: dict[str, Any]) -> str:
-    """How a file's messages are packed, in a line."""
+    """Describe in one line how a file's messages are compressed."""
     stored, plain = chunks["stored_bytes"], chunks["plain_bytes"]
     kind = chunks["compression"] or "not compressed"
     number = counted(chunks["chunks"], "chunk")

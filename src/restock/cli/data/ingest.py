@@ -127,7 +127,7 @@ class IngestCommand:
         return ExitCode.LOSSY if failures or lossy else ExitCode.OK
 
     def _recordings(self) -> tuple[list[Path], list[dict[str, Any]]]:
-        """The recordings of all paths, each once, and the paths that have none."""
+        """Return the recordings of all paths, each once, and the paths that have none."""
         from restock.ingest.containers.open_recording import recordings_in
 
         paths: dict[Path, None] = {}
@@ -153,7 +153,7 @@ _LEFT_OUT = (
 
 
 def as_json(outcome: IngestResult) -> dict[str, Any]:
-    """An outcome as `--json` prints it."""
+    """Return an outcome as `--json` prints it."""
     from restock.ingest.task.label_scores import GOOD
 
     # Of events, too; a recording that was ingested before there were such counts has none.
@@ -186,7 +186,7 @@ def as_json(outcome: IngestResult) -> dict[str, Any]:
 
 
 def show(outcome: IngestResult) -> None:
-    """One recording's counts, as tables on stdout."""
+    """Print the counts of one recording as tables."""
     from restock.cli import output
     from restock.ingest.store.manifest import UNUSED
     from restock.ingest.task.tags import in_words
@@ -309,7 +309,7 @@ def show(outcome: IngestResult) -> None:
 
 
 def _unknown(row: Mapping[str, Any]) -> list[str]:
-    """What its rows do not tell, a line a reason."""
+    """List the conditions that are unknown for its rows, a line for each reason."""
     by_reason: dict[str, list[str]] = {}
     for one in row["unknown_conditions"] or []:
         by_reason.setdefault(one["because"], []).append(one["condition"])

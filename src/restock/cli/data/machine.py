@@ -62,7 +62,7 @@ def _machine() -> list[Finding]:
 
 
 def _packages() -> list[Finding]:
-    """What Restock needs, and its extras: the version, or how to install one that serves."""
+    """Check what Restock and its extras need, and say how to install what is missing."""
     from packaging.requirements import Requirement
 
     found = []
@@ -99,7 +99,7 @@ def _torch() -> Finding:
 
 
 def _native() -> Finding:
-    """Whether the update of a plain network is compiled; without, it takes longer."""
+    """Check whether the update of a plain network is compiled; it is slower without."""
     state = native.state()
     if native.IS_THERE:
         return Finding("works", "native code", "ok", state)
@@ -110,7 +110,7 @@ def _native() -> Finding:
 
 
 def _drawing() -> Finding:
-    """Whether MuJoCo can draw off screen; only what its cameras see needs it."""
+    """Check whether MuJoCo can draw off screen, which only its cameras need."""
     command = [sys.executable, "-c", DRAWS]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=DRAWS_S)

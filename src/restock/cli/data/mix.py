@@ -141,7 +141,7 @@ class MixCommand:
 
 
 def describe(plan: PanelPlan) -> dict[str, Any]:
-    """The plan as a document: what `--json` prints."""
+    """Return the plan as `--json` prints it."""
     return {
         "strata": [_line(stratum) for stratum in plan.strata],
         "rows": len(plan.panel_rows),
@@ -188,7 +188,7 @@ def _line(stratum: Stratum) -> dict[str, Any]:
 
 
 def _table(strata: list[dict[str, Any]], *, wide: bool) -> list[dict[str, Any]]:
-    """As many columns as fit; shares in percent, each named with what it is of."""
+    """Print as many columns as fit; shares are in percent, and each says of what."""
     rows = []
     missing = any(line["missing_rows"] for line in strata)
     for line in strata:
@@ -219,7 +219,7 @@ def _percent(share: float) -> float:
 
 
 def _missing(line: dict[str, Any]) -> str:
-    """What would fill a stratum, in rows and in hours of driving."""
+    """Say what would fill a stratum, in rows and in hours of driving."""
     if not line["missing_rows"]:
         return ""
     text = f"; {counted(line['missing_rows'], 'more row')} would fill it"
@@ -231,7 +231,7 @@ def _missing(line: dict[str, Any]) -> str:
 
 
 def _in_training(document: dict[str, Any], most: float) -> list[str]:
-    """What logged rows bear of their quotas at `restock train`'s default budget, if it is less."""
+    """Say how much of their quotas logged rows cover at the default training budget."""
     updates, batch_size = TRAINING
     short = []
     for line in document["strata"]:

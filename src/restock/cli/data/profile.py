@@ -186,8 +186,9 @@ class ProfileCommand:
         return ExitCode.LOSSY if lossy else ExitCode.OK
 
     def _drives(self, paths: Sequence[Path]) -> tuple[Drives | None, list[Path]]:
-        """Several recordings by their kind of robot, and those that cannot be read, which are
-        named; None for a single recording.
+        """Group several recordings by kind of robot, and name those that cannot be read.
+
+        The groups are None for a single recording.
 
         Raises:
             RecordingError: none can be read.
@@ -286,8 +287,10 @@ class ProfileCommand:
     def _advice(
         self, profile: Profile, outcome: IngestResult | None
     ) -> tuple[list[str], float | None]:
-        """What of the profile removes most rows or labels most of them, and what to try; and at
-        what share of the ticks the lidar sees something inside the robot's outline."""
+        """Say what in the profile removes or labels most rows, and what to try.
+
+        Also return the share of ticks at which the lidar sees something inside the robot's outline.
+        """
         from restock.cli import output
         from restock.ingest.propose.trial import try_profile
         from restock.ingest.steps.needs import as_recorded, read_topics
@@ -314,8 +317,10 @@ class ProfileCommand:
 
 
 def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
-    """What is missing of these recordings' files and of the topics that a profile takes: a line
-    each. Of a profile that cannot be used yet, of all topics that were read."""
+    """List what is missing of the recordings' files and of the topics that a profile takes.
+
+    If the profile cannot be used yet, all topics that were read count.
+    """
     from restock.ingest.profile.profile import parse_profile
 
     topics = None
@@ -331,8 +336,10 @@ def _losses(recordings: Sequence[Recording], toml: str) -> list[str]:
 
 
 def _inside_outline(profile: Profile, topics: Mapping[str, Any]) -> float | None:
-    """The share of usable ticks with a return of the lidar inside the robot's outline; None where
-    there is no lidar."""
+    """Return the share of usable ticks with a lidar return inside the robot's outline.
+
+    None if there is no lidar.
+    """
     from restock.ingest.steps.steps import steps_of
 
     scan = profile.inputs.scan
@@ -348,7 +355,7 @@ def _inside_outline(profile: Profile, topics: Mapping[str, Any]) -> float | None
 
 
 def _inputs(profile: Any, topics: Any) -> list[dict[str, Any]]:
-    """What the profile takes from where, and how many messages of it there are."""
+    """List where each input comes from, and how many messages it has."""
 
     from restock.ingest.steps.needs import near
 

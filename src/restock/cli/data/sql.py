@@ -112,7 +112,7 @@ class SqlCommand:
             output.say(f"{count:,} rows, {len(rows)} shown; a file or a pipe gets all of them")
 
     def _show(self, rows: list[dict[str, Any]], columns: list[str]) -> None:
-        """A table, or the rows one below the other where that would not fit."""
+        """Print a table, or the rows one below the other if a table would not fit."""
         from restock.cli import output
 
         if len(rows) <= EXPANDED_ROWS and output.too_wide(rows, columns):
@@ -162,7 +162,7 @@ class SqlCommand:
 
 
 def _cut(row: dict[str, Any]) -> dict[str, Any]:
-    """The row with long lists cut, as a terminal shows it."""
+    """Cut long lists of a row for a terminal."""
     return {
         name: [*value[:CUT_TO], f"… {len(value):,} in all"]
         if isinstance(value, list | tuple) and len(value) > 2 * CUT_TO

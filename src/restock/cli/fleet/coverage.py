@@ -12,8 +12,7 @@ import tyro
 
 @dataclass
 class CoverageCommand:
-    """Show how much of each condition a store holds, where, when and by which driver, and what is
-    missing.
+    """Show how much of each condition a store holds, where, when and by which driver.
 
     Prints the rows in which each condition holds, their episodes and success. A row can hold
     several conditions and counts for each of them; `by priority` counts it once. With --out, it

@@ -1,4 +1,4 @@
-"""`restock coverage diff`: what is different between two stores, store versions, panels or runs?"""
+"""`restock coverage diff`: compare two stores, versions, panels or runs."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
 
 
 def _kind_of(place: str) -> str:
-    """A panel or a run by its own file; all else is to be a store, which says what it is not."""
+    """Tell a panel or a run by its own file; everything else is taken for a store."""
     from restock.replay.panel.panel import HEADER
     from restock.replay.places import RUN_CONFIG
 

@@ -203,7 +203,7 @@ def _print_labels(labels: dict[str, Any]) -> None:
 
 
 def _section(title: str, rows: list[dict[str, Any]]) -> None:
-    """A table, cut on a terminal, which says what it left out."""
+    """Print a table, cut on a terminal, with a note of what was left out."""
     from restock.cli import output
 
     if not rows:

@@ -1,4 +1,4 @@
-"""`restock coverage drift`: which robot's wheels, lidar or floor have changed?"""
+"""`restock coverage drift`: find the robots whose wheels, lidar or floor have changed."""
 
 from __future__ import annotations
 

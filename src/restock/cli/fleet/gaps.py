@@ -1,4 +1,4 @@
-"""`restock coverage gaps`: what is missing, and which missions would fill it?"""
+"""`restock coverage gaps`: find what is missing, and which missions would fill it."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def _interval(gap: dict[str, Any], name: str) -> str:
 
 
 def _unknown(gaps: list[dict[str, Any]], unit: str) -> list[dict[str, Any]]:
-    """One line for the actions of a condition that nobody ever took there."""
+    """Name in one line the actions that nobody ever took in a condition."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for gap in gaps:
         key = (gap["stratum"] or gap["condition"], gap["zone"], gap["robot"], gap["asked_by"])

@@ -1,4 +1,4 @@
-"""`restock compare`: were two runs fed the same, and if so, which one did better?"""
+"""`restock compare`: check whether two runs were fed the same, and which did better."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class CompareCommand:
 def _write(
     comparison: Comparison, first: Sequence[Path], second: Sequence[Path], out: Path
 ) -> Path:
-    """The page, with what the comparison itself does not need: curves and cost."""
+    """Write the page, with the curves and costs that the comparison itself does not need."""
     from restock.cli.output import plain
     from restock.report import write_comparison_page
     from restock.train.study.contrasts import learning_curves, training_cost
@@ -98,7 +98,7 @@ def _write(
 
 
 def _names(first: Sequence[Path], second: Sequence[Path]) -> tuple[str, str]:
-    """What the arms are called: their run, or what all of their runs are called but for a seed."""
+    """Name each arm by its run, or by what its runs are all called but for a seed."""
     names = []
     for paths in (first, second):
         bare = {path.name.rstrip("-_.0123456789") for path in paths}

@@ -19,7 +19,7 @@ _OF_LOGS = ("policies", "successes", "logs_share", "offline_updates")  # of a te
 
 
 def describe_run(prepared: Prepared) -> str:
-    """The run, and what of it one may not expect: a line each."""
+    """Describe the run, and what not to expect of it, in a line each."""
     config, panel, document = prepared.config, prepared.panel, prepared.document
     schedule = config.schedule
     fed = "no panel: online only"
@@ -169,7 +169,7 @@ def _teacher(teacher: TeacherConfig, panel: Panel | None) -> str:
 
 
 def _not_evaluated(document: dict[str, Any]) -> list[str]:
-    """The conditions that the twin cannot show, and why."""
+    """Return the conditions that the twin cannot show, and why."""
     return [
         f"condition {name!r} is not evaluated in the twin, which has no {', '.join(signals)}: "
         + (

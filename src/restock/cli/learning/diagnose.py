@@ -1,4 +1,4 @@
-"""`restock diagnose`: is it what the critic was fed, or the target it follows?"""
+"""`restock diagnose`: tell failures of the feed from failures of the target."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class DiagnoseCommand:
-    """Find out why a critic fails: because of the buffer, or because of the target?
+    """Find out why a critic fails: because of the buffer, or because of the target.
 
     For each condition, it compares replay with the steps of the periodic evaluations, which are
     never replayed: TD error, frequency and rows. It also compares the online network with the

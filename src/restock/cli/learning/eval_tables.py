@@ -13,8 +13,10 @@ if TYPE_CHECKING:
 
 
 def show_measures(rows: list[dict[str, Any]]) -> None:
-    """A table a perturbation: success, return and safety, policies beneath each other within a
-    condition. Where it is too wide it is parted, so that no measure is left out."""
+    """Print a table for each perturbation: success, return and safety of each policy.
+
+    A table that is too wide is split, so that no measure is left out.
+    """
     from restock.cli.output import print_parted, say
 
     names = policy_words(row["policy"] for row in rows)
@@ -63,7 +65,7 @@ def _with_interval(row: dict[str, Any], name: str, form: str) -> str:
 
 
 def show_off_policy(path: Path, result: OpeResult, config: OpeConfig, *, as_json: bool) -> None:
-    """A row per measure and condition, a column per estimator; and why weighting is refused."""
+    """Print a row per measure and condition, and why weighting is refused if it is."""
     from restock.cli.output import print_json, print_table, say
 
     if as_json:
@@ -117,7 +119,7 @@ def _value(row: dict[str, Any]) -> str:
 
 
 def show_regression(rows: list[dict[str, Any]], baseline: str, margin: float) -> None:
-    """A row per perturbation and condition, and one line with the result."""
+    """Print a row per perturbation and condition, and one line with the result."""
     from restock.cli.output import print_table, say
 
     print_table(

@@ -65,7 +65,7 @@ class SchemaCommand:
 
 
 def schema_of(name: str) -> str:
-    """The schema of a config, as JSON text."""
+    """Return the schema of a config, as JSON text."""
     from restock.toml import json_schema
 
     kind, changed = _kinds()[name]
@@ -84,7 +84,7 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
     from restock.train.twin.physics.perturbation import Perturbation, Schedule
 
     def as_it_is(_: dict[str, Any]) -> None:
-        """What is read is what the file says."""
+        """Change nothing, if the file is read as it is written."""
 
     return {
         "train": (TrainConfig, as_it_is),
@@ -99,7 +99,7 @@ def _kinds() -> dict[str, tuple[type, Callable[[dict[str, Any]], None]]]:
 
 
 def _conditions_in_files(schema: dict[str, Any]) -> None:
-    """A `[[condition]]` names a .sql file in place of its `sql`."""
+    """Let a `[[condition]]` name a .sql file in place of its `sql`."""
     condition = schema["$defs"]["Condition"]
     condition["properties"]["file"] = {
         "type": "string",

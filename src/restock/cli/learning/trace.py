@@ -1,4 +1,4 @@
-"""`restock trace`: where did this sampled row come from?"""
+"""`restock trace`: follow a sampled row back to the message it came from."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ class TraceCommand:
 
 
 def document(trace: tracing.Trace) -> dict[str, Any]:
-    """A trace as one document: what `--json` prints. What is not known is null."""
+    """Return a trace as `--json` prints it; what is not known is null."""
     origin = asdict(trace.origin) if trace.origin is not None else None
     names = (
         *("transition", "reward_parts", "store", "recording", "moment", "topics"),
@@ -256,7 +256,7 @@ def _print_view(written: dict[str, Any]) -> None:
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:
-    """A table of names and values, without what is empty."""
+    """Print a table of names and values, without empty ones."""
     from restock.cli import output
 
     known = {name: value for name, value in (values or {}).items() if value not in (None, "", [])}

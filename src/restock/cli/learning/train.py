@@ -132,7 +132,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
     seconds = config.schedule.seconds
 
     def spent() -> int:
-        """Of the budget: seconds, or environment steps."""
+        """Return how much of the budget is used, in seconds or environment steps."""
         return session.progress.env_steps if seconds is None else round(session.wall_s)
 
     budget = config.schedule.env_steps if seconds is None else round(seconds)
@@ -182,7 +182,7 @@ def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C asks the loop to stop with a checkpoint, the second one stops at once."""
+    """Let the first Ctrl-C stop the loop with a checkpoint, and the second one at once."""
     from restock.cli.output import say
 
     # On a thread: a handler must not print while what it interrupts does.

@@ -32,7 +32,7 @@ OF_ONE_ROBOT = ("urdf", "footprint", "robot")
 
 
 def fullest(document: Document) -> str | None:
-    """The recording that has most of what a profile needs: a command, a pose, and time."""
+    """Return the recording with most of what a profile needs: a command, a pose, and time."""
     from restock.ingest.propose.evidence.roles import KINDS
 
     def types(role: str) -> set[str]:
@@ -48,7 +48,7 @@ def fullest(document: Document) -> str | None:
 
 
 def edited(profile: Path | str | None, out: Path) -> bool:
-    """Whether the profile in the folder is a person's: not, byte for byte, what was proposed."""
+    """Return whether a person edited the profile in the folder since it was proposed."""
     path, proposed = Path(str(profile)), out / FOLDER / "propose.json"
     if not path.is_file():
         return False
@@ -56,7 +56,7 @@ def edited(profile: Path | str | None, out: Path) -> bool:
 
 
 def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
-    """Recordings of several kinds of robots: one call for each, the profile's own first.
+    """Stop at recordings of several kinds of robots, with one call for each kind as remedy.
 
     With the options that were given; what describes one robot is for the first kind alone.
     """
@@ -78,7 +78,7 @@ def several_kinds(kinds: list[Any], requested: StartCommand) -> Stop:
 
 
 def _options(requested: StartCommand, *, but: Collection[str]) -> list[str]:
-    """The options of a call that are not the default, as they are typed."""
+    """Return the options of a call that are not the default, as they are typed."""
     words = []
     for field in dataclasses.fields(requested):
         value = getattr(requested, field.name)
@@ -91,15 +91,14 @@ def _options(requested: StartCommand, *, but: Collection[str]) -> list[str]:
 
 
 def of_other_kinds(out: Path) -> list[str]:
-    """The recordings that the proposal in this folder is not for: those of other kinds of robots,
-    and those that it could not read."""
+    """Return the recordings of other kinds of robots, and those that could not be read."""
     document = _proposal(out)
     others = [path for kind in document.get("kinds", [])[1:] for path in kind["recordings"]]
     return [*others, *document.get("unreadable", [])]
 
 
 def proposed_from(out: Path) -> str | None:
-    """The recording that the proposal in this folder was made from: it gives rows, if any does."""
+    """Return the recording that the proposal in this folder was made from."""
     return next(iter(_proposal(out).get("read", [])), None)
 
 
@@ -109,7 +108,7 @@ def _proposal(out: Path) -> Document:
 
 
 def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bool) -> Stop | None:
-    """The lidar sees things inside the robot most of the time: its outline is not the robot's.
+    """Stop if the lidar sees something inside the robot's outline most of the time.
 
     `proposed`: the profile is as it was proposed, and may be proposed again.
     """
@@ -148,7 +147,7 @@ def node_refuses(profile: Path | str | None) -> str | None:
 
 
 def horizon(profile: Path | str | None) -> float:
-    """Some 3 s in whole control periods: the twin's limits are of that."""
+    """Return some 3 s in whole control periods, the horizon of the twin's limits."""
     if (task := _task(profile)) is None:
         return 3.0
     period_s = task.control_period_s
@@ -156,13 +155,13 @@ def horizon(profile: Path | str | None) -> float:
 
 
 def has_goal(profile: Path | str | None) -> bool:
-    """Whether the task has one: without, there is no success to compare."""
+    """Return whether the task has a goal; without one, there is no success to compare."""
     task = _task(profile)
     return task is None or task.goal != "none"
 
 
 def _task(profile: Path | str | None) -> Task | None:
-    """Of a profile; None where there is none yet, as before a proposal."""
+    """Return the task of a profile; None if there is no profile yet."""
     from restock.ingest.profile.profile import load_profile
 
     if profile is None or (isinstance(profile, Path) and not profile.is_file()):
@@ -234,7 +233,7 @@ def no_ways(to: Settings) -> str | None:
 
 
 def evidence_lines(to: Settings) -> list[str]:
-    """What the logs lack for the twin and a policy to be judged by them, and what to record."""
+    """Say what must be logged before the twin and a policy can be judged by the logs."""
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.store.store import Store
     from restock.train.diagnosis.evidence_needed import policy_evidence, twin_evidence
@@ -269,7 +268,7 @@ def floor_settings(to: Settings, kinds: Collection[str]) -> list[str]:
 
 
 def missions_unseen(to: Settings, document: Document) -> str | None:
-    """What there is room for on the floor and no sensor sees, so that it is left out."""
+    """Say which missions are left out because the robot has no lidar to see them coming."""
     if not (unseen := _unseen(to, document)):
         return None
     kinds = ", ".join(unseen).replace("_", " ")
@@ -287,13 +286,13 @@ def _unseen(to: Settings, document: Document) -> list[str]:
 
 
 def possible_kinds(to: Settings, document: Document) -> list[str]:
-    """The kinds of episode that the floor has room for and that the robot can do."""
+    """Return the kinds of mission that the floor has room for and that the robot can do."""
     unseen = _unseen(to, document)
     return [kind for kind in document.get("episodes", []) if kind not in unseen]
 
 
 def logs_alone_settings(coverage: Document) -> list[str]:
-    """No twin, and no action that the logs' drivers would not plausibly have taken."""
+    """Return settings for training without a twin, on actions that the logs' drivers might take."""
     from restock.toml import toml_value
 
     drivers = sorted({name for row in coverage.get("rows", []) for name in row[DRIVERS] or ()})
@@ -303,10 +302,11 @@ def logs_alone_settings(coverage: Document) -> list[str]:
 def updates_settings(
     mix: Document, minutes: float, *, twin: bool, seconds: float = math.inf
 ) -> list[str]:
-    """As many offline updates as the panel's rows and the budget allow; each curve has points.
+    """Return settings for as many offline updates as the panel's rows and the budget allow.
 
-    Of few rows, each of which may be drawn so often and no more, half of the draws are left for the
-    `seconds` in the twin, and planned for the steps that fit in them.
+    Each row may be drawn only so often. If there are few rows, half of the draws are left for the
+    `seconds` in the twin, and planned for the steps that fit into them. Each curve gets enough
+    points.
     """
     from restock.train.dqn.config import TrainConfig
 
@@ -332,7 +332,7 @@ def updates_settings(
 
 
 def robot_line(profile: Path | str | None) -> str:
-    """What the twin builds, and where that is from."""
+    """Describe the robot that the twin builds, and where each figure is from."""
     from restock.ingest.profile.profile import load_profile
 
     robot = None if profile is None else load_profile(str(profile)).robot

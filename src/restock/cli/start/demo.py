@@ -112,7 +112,7 @@ class DemoCommand:
         return None
 
     def _given(self) -> list[Path]:
-        """The user's own files: the recordings and the profile, which are to be there.
+        """Return the user's own files, which must exist: the recordings and the profile.
 
         Raises:
             RestockError: they cannot be found or read.
@@ -128,7 +128,7 @@ class DemoCommand:
 
 
 def tell(to: Settings, console: Console) -> None:
-    """What came of it, from what the stages wrote."""
+    """Print the results, read from what the stages wrote."""
     from restock.cli.output import print_table
 
     def show(title: str, lines: list[str]) -> None:
@@ -153,7 +153,7 @@ def tell(to: Settings, console: Console) -> None:
 
 
 def plan_of(to: Settings) -> list[Stage]:
-    """The stages of the demo, in order."""
+    """Return the stages of the demo, in order."""
     return [
         stages.info(to),
         stages.ingest(to),
@@ -244,7 +244,9 @@ def find_logs() -> Path | None:
 
 
 def prepare(out: Path, given: Sequence[Path] = ()) -> None:
-    """An empty directory for the demo; one that an earlier demo left is replaced.
+    """Make an empty directory for the demo, in place of what an earlier demo left.
+
+    Raises:
 
     Raises:
         RestockError: there is something at `out` that no demo made, or that is one of the user's

@@ -17,7 +17,7 @@ ESTIMATORS = (
 
 
 def info(document: Document) -> list[str]:
-    """How much there is."""
+    """Say how much was recorded."""
     recordings = document["recordings"]
     seconds = sum(row["duration_s"] or 0.0 for row in recordings)
     messages = sum(row["messages"] for row in recordings)
@@ -28,7 +28,7 @@ def info(document: Document) -> list[str]:
 
 
 def propose(document: Document) -> list[str]:
-    """What the proposed profile makes of the recording."""
+    """Say what the proposed profile makes of the recording."""
     made, ticks = counted(document["transitions"], "transition"), counted(document["ticks"], "tick")
     lines = [f"{made} of {ticks}"]
     if unread := document.get("unread"):
@@ -43,7 +43,7 @@ def propose(document: Document) -> list[str]:
 
 
 def check(document: Document) -> list[str]:
-    """What the profile finds, and what stands in for what is not there."""
+    """Say what the profile finds, and what stands in for missing inputs."""
     lines = [*document["problems"]]
     if (outcome := document["outcome"]) is None:
         return lines
@@ -92,7 +92,7 @@ def ingest(document: Document) -> list[str]:
 
 
 def _some(lines: list[str], most: int = 3) -> list[str]:
-    """The first of them, and how many more there are."""
+    """Return the first lines, and how many more there are."""
     more = [f"… and {len(lines) - most} more"] if len(lines) > most else []
     return lines[:most] + more
 
@@ -111,7 +111,7 @@ def coverage(document: Document) -> list[str]:
 
 
 def audit(document: Document) -> list[str]:
-    """Which audits failed or warned."""
+    """Name the audits that failed or warned."""
     lines = []
     for status, word in (("fail", "failed"), ("warn", "warned")):
         found = [item for item in document["audits"] if item["status"] == status]
@@ -138,7 +138,7 @@ def mix(document: Document) -> list[str]:
 
 
 def floor(document: Document) -> list[str]:
-    """What it was made from, how large it is, and which episodes fit."""
+    """Say what the floor was made from, how large it is, and which missions fit."""
     aisles = counted(document["aisle_segments"], "aisle segment")
     lines = [
         f"made from {document['made_from']}: {document['width_m']:g} x {document['depth_m']:g} m,"
@@ -149,7 +149,7 @@ def floor(document: Document) -> list[str]:
 
 
 def fit(document: Document) -> list[str]:
-    """The parameters that the logs tell, and the distance before and after."""
+    """Say which parameters the logs determine, and the distance before and after."""
     (first, *_) = document["fits"]
     reported = [
         f"{item['name']} {interval_text(item['value'], item['low'], item['high'], '.3g')}"
@@ -164,7 +164,7 @@ def fit(document: Document) -> list[str]:
 
 
 def gap(document: Document) -> list[str]:
-    """In which conditions the twin may be trusted."""
+    """Say in which conditions the twin may be trusted."""
     by: dict[str, list[str]] = {}
     for item in document["verdicts"]:
         by.setdefault(item["verdict"], []).append(item["condition"])
@@ -174,12 +174,12 @@ def gap(document: Document) -> list[str]:
 
 
 def of_nominal(document: Document) -> Mapping[str, Any] | None:
-    """The verdict on nominal driving, with its reasons; None where there is none."""
+    """Return the verdict on nominal driving, with its reasons; None if there is none."""
     return next((v for v in document.get("verdicts", []) if v["condition"] == "nominal"), None)
 
 
 def train(document: Document) -> list[str]:
-    """How much it learnt from, and what was kept."""
+    """Say how much the policy learned from, and what was kept."""
     twin = f", {document['env_steps']:,} steps in the twin" if document["env_steps"] else ""
     lines = [f"{document['gradient_steps']:,} updates{twin}, {_time(document['wall_s'])}"]
     best = document["best"]
@@ -216,7 +216,7 @@ def driven(document: Document) -> list[str]:
 
 
 def driven_on_ways(document: Document) -> list[str]:
-    """Which ways these are, and the success of each policy there."""
+    """Say which routes were driven, and the success of each policy there."""
     bare = {**document, "clones": []}  # the next evaluation says how good the clone is
     return [str(document["missions"]), *driven(bare)]
 
@@ -227,7 +227,7 @@ def _difference(row: Mapping[str, Any]) -> str:
 
 
 def on_logs(document: Document) -> list[str]:
-    """What the policy is worth by held-out logs, beside what the logs' drivers achieved."""
+    """Compare the policy's worth by held-out logs with what the logs' drivers achieved."""
     rows = [row for row in document["results"] if row["condition"] == "all"]
     lines = []
     for measure in dict.fromkeys(row["measure"] for row in rows):
@@ -257,7 +257,7 @@ def report(document: Document) -> list[str]:
 
 
 def errors(text: str) -> list[str]:
-    """The complaints that a verb left on stderr, each with its remedy, without its progress."""
+    """Return the complaints that a verb left on stderr, with remedies and without progress."""
     found: list[str] = []
     for line in text.splitlines():
         if line.startswith(_COMPLAINT):

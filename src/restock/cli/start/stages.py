@@ -19,7 +19,7 @@ UPDATES = 2000  # of a policy from the logs alone: as many as one has that goes 
 
 
 def nothing(document: Document) -> list[str]:
-    """Of a stage that has nothing to say beside its output."""
+    """Return no lines, for a stage whose output says enough."""
     return []
 
 
@@ -43,7 +43,7 @@ class Stage:
     decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
-        """The command, to be copied; beside another, where two run at the same time."""
+        """Return the command as it is typed, below the one that runs beside it."""
         beside = f"restock {shlex.join(self.beside)} &\n" if self.beside else ""
         return f"{beside}restock {shlex.join(self.command)}"
 
@@ -112,12 +112,12 @@ class Settings:
 
     @property
     def layouts(self) -> str:
-        """All floors, as a run's config and evaluations take them."""
+        """Return all floors, as a run's config and evaluations take them."""
         return ",".join(map(str, (self.floor, *self.further_floors)))
 
     @property
     def of_each_kind(self) -> str:
-        """How many episodes to evaluate on, as `restock eval --episodes` takes it."""
+        """Return the number of episodes of each kind, as `restock eval --episodes` takes it."""
         counts = ",".join(f"{kind}={self.episodes}" for kind in self.kinds)
         return counts or str(self.episodes)
 
@@ -132,19 +132,19 @@ class Settings:
 
     @property
     def with_definitions(self) -> list[str]:
-        """Where the definitions of a recording's types are that it does not carry itself."""
+        """Return the options that define message types which a recording does not define."""
         distribution = [] if self.typestore is None else ["--typestore", self.typestore]
         folder = [] if self.definitions is None else ["--definitions", str(self.definitions)]
         return distribution + folder
 
     @property
     def reading(self) -> list[str]:
-        """How recordings are read."""
+        """Return the options by which recordings are read."""
         return self.with_definitions + ["--salvage"] * self.salvage
 
     @property
     def read(self) -> tuple[Path, ...]:
-        """What is read of the user's wherever a recording is."""
+        """Return the user's files that every stage reads which reads a recording."""
         return (*self.recordings, *([] if self.definitions is None else [self.definitions]))
 
     @property
@@ -157,7 +157,7 @@ class Settings:
 
 
 def own_file(name: Path | str | None) -> tuple[Path, ...]:
-    """The file of this name, unless it is that of a shipped one."""
+    """Return the file of this name, unless it is the name of a shipped one."""
     return () if name is None or not Path(name).is_file() else (Path(name),)
 
 
@@ -176,7 +176,7 @@ def info(to: Settings) -> Stage:
 def propose(
     to: Settings, recordings: tuple[str, ...], flags: list[str], urdf: Path | None = None
 ) -> Stage:
-    """One profile, from these recordings."""
+    """Propose one profile from these recordings."""
     assert to.profile is not None
     return Stage(
         "propose",
@@ -262,7 +262,7 @@ def mix(to: Settings) -> Stage:
 
 
 def mix_uniform(to: Settings) -> Stage:
-    """The logs as they are, for what quotas are compared with."""
+    """Mix the logs as they are, to compare quotas with."""
     return Stage(
         "mix-uniform",
         "The same logs as they are, to compare with",
@@ -273,7 +273,7 @@ def mix_uniform(to: Settings) -> Stage:
 
 
 def floor(to: Settings) -> Stage:
-    """The user's floor for the twin: their map, else scans, else the way that was driven."""
+    """Make the twin's floor from the user's map, else from scans, else from the path driven."""
     given = () if to.map is None else ("--map", str(to.map))
     return _floor(
         to, to.floor, "The floor, as the recordings show it",
@@ -283,7 +283,7 @@ def floor(to: Settings) -> Stage:
 
 
 def further_floor(to: Settings, recording: str, made: Path) -> Stage:
-    """The floor of a recording whose poses are in another frame than those of the floors before."""
+    """Make the floor of a recording whose poses are in a frame of their own."""
     return _floor(
         to, made, "The floor of another frame",
         f"The poses of {Path(recording).name} are in a frame of their own: its routes are on a "
@@ -308,7 +308,7 @@ def _floor(to: Settings, made: Path, title: str, why: str, given: Sequence[str])
 
 
 def fit(to: Settings, horizon_s: float) -> Stage:
-    """The twin's robot, from the commands and what the robot did. Few segments: minutes matter."""
+    """Fit the twin's robot to what the robot did; by few segments, as minutes matter."""
     few = ["--search", "32", "--segments", "80", "--horizon-s", f"{horizon_s:g}"]
     return Stage(
         "fit",
@@ -360,7 +360,7 @@ def train(to: Settings, *, twin: bool = True) -> Stage:
 
 
 def train_beside_uniform(to: Settings) -> Stage:
-    """As `train`, and at the same time a policy that differs in what it is fed alone."""
+    """Train as `train` does, and beside it a policy that differs only in what it is fed."""
     fed = train(to)
     return replace(
         fed,
@@ -379,7 +379,7 @@ def train_beside_uniform(to: Settings) -> Stage:
 
 
 def even_out(to: Settings) -> Stage:
-    """As many steps for both: a comparison of feeds takes everything else alike."""
+    """Continue the run that drove less: a comparison of feeds needs equally many steps."""
 
     def decided() -> list[str] | None:
         from restock.train.run.run import Run
@@ -408,7 +408,7 @@ def even_out(to: Settings) -> Stage:
 
 
 def train_on_logs(to: Settings) -> Stage:
-    """The policy before fine-tuning: of the same panel, and never in the twin."""
+    """Train the policy before fine-tuning, on the same panel and without the twin."""
     settings = ["env.twin=false", "teacher.source=logs", f"schedule.offline_updates={UPDATES}"]
 
     def command(settings: Sequence[str]) -> list[str]:
@@ -452,7 +452,7 @@ def evaluate_logs_alone(to: Settings) -> Stage:
 
 
 def evaluate_beside_uniform(to: Settings) -> Stage:
-    """As `evaluate`, beside the policy that was fed uniformly."""
+    """Evaluate as `evaluate` does, beside the policy that was fed uniformly."""
     alone = evaluate(to)
     policies = f"agent,{fed_uniformly(to)},planner,random"
     return replace(
@@ -473,12 +473,12 @@ def film(to: Settings) -> Stage:
 
 
 def from_logs_alone(to: Settings) -> str:
-    """The policy from the logs alone, as evaluations name it."""
+    """Return the name of the policy from the logs alone, as evaluations take it."""
     return f"run:{to.logs_alone}"
 
 
 def fed_uniformly(to: Settings) -> str:
-    """The policy that was fed uniformly, as evaluations name it."""
+    """Return the name of the policy that was fed uniformly, as evaluations take it."""
     return f"run:{to.uniform}"
 
 

@@ -78,7 +78,7 @@ class StartCommand:
     "files", "seconds", …}], "stopped", "report"}."""
 
     def run(self) -> int:
-        """The whole way; 3 where a person must decide, or a stage failed that it needs."""
+        """Run all stages; return 3 if a person must decide or a needed stage failed."""
         from restock.cli import main
         from restock.cli.output import print_json, stderr, stdout
         from restock.cli.start.decisions import node_refuses
@@ -125,8 +125,7 @@ class StartCommand:
         return int(ExitCode.LOSSY)
 
     def _expect_a_recording(self) -> str:
-        """The first of the paths, or in the folders among them, that by its first bytes is a
-        recording.
+        """Return the first path, or file in a folder, whose first bytes are a recording's.
 
         Raises:
             RecordingError: none is; what is wrong with the other paths is printed before.
@@ -154,7 +153,7 @@ class StartCommand:
         raise RecordingError(last.what, where=last.where, remedy=last.remedy or known)
 
     def _check(self) -> None:
-        """That what is given beside the recordings can be used: said before anything is written.
+        """Check what is given beside the recordings, before anything is written.
 
         Raises:
             ConfigError, RecordingError: it cannot.

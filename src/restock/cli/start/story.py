@@ -42,10 +42,10 @@ FULL_STEPS = 128_000  # of docs/evidence.md
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:
-    """Per kind of mission, how many succeeded before and after fine-tuning (the agent), by quotas
-    and fed uniformly, and the planner's.
+    """Count the missions of each kind that succeeded, before and after fine-tuning.
 
-    On the floor as it was trained on. Empty where the task has no goal: nothing succeeds or fails.
+    Beside these stand the policy fed uniformly and the planner, all on the floor that was trained
+    on. Empty if the task has no goal: nothing succeeds or fails.
     """
     from restock.train.run.kept_evaluations import shown_evaluation
 
@@ -71,7 +71,7 @@ def before_and_after(to: Settings) -> list[dict[str, str]]:
 
 
 def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
-    """Of the missions of a kind, those that arrived without a contact, with a 95 % interval."""
+    """Count missions of a kind that arrived without a contact, with a 95 % interval."""
     of = [
         bool(row["success"])
         for row in rows
@@ -84,7 +84,7 @@ def _arrived(rows: Sequence[dict[str, Any]], kind: str) -> str:
 
 
 def trained(to: Settings) -> str:
-    """How far fine-tuning came, and what was fed otherwise."""
+    """Say how far fine-tuning came, and how the other policy was fed."""
     from restock.train.run.run import Run
 
     steps: list[int] = Run.open(to.run).table("progress")["env_steps"].to_pylist()
@@ -142,7 +142,7 @@ def shelves(run: Path) -> list[str]:
 
 
 def films(to: Settings) -> list[str]:
-    """Where the films are that show who failed beside the fine-tuned policy."""
+    """Return where the films are, with the failing policy beside the fine-tuned one."""
     from restock.train.evaluation.film import FOLDER
 
     found = sorted((to.run / FOLDER).glob("*-rescue.webp"))
@@ -153,7 +153,7 @@ def films(to: Settings) -> list[str]:
 
 
 def rare_event(to: Settings) -> list[str]:
-    """One logged row of a rare condition, from its message to an update; none where none is."""
+    """Follow a logged row of a rare condition from its message to an update, if there is one."""
     row = _chosen(to.run)
     if row is None:
         return []
@@ -172,7 +172,7 @@ def rare_event(to: Settings) -> list[str]:
 
 
 def _chosen(run: Path) -> dict[str, Any] | None:
-    """The audited logged row of the rarest condition with the largest TD error."""
+    """Return the audited logged row of the rarest condition with the largest TD error."""
     from restock.train.run.run import Run
 
     audit: list[dict[str, Any]] = Run.open(run).table("audit").to_pylist()
@@ -194,7 +194,7 @@ def _chosen(run: Path) -> dict[str, Any] | None:
 
 
 def _told(trace: Trace, to: Settings) -> list[str]:
-    """The chain, a line or two a link."""
+    """Write the chain, with a line or two for each link."""
     from restock.replay.panel.panel import Panel
     from restock.train.run.fed_shares import fed_shares
     from restock.train.run.run import Run
@@ -227,7 +227,7 @@ def _told(trace: Trace, to: Settings) -> list[str]:
 
 
 def _draws(run: Path, panel: Panel, episode: str) -> tuple[int, float]:
-    """How often an episode's rows were drawn, and how often if all rows had been drawn alike."""
+    """Count how often an episode's rows were drawn, and how often uniform draws would have."""
     from restock.train.run.run import Run
 
     logged = [
@@ -241,7 +241,7 @@ def _draws(run: Path, panel: Panel, episode: str) -> tuple[int, float]:
 
 
 def _message(name: str, fields: dict[str, Any]) -> str:
-    """What a message says in a few words; "" of those that would say little here."""
+    """Summarize a message in a few words; "" if that would say little here."""
     if name == "scan":
         ranges = [r for r in fields.get("ranges", ()) if r is not None and math.isfinite(r)]
         return f"the nearest return is {min(ranges):.2f} m away" if ranges else "no return"
@@ -254,7 +254,7 @@ def _message(name: str, fields: dict[str, Any]) -> str:
 
 
 def next_steps(to: Settings) -> list[str]:
-    """What to try on one's own logs: a command and what it does, a line each."""
+    """List what to try on one's own logs: a command, and what it does."""
     run, store = to.run, to.store
     return [
         "restock start BAG --out mine",

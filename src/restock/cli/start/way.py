@@ -79,7 +79,7 @@ class Way:
         )
 
     def go(self) -> Stop | None:
-        """The whole way; where a person must decide, why and what to do."""
+        """Run all stages; return why and what to do if a person must decide."""
         try:
             readable = self._recordings()
             self._profile(readable)
@@ -95,7 +95,7 @@ class Way:
         self.work.say(f"   [yellow]{escape(text)}[/]")
 
     def _recordings(self) -> list[Document]:
-        """What can be read, a document of `restock info` each."""
+        """Return the recordings that can be read, as `restock info` describes them."""
         found = self.work.do(stages.info(self.to))
         readable = list(found.document.get("recordings", ()))
         if not (found.good or readable):
@@ -110,7 +110,7 @@ class Way:
         return readable
 
     def _profile(self, readable: list[Document]) -> None:
-        """The user's profile, or one that is proposed; and what it makes of a recording."""
+        """Take the user's profile or propose one, and check it against a recording."""
         requested, to = self.requested, self.to
         recording = fullest({"recordings": readable}) or self.first
         own = requested.profile is not None
@@ -200,7 +200,7 @@ class Way:
         return covered.document, mixed.document
 
     def _twin(self) -> Ended | None:
-        """The floor, where a policy can be trained in the twin; None: on the logs alone."""
+        """Make the floor, and decide whether to train in the twin; None: on the logs alone."""
         requested, to = self.requested, self.to
         if requested.twin == "no":
             return None
@@ -259,7 +259,7 @@ class Way:
         return tuple(used)
 
     def _fit(self) -> tuple[Ended, bool]:
-        """The gap of the twin that is used, and whether that is the fitted one."""
+        """Return the gap of the twin that is used, and whether that is the fitted one."""
         horizon_s = horizon(self.to.profile)
         fitted = self.work.do(stages.fit(self.to, horizon_s))
         gap = self.work.do(stages.gap(self.to, horizon_s, fitted=fitted.good))
@@ -278,7 +278,7 @@ class Way:
             raise Stopped("training did not finish", *trained.errors[:2], self.again)
 
     def _judge(self, floor: Ended | None, panel: Document) -> None:
-        """In the twin, on the logs that were held out, and on one page."""
+        """Evaluate in the twin and on held-out logs, and write one page."""
         to, do, judged = self.to, self.work.do, []
         if floor is not None:
             goal = has_goal(to.profile)

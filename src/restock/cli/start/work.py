@@ -46,7 +46,7 @@ class Ended:
 
     @property
     def good(self) -> bool:
-        """Whether the way can go on from it."""
+        """Return whether the next stages can build on it."""
         return self.status != "failed"
 
 
@@ -149,7 +149,7 @@ class Work:
         return ended
 
     def _before(self, stage: Stage, stamp: str) -> Ended | None:
-        """What an earlier call made of just this, where all of it is still there."""
+        """Return what an earlier call made of the same inputs, if all of it is still there."""
         known = self._known.get(stage.name, {})
         if known.get("status") != "done" or known.get("stamp") != stamp:
             return None
@@ -163,7 +163,7 @@ class Work:
         return ended
 
     def _stamp(self, stage: Stage) -> str:
-        """What decides its result: the command, the user's files, and all stages before it."""
+        """Hash all that decides a result: the command, the user's files, and the stages before."""
         parts = [stage.line(), *self._stamps[-1:], *(_fingerprint(path) for path in stage.reads)]
         return hashlib.blake2b(os.fsencode("\n".join(parts)), digest_size=12).hexdigest()
 
@@ -227,7 +227,7 @@ def _resumed(stage: Stage) -> Stage:
 
 
 def _fingerprint(path: Path) -> str:
-    """A user's file or folder as it is now."""
+    """Return what a user's file or folder holds now, as a text to compare."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     parts = []
     for file in files:

@@ -138,7 +138,7 @@ class FitCommand:
 
 
 def robot_given(profile: str | None) -> Robot | None:
-    """The robot of a profile that was named; None where none was.
+    """Return the robot of a named profile; None if no profile is named.
 
     Raises:
         ConfigError: no such profile, or it has no [robot].

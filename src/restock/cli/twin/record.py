@@ -172,7 +172,7 @@ class RecordCommand:
 
 
 def _missions(text: str | None) -> int | MissionsFile | None:
-    """How many, or which: a number, or a missions file."""
+    """Read `--missions`: a number, or a missions file."""
     from restock.replay.fleet.missions_file import read_missions
 
     if text is None:
@@ -182,7 +182,7 @@ def _missions(text: str | None) -> int | MissionsFile | None:
 
 
 def load_policy(name: str) -> Policy | None:
-    """The policy that `run:DIRECTORY` or `onnx:FILE` names, tagged; None for the names of scripts.
+    """Return the policy that `run:DIRECTORY` or `onnx:FILE` names; None for scripted ones.
 
     Raises:
         ConfigError: no such policy, or one of another task.

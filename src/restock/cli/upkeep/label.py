@@ -117,7 +117,7 @@ class LabelCommand:
         return ExitCode.OK
 
     def _check_options(self) -> None:
-        """Raises ConfigError where options do not go together."""
+        """Raise ConfigError if options cannot be combined."""
         of_rules = {
             "--profile": self.profile is not None,
             "--all": self.all,
@@ -166,7 +166,7 @@ class LabelCommand:
 
 
 def as_json(outcome: Relabelled) -> dict[str, Any]:
-    """An outcome as `--json` prints it."""
+    """Return an outcome as `--json` prints it."""
     from restock.ingest.store.manifest import score_rows
 
     return {

@@ -42,7 +42,7 @@ def print_scores(path: Path, by: str | None, *, json: bool) -> int:
 
 
 def score_rows(found: Sequence[LabelQuality], by: str | None) -> list[dict[str, Any]]:
-    """One row a condition (of each group), for a table."""
+    """Return a table row for each condition and group."""
     return [
         ({by: one.group} if by else {})
         | {
@@ -60,7 +60,7 @@ def score_rows(found: Sequence[LabelQuality], by: str | None) -> list[dict[str, 
 
 
 def reliability_rows(bins: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a condition, a column a tenth of probability: the share that is true (of steps)."""
+    """Return a row for each condition: the true share of steps by tenths of probability."""
     rows: dict[str, dict[str, Any]] = {}
     for one in bins:
         row = rows.setdefault(one["condition"], {"condition": one["condition"]})
@@ -70,7 +70,7 @@ def reliability_rows(bins: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def quality_json(one: LabelQuality) -> dict[str, Any]:
-    """As `--json` has it: counts, and shares with 95 % intervals."""
+    """Return counts, and shares with 95 % intervals, as `--json` prints them."""
     from dataclasses import asdict
 
     shares = ("precision", "recall", "event_precision", "event_recall")

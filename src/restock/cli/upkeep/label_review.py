@@ -67,7 +67,7 @@ def review(path: Path, most: int, out: Path | None, *, json: bool) -> int:
 
 
 def _line(row: dict[str, Any]) -> dict[str, Any]:
-    """As much of a line as fits a terminal; the file has all of it."""
+    """Return as much of a line as fits a terminal; the file has all of it."""
     return {
         "condition": row["condition"],
         "labelled": row["labelled"],

@@ -83,7 +83,7 @@ class RemoveCommand:
         return ExitCode.OK
 
     def _lines(self, done: Removed) -> list[str]:
-        """What the table does not say."""
+        """Say what the table does not."""
         from restock.ingest.store.writer import RETENTION_HOURS
 
         what = counted(len(done.recordings), "recording")
