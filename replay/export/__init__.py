@@ -1,1 +1,10 @@
 """Transitions as data sets of other libraries."""
+
+# name -> (module, what must be installed, what a file's name must end with or "" for a directory)
+FORMATS: dict[str, tuple[str, str, str]] = {
+    "minari": ("minari_hdf5", "minari", ""),
+    "d3rlpy": ("one_file", "h5py", ".h5"),
+    "lerobot": ("lerobot_v3", "", ""),
+    "parquet": ("one_file", "", ".parquet"),
+    "npz": ("one_file", "", ".npz"),
+}

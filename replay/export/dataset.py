@@ -19,19 +19,12 @@ from restock.files import building, expect_place
 from restock.imports import install_command, installed
 from restock.ingest.store.version import Version
 from restock.interrupts import interrupts_raised
+from restock.replay.export import FORMATS
 from restock.replay.export.card import Contents, card, check_license
 from restock.replay.export.selection import Selection, open_selection
 from restock.replay.export.trajectory import Counts, Trajectory, count_episodes, trajectories
 from restock.replay.panel.panel import HEADER
 
-# name -> (module, what must be installed, what a file's name must end with or "" for a directory)
-FORMATS: dict[str, tuple[str, str, str]] = {
-    "minari": ("minari_hdf5", "minari", ""),
-    "d3rlpy": ("one_file", "h5py", ".h5"),
-    "lerobot": ("lerobot_v3", "", ""),
-    "parquet": ("one_file", "", ".parquet"),
-    "npz": ("one_file", "", ".npz"),
-}
 WITH_IMAGES = ("lerobot",)
 # The HDF5 library crashes where it cannot write what it holds back when a file is closed. That is
 # less than this: its caches of metadata, and of chunks.

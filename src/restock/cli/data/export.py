@@ -8,6 +8,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from restock.replay.export import FORMATS
+
+TO = (*FORMATS, "onnx")
+
 
 @dataclass
 class ExportCommand:
@@ -22,7 +26,7 @@ class ExportCommand:
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """A store or a panel; for onnx, a run."""
-    to: Literal["minari", "d3rlpy", "lerobot", "parquet", "npz", "onnx"]
+    to: Annotated[str, tyro.conf.arg(constructor=Literal[TO], metavar=f"{{{','.join(TO)}}}")]
     """The format. minari and lerobot write directories, the others files (d3rlpy: .h5)."""
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """The file or directory to write, which must not exist yet."""
