@@ -24,8 +24,7 @@ from restock.ingest.containers.open_recording import open_recording
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
-from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
 from restock.ingest.profile.tag_rules import Told, resolve_tags
 from restock.ingest.steps.episodes import split, why_none
 from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields

@@ -22,8 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from restock.errors import ConfigError, StoreError, expect
-from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml, with_conditions
+from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml, with_conditions
 from restock.ingest.store.corrections import (
     COLUMN,
     Correction,

@@ -27,7 +27,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction
 from restock.ingest.decoding.columns import FieldColumn, Ragged, TopicColumns
 from restock.ingest.decoding.field_paths import DTYPES, Leaf
-from restock.ingest.profile.camera import Camera
+from restock.ingest.profile.tables import Camera
 from restock.ingest.task.schema import frame_schema, transition_ids
 
 # Names of fields hold no space.

@@ -15,8 +15,7 @@ from restock.arrays import F32
 from restock.errors import ConfigError
 from restock.files import first_line
 from restock.imports import import_extra
-from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.profile.profile_text import read_profile_toml
+from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
 
 FORMAT = "restock-policy/1"
 _REMEDY = "give the file that `restock export RUN --to onnx --out policy.onnx` wrote"

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from restock.errors import ConfigError
-from restock.ingest.profile.camera import camera_name_problem
 from restock.ingest.profile.custom_signal import name_problem
 from restock.ingest.profile.inputs import (
     COMMAND_SOURCES,
@@ -15,6 +14,7 @@ from restock.ingest.profile.inputs import (
     check_input,
     check_scans,
 )
+from restock.ingest.profile.tables import camera_name_problem
 from restock.ingest.task.condition_files import shipped
 from restock.ingest.task.conditions import Kind, label_with_probabilities
 from restock.ingest.task.robot import beyond_limits
@@ -98,6 +98,7 @@ def check_profile(profile: Profile, where: str) -> None:
             remedy="leave out wheel_slip, or give the odometry under [inputs.wheels]",
         )
     _check_goal(profile, where)
+    _check_goal_rules(profile, where)
     proposed = profile.inputs.nav_command
     if proposed is not None and proposed.topic == profile.inputs.command.topic:
         raise ConfigError(
@@ -151,8 +152,8 @@ def _check_goal(profile: Profile, where: str) -> None:
             )
 
 
-def refuse_unused_goal_rules(profile: Profile, where: str) -> None:
-    """Raises ConfigError where a profile says how goals are found, and they are not found so."""
+def _check_goal_rules(profile: Profile, where: str) -> None:
+    """Raise ConfigError if a profile says how goals are found, and they are not found so."""
     goal, source = profile.task.goal, profile.goal.source
     rules = [f"goal.{key}" for key in changed(profile.goal)]
     limits = changed(profile.episodes, ("goal_moved_m", "plan_goal_tolerance_m"))

@@ -77,6 +77,12 @@ HINDSIGHT = {
 
 FIX_SETTINGS = ("origin_deg", "max_std_m", "track_m")
 SCAN_SETTINGS = ("upside_down", "lidar_at_m", "lidar_yaw_rad")
+_COMMAND, _SCAN, _FIX = "a command", "a scan", "a pose by latitude and longitude"
+_APPLIES_TO = {
+    "stop_holds": _COMMAND,
+    **dict.fromkeys(SCAN_SETTINGS, _SCAN),
+    **dict.fromkeys(FIX_SETTINGS, _FIX),
+}
 
 
 def last_part(kind: str) -> str:
@@ -165,13 +171,7 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         unknown += sorted(source.fields.keys() & {"x_m", "y_m", "orientation", "yaw_rad"})
     elif name in ("pose", "heading") and not source.fields.keys() & {"orientation", "yaw_rad"}:
         missing.append("orientation")
-    given = [key for key in FIX_SETTINGS if getattr(source, key) is not None]
-    if given and not source.by_fix:
-        raise ConfigError(
-            f"`inputs.{name}.{given[0]}` applies only to a pose by latitude and longitude",
-            where=where,
-            remedy="leave it out, or give latitude_deg and longitude_deg",
-        )
+    _check_settings(f"inputs.{name}", name, source, where)
     steered = "steering_rad" in source.fields
     if name in ("command", "nav_command"):
         if steered and "yaw_rate_radps" in source.fields:
@@ -192,10 +192,6 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
             where=where,
             remedy=f"{name} has the fields {', '.join(known)}",
         )
-    if source.stop_holds and name != "command":
-        raise ConfigError(f"`inputs.{name}.stop_holds` applies only to a command", where=where)
-    if name not in SCANS:
-        _check_scan_settings(f"inputs.{name}", source, where)
     if source.optional and name not in FALLBACKS and not (name == "pose" and framed):
         raise ConfigError(
             f"`inputs.{name}.optional`: {name} has no fallback, so it cannot be optional",
@@ -204,10 +200,15 @@ def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
         )
 
 
-def _check_scan_settings(key: str, source: Input, where: str) -> None:
-    for setting in SCAN_SETTINGS:
-        if getattr(source, setting) not in (None, False):
-            raise ConfigError(f"`{key}.{setting}` applies only to a scan", where=where)
+def _check_settings(key: str, name: str, source: Input, where: str) -> None:
+    """Refuse settings that do not apply to an input of this name; "": to a source of commands."""
+    own = {"command": _COMMAND, **dict.fromkeys(SCANS, _SCAN)}.get(name)
+    for setting, only in _APPLIES_TO.items():
+        applies = only == own or (only == _FIX and source.by_fix)
+        if getattr(source, setting) not in (None, False) and not applies:
+            raise ConfigError(
+                f"`{key}.{setting}` applies only to {only}", where=where, remedy="leave it out"
+            )
 
 
 def check_scans(scans: Mapping[str, Input], where: str) -> None:
@@ -310,12 +311,12 @@ def check_command_source(key: str, source: Input, command: Input, where: str) ->
             remedy="give the topic of this source's commands, before one of several sources is "
             "chosen",
         )
-    if source.stop_holds or source.optional:
+    if source.optional:
         raise ConfigError(
-            f"`{key}` cannot have stop_holds or optional",
+            f"`{key}.optional`: a recording may always lack a source of commands",
             where=where,
-            remedy="leave out both: a recording may always lack a source of commands",
+            remedy="leave it out",
         )
     _check_wheelbase(key, source, where)
     _check_pressed(key, source, where)
-    _check_scan_settings(key, source, where)
+    _check_settings(key, "", source, where)

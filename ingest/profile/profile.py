@@ -8,12 +8,18 @@ columns), `[cameras.*]` (frames that are kept), `[tags]` (whose drive it is), `[
 twin builds), `[limiter]` (of a policy's commands) and `[[zone]]` (named rectangles of the map).
 `load_profile("warehouse_amr")` reads one that comes with Restock, `load_profile("my_robot.toml")`
 one of yours.
+
+Stores, panels and runs carry a profile as one TOML text that needs no other file (`profile_toml`):
+the SQL of each `[[condition]]` that was a file is in it, and shipped conditions stay names. The
+text may come from a stranger, and is read as a profile file is: values are checked by type, SQL
+runs in the same sandbox, and no file is opened.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
@@ -24,8 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.profile.camera import Camera
-from restock.ingest.profile.checks import check_profile, refuse_unused_goal_rules
+from restock.ingest.profile.checks import check_profile
 from restock.ingest.profile.custom_signal import CustomSignal
 from restock.ingest.profile.inputs import (
     COMMAND_FALLBACK,
@@ -47,7 +52,7 @@ from restock.ingest.profile.inputs import (
     is_motion,
 )
 from restock.ingest.profile.robot_file import with_robot_file
-from restock.ingest.profile.tables import Clock, Episodes, Frames, Motion, Zone
+from restock.ingest.profile.tables import Camera, Clock, Episodes, Frames, Motion, Zone
 from restock.ingest.profile.tag_rules import TagRules
 from restock.ingest.task.condition_files import shipped, with_files
 from restock.ingest.task.conditions import Condition, Kind, labels_version, of_kind
@@ -56,7 +61,7 @@ from restock.ingest.task.limiter import Limiter
 from restock.ingest.task.robot import Robot, refuse_beyond_steering
 from restock.ingest.task.signals import Noise
 from restock.ingest.task.task import Task
-from restock.toml import Checked, parse_toml, read_toml, typed
+from restock.toml import Checked, parse_toml, read_toml, toml_value, typed
 
 ELSEWHERE = "elsewhere"
 
@@ -257,8 +262,6 @@ def load_profile(name_or_path: str | Path) -> Profile:
             else f"the shipped profiles are: {', '.join(names)}",
         )
     profile = _typed(read_toml(path), where=where, folder=path.parent)
-    # Of stores too these would shut out those that an older Restock wrote: here, and in the twin.
-    refuse_unused_goal_rules(profile, where)
     refuse_beyond_steering(profile.robot, profile.task.actions, where=where)
     return profile
 
@@ -291,3 +294,100 @@ def without_lidar(profile: Profile) -> Profile:
         inputs=msgspec.structs.replace(profile.inputs, **dict.fromkeys(SCANS)),
         task=msgspec.structs.replace(profile.task, sectors=0),
     )
+
+
+def profile_toml(profile: Profile) -> str:
+    """The profile as TOML, every default written out; `read_profile_toml` gives an equal one."""
+    values = _given(msgspec.to_builtins(profile))
+    plain, tables = [], []
+    for name, value in values.items():
+        if isinstance(value, dict):
+            tables += ["", f"[{name}]", *_lines(value)]
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for entry in value:
+                tables += ["", f"[[{name}]]", *_lines(entry)]
+        else:
+            plain += _lines({name: value})
+    return "\n".join([*plain, *tables]) + "\n"
+
+
+def read_profile_toml(text: str, *, where: str) -> Profile:
+    """A profile from such a text; `where` names it in errors.
+
+    Raises:
+        ConfigError: as `parse_profile`, also where the text names a file.
+    """
+    return parse_profile(text, where=where, folder=None)
+
+
+def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
+    """The same profile with other conditions; those that come with Restock go by their names."""
+    known = shipped(profile.constants) | shipped(profile.constants, "exposure")
+    named = [c for c in conditions if known.get(c.name) == c]
+    return msgspec.structs.replace(
+        profile,
+        shipped_conditions=[c.name for c in of_kind(named, "outcome")],
+        shipped_exposures=[c.name for c in of_kind(named, "exposure")],
+        own_conditions=[c for c in conditions if c not in named],
+    )
+
+
+def _given(value: Any) -> Any:
+    """Plain values without what is None: TOML has no word for it, and it is always the default."""
+    if isinstance(value, dict):
+        return {key: _given(item) for key, item in value.items() if item is not None}
+    return [_given(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _lines(table: dict[str, Any]) -> list[str]:
+    return [f"{name} = {toml_value(value)}" for name, value in table.items()]
+
+
+_POSE = "name a topic with the pose in the map frame under [inputs.pose]"
+
+
+@dataclass(frozen=True)
+class NotLive:
+    """One thing that a profile takes and a running robot does not give."""
+
+    takes: str  # "its pose from transforms"
+    why: str  # why it is not there
+    topics: str  # the tables of the profile that it needs instead
+    remedy: str
+    settings: str = ""  # that it needs with them
+
+
+def not_live(profile: Profile) -> list[NotLive]:
+    """What such a profile takes that is not there on a running robot; none: it can be followed."""
+    found = []
+    pose = profile.inputs.pose
+    if profile.frames is not None:
+        found.append(
+            NotLive(
+                "its pose from transforms ([frames])",
+                "which are not held live",
+                "[inputs.pose]",
+                _POSE,
+            )
+        )
+    elif pose is not None and pose.by_fix:
+        found.append(
+            NotLive(
+                "its pose from satellite fixes",
+                "whose frame and heading are not computed live",
+                "[inputs.pose]",
+                f"{_POSE}, such as that of robot_localization's navsat_transform_node",
+            )
+        )
+    if profile.goal_source == "hindsight":
+        found.append(
+            NotLive(
+                "its goals in hindsight",
+                "which is not possible live",
+                "[inputs.goal], [inputs.plan]",
+                "name the topics of goal and plan under [inputs.goal] and [inputs.plan], with"
+                ' goal.source = "logged"',
+                'goal.source = "logged"',
+            )
+        )
+    return found

@@ -1,7 +1,8 @@
-"""The small tables of a profile: `[clock]`, `[episodes]`, `[frames]`, `[motion]` and `[[zone]]`."""
+"""The small tables of a profile: clock, episodes, frames, motion, zones and cameras."""
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -74,3 +75,19 @@ class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has wh
             dx, dy = x_m - middle_x, y_m - middle_y
             x_m, y_m = middle_x + cos * dx + sin * dy, middle_y + cos * dy - sin * dx
         return np.asarray((x_m >= x0) & (x_m <= x1) & (y_m >= y0) & (y_m <= y1), np.bool_)
+
+
+class Camera(Checked, frozen=True):
+    """One `[cameras.NAME]` of a profile: a topic of sensor_msgs Image or CompressedImage."""
+
+    topic: str
+    max_age_s: Annotated[float, Meta(gt=0)] = 0.5  # age of the last frame at the step, at most
+    max_hz: Annotated[float, Meta(gt=0)] | None = None  # frames kept per second; None: all
+    doc: str = ""
+
+
+def camera_name_problem(name: str) -> str | None:
+    """Why a camera may not have this name, or None."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name):
+        return "a name consists of lower-case letters, digits and _, and begins with a letter"
+    return None

@@ -14,8 +14,7 @@ import pyarrow as pa
 
 from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import TopicColumns
-from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import Profile, profile_toml
 from restock.ingest.steps.aligned_inputs import fallbacks_used
 from restock.ingest.steps.episodes import Split
 from restock.ingest.steps.steps import Steps

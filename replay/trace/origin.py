@@ -16,8 +16,7 @@ import numpy as np
 
 from restock.errors import ConfigError, StoreError
 from restock.files import first_line
-from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.profile.profile_text import read_profile_toml
+from restock.ingest.profile.profile import Profile, load_profile, read_profile_toml
 from restock.ingest.store.location import FRAMES
 from restock.ingest.task.schema import STEP_BITS
 from restock.ingest.task.task import Task, reward_parts

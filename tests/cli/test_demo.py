@@ -18,8 +18,7 @@ from restock.cli.start import stages
 from restock.cli.start.demo import MARKER, plan_of, prepare, run_demo
 from restock.cli.start.stages import Settings, Stage
 from restock.errors import RestockError
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.train.run.run import FORMAT
 
 SILENT = lambda message: None  # noqa: E731

@@ -243,7 +243,7 @@ def test_the_middle_of_a_chain_must_tell_a_command(tmp_path):
         (
             "fields =",
             "optional = true\nfields =",
-            "cannot have stop_holds or optional",
+            "may always lack a source of commands",
         ),
     ],
 )

@@ -11,8 +11,7 @@ from support.profile_texts import WAREHOUSE
 from support.stores import manifest, recording_transitions
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import parse_profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import parse_profile, profile_toml, read_profile_toml
 from restock.ingest.relabel import relabel_store
 from restock.ingest.store.episode_rows import ENDS, packed
 from restock.ingest.store.writer import StoreWriter

@@ -12,8 +12,12 @@ from support.profile_texts import WAREHOUSE as TEXT
 
 from restock.cli import main
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import (
+    load_profile,
+    parse_profile,
+    profile_toml,
+    read_profile_toml,
+)
 from restock.ingest.store.episode_rows import ENDS, episode_ends, packed
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.condition_files import shipped

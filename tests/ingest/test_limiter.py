@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from restock.arrays import F64
-from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.task.limiter import RULES, Limited, Limiter, Limits, limit
 from restock.ingest.task.robot import Robot
 

@@ -20,8 +20,7 @@ from support.twin_robot import TwinRobot, follower_onnx
 from restock.cli import main, run_node
 from restock.ingest.live.node import lifecycle_node
 from restock.ingest.live.node_topics import ACTION, LIMITER, SHADOW, TAKEOVER, with_node_topics
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.task.limiter import Limiter
 from restock.replay.store.store import Store
 from restock.train.twin.physics.episode import EpisodeSpec

@@ -13,8 +13,12 @@ from support.profile_texts import WAREHOUSE as TEXT
 from restock.cli import main
 from restock.errors import ConfigError, RecordingError
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile, parse_profile, shipped_profiles
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import (
+    load_profile,
+    parse_profile,
+    profile_toml,
+    shipped_profiles,
+)
 
 
 def test_the_shipped_profiles_load():

@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 
 from restock.ingest.live.policy_file import FORMAT
-from restock.ingest.profile.profile import Profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import Profile, profile_toml
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
 from restock.train.twin.recording.messages import build, stamp

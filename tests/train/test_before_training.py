@@ -21,8 +21,7 @@ from restock.arrays import Ints
 from restock.cli import main
 from restock.errors import PanelError
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import load_profile, profile_toml
 from restock.ingest.store.transitions import replaced
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.panel.panel import HEADER, META, Panel

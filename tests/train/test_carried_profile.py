@@ -16,8 +16,12 @@ from support.profile_texts import WAREHOUSE
 from restock.cli import main
 from restock.errors import ConfigError, PanelError
 from restock.ingest.profile.custom_signal import CustomSignal
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml, with_conditions
+from restock.ingest.profile.profile import (
+    load_profile,
+    profile_toml,
+    read_profile_toml,
+    with_conditions,
+)
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.prepare import prepare_new, prepare_resumed

@@ -12,8 +12,7 @@ from twin.test_robot_drives import CAR, CAR_ACTIONS, OUTLINE
 
 from restock import cli
 from restock.errors import ExitCode
-from restock.ingest.profile.profile import Profile, load_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import Profile, load_profile, profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.train.twin.calibration.open_loop import empty_floor

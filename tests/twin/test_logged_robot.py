@@ -7,8 +7,7 @@ from pathlib import Path
 from support.paths import ROOT
 
 from restock.ingest.pipeline import ingest
-from restock.ingest.profile.profile import load_profile, parse_profile
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import load_profile, parse_profile, profile_toml
 from restock.ingest.store.writer import StoreWriter
 from restock.replay.store.store import Store
 from restock.train.twin.calibration.logged_steps import robot_of_store

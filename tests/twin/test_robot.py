@@ -12,8 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import Profile, load_profile, parse_profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import (
+    Profile,
+    load_profile,
+    parse_profile,
+    profile_toml,
+    read_profile_toml,
+)
 from restock.ingest.task.robot import Lidar, Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task

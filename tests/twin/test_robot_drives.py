@@ -12,8 +12,7 @@ import pytest
 from twin.test_robot import AMR, amr_with, driven
 
 from restock.errors import ConfigError
-from restock.ingest.profile.profile import load_profile
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import load_profile, profile_toml, read_profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.scan import Body
 from restock.ingest.task.task import Task

@@ -22,7 +22,7 @@ from restock.errors import ConfigError, RunError
 from restock.files import expect_file_place, write_bytes
 from restock.imports import import_extra
 from restock.ingest.live.policy_file import FORMAT, open_session
-from restock.ingest.profile.profile_text import profile_toml
+from restock.ingest.profile.profile import profile_toml
 from restock.ingest.task.task import Task
 from restock.train.dqn.behaviour import FilteredNetwork, PolicyNetwork
 from restock.train.dqn.network import QNetwork

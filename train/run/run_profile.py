@@ -5,8 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from restock.errors import ConfigError, PanelError, RestockError, RunError
-from restock.ingest.profile.profile import Profile, load_profile, shipped_profiles
-from restock.ingest.profile.profile_text import profile_toml, read_profile_toml
+from restock.ingest.profile.profile import (
+    Profile,
+    load_profile,
+    profile_toml,
+    read_profile_toml,
+    shipped_profiles,
+)
 from restock.replay.panel.panel import Panel
 from restock.train.run.run import Run
 

@@ -38,6 +38,8 @@ class View:
 
     def turned(self, yaw_rad: float) -> View:
         """Return the view of a lidar that is turned so, in the robot's frame."""
+        if not yaw_rad:
+            return self
         low, high = self.low_rad + yaw_rad, self.high_rad + yaw_rad
         back = _TURN * round((low + high) / 2 / _TURN)  # the middle of it within half a turn
         return View(low - back, high - back, self.beams)

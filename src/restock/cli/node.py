@@ -78,7 +78,7 @@ class NodeCommand:
         from restock.errors import ConfigError
         from restock.files import expect_file_place, write_bytes
         from restock.ingest.live.node_topics import with_node_topics
-        from restock.ingest.profile.profile_text import profile_toml
+        from restock.ingest.profile.profile import profile_toml
 
         if out.exists():
             raise ConfigError("already exists", where=str(out), remedy="choose another file")

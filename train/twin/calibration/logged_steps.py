@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import ConfigError, StoreError
-from restock.ingest.profile.profile_text import read_profile_toml
+from restock.ingest.profile.profile import read_profile_toml
 from restock.ingest.task.robot import Robot
 from restock.ingest.task.schema import SIGNAL_COLUMNS
 from restock.ingest.task.signals import Signals

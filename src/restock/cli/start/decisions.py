@@ -132,8 +132,7 @@ def wrong_outline(checked: Document, profile: Path | str | None, *, proposed: bo
 
 def node_refuses(profile: Path | str | None) -> str | None:
     """Why the node refuses this profile on a robot, and which one it needs; None: it takes it."""
-    from restock.ingest.profile.not_live import not_live
-    from restock.ingest.profile.profile import load_profile
+    from restock.ingest.profile.profile import load_profile, not_live
 
     if profile is None or not (lacking := not_live(load_profile(str(profile)))):
         return None

@@ -140,8 +140,7 @@ class LabelCommand:
             raise ConfigError("--out needs --review N")
 
     def _conditions_of(self, store: StoreWriter) -> Callable[[str], Sequence[Condition]]:
-        from restock.ingest.profile.profile import load_profile
-        from restock.ingest.profile.profile_text import read_profile_toml
+        from restock.ingest.profile.profile import load_profile, read_profile_toml
         from restock.ingest.store.version import given_version
 
         live = store.live(version=given_version(self.version))
