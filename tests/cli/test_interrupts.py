@@ -112,7 +112,7 @@ def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
     monkeypatch.setattr(plan, "read_candidates", stopped)
     code = main(["mix", str(store_path), "--out", str(tmp_path / "panel")])
     assert code == ExitCode.INTERRUPTED
-    assert capsys.readouterr().err.endswith("interrupted; nothing is left half-written\n")
+    assert capsys.readouterr().err.endswith("interrupted; no partial files were left\n")
     assert not list(tmp_path.iterdir())
 
 

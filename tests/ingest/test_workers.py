@@ -230,7 +230,7 @@ def test_ctrl_c_ends_with_130_and_leaves_nothing_running(bags, tmp_path):
     _, err = process.communicate()
     assert (process.returncode, err) == (
         130,
-        "restock: interrupted; nothing is left half-written\n",
+        "restock: interrupted; no partial files were left\n",
     )
     while any(map(_alive, children)):
         time.sleep(0.01)

@@ -31,6 +31,9 @@ from typing import Any
 from support.pages import SHELL, Block
 from support.paths import ROOT
 
+NODE = """#!/bin/sh
+exec {python} -c 'import sys; from restock.cli import run_node; sys.exit(run_node())' "$@"
+"""
 CLIENT = """#!{python} -IS
 import json, os, socket, sys
 with socket.socket(socket.AF_UNIX) as client:
@@ -117,6 +120,8 @@ def serve(folder: Path) -> None:
         (folder / installer).chmod(0o755)
     (folder / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
     (folder / "python").chmod(0o755)
+    (folder / "restock-node").write_text(NODE.format(python=sys.executable))
+    (folder / "restock-node").chmod(0o755)
     client.rename(folder / "restock")
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listener.settimeout(1)

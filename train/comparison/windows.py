@@ -15,7 +15,7 @@ And a condition may be well supplied, and an action of it not (`action_coverage`
 fresh rows say what it leads to, and the policy wants it.
 
 The limits are from faults planted in the twin (benchmarks/planted_faults.py; the table is in
-docs/diagnose.md).
+docs/run.md).
 """
 
 from __future__ import annotations

@@ -272,7 +272,7 @@ def _without_ros(args: list[str]) -> list[str]:
 
 
 def _interrupted() -> int:
-    _complain("interrupted; nothing is left half-written")
+    _complain("interrupted; no partial files were left")
     return int(ExitCode.INTERRUPTED)
 
 

@@ -80,7 +80,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
     package = kind.__module__.split(".")[0]
     if package == "torch" and kind.__name__ == "OutOfMemoryError":
         return RestockError(
-            f"the GPU's memory does not suffice: {first_line(error)}",
+            f"out of GPU memory: {first_line(error)}",
             where=where,
             remedy="use --device cpu, a smaller replay.ring_capacity, or a panel that is read in "
             'chunks (sampling = "chunked" in its mixture)',

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class AuditCommand:
-    """Is the coverage of a store good enough to learn from? Exits 1 when an audit fails.
+    """Check whether a store is good enough to learn from. Exits 1 if an audit fails.
 
     Each audit is a query that returns offending rows, with a severity: an error fails, a warning
     warns, an info informs. Audits of a panel or a run are skipped unless one is given.
@@ -46,7 +46,7 @@ class AuditCommand:
     baseline: Annotated[str | None, tyro.conf.arg(metavar="RUN|NAME")] = None
     """The run must not be worse than this: another run, or a saved baseline's name or file."""
     margin: float = 0.05
-    """The run is worse where its success is lower by more than this, with the interval below 0."""
+    """The run is worse if its success is lower by more than this, with the interval below 0."""
     audits: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """A folder of your own audits (*.sql). An audit with the name of a shipped one replaces it."""
     thresholds: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -56,7 +56,7 @@ class AuditCommand:
     enough."""
     reward: bool = False
     """Only check whether the reward agrees with the outcomes: print returns by driver, condition
-    and outcome, and check that more success earns a higher return (docs/reward.md)."""
+    and outcome, and check that more success earns a higher return (docs/task.md)."""
     discount: float | None = None
     """With --reward on a store: the discount per step. Default: 0.99. For a run, the discount of
     its evaluations is used."""

@@ -30,7 +30,7 @@ class InfoCommand:
     recording that cannot be read is reported on stderr and makes the exit code 2; the others are
     still shown.
 
-    Of a store, it shows what it holds and whether it can be read. Without a PATH, it shows what is
+    For a store, it shows what it holds and whether it can be read. Without a PATH, it shows what is
     installed on this machine and what works: for a bug report. The exit code is then 2 if something
     that every command needs is missing; a missing extra is not an error.
     """

@@ -29,7 +29,7 @@ class EvalCommand:
 
     With --baseline, the policy is compared with another run or a saved baseline on the same
     episodes. With --on-logs nothing is driven: off-policy evaluation on logged episodes that the
-    policy did not learn from (docs/off-policy.md), written to RUN/eval/off_policy.parquet.
+    policy did not learn from (docs/eval.md), written to RUN/eval/off_policy.parquet.
 
     Example: `restock eval runs/a --perturbations none,friction,latency`
     """

@@ -35,6 +35,9 @@ class TrainCommand:
     writes a checkpoint and exits 130, a second Ctrl-C ends at once with the last checkpoint;
     `--resume RUN` continues exactly where it stopped.
     docs/train.md explains the recipe and every key of the config.
+
+    `restock train STUDY.toml` trains every arm of a study with every seed, and compares them; it
+    has its own options: `restock train STUDY.toml --help`.
     """
 
     out: Path | None = None

@@ -51,7 +51,7 @@ class LabelCommand:
     """With --review: write the events to this CSV file, in which you fill in the column
     `verdict`."""
     corrections: Annotated[str | None, tyro.conf.arg(metavar="FILE|none")] = None
-    """Write the verdicts of a CSV file (see docs/review.md) to the store; `none` removes all
+    """Write the verdicts of a CSV file (see docs/ingest.md) to the store; `none` removes all
     corrections."""
     version: Annotated[str | None, tyro.conf.arg(metavar="N|TIME")] = None
     """With --dry-run: an earlier version of the store, its number or a time. Default: the
