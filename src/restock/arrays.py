@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Codes = NDArray[np.signedinteger[Any]]  # of texts: places in a dictionary; -1 for none
+Codes = NDArray[np.signedinteger[Any]]  # indices of texts in a dictionary; -1: no text
 Bools = NDArray[np.bool_]
 
 

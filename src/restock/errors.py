@@ -10,7 +10,7 @@ import os
 import re
 from enum import IntEnum
 
-TRACEBACK = "RESTOCK_TRACEBACK"  # of the environment: print tracebacks
+TRACEBACK = "RESTOCK_TRACEBACK"  # environment variable that prints tracebacks
 
 
 def reported(text: str, keep: str = "") -> str:

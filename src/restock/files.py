@@ -131,7 +131,7 @@ def _takes_a_stream(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-# What marks a folder that Restock writes, and its name for people.
+# The file that marks a folder of Restock's -> what people call that folder.
 _MARKS = {
     "panel.json": "the panel",
     "transitions/_delta_log": "the store",
@@ -196,7 +196,7 @@ def is_undecoded(letter: str) -> bool:
 
 
 def _temporary(path: Path, *, replaces: bool = True) -> Path:
-    if replaces and path.is_dir():  # said of the path itself: not, later, of the file beside it
+    if replaces and path.is_dir():  # reported for the path itself, not later for the file beside it
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     return temporary_name(path)

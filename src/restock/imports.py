@@ -53,7 +53,7 @@ def installed(name: str) -> bool:
     """Return whether the module `name` can be imported, without importing it."""
     try:
         return importlib.util.find_spec(name) is not None
-    except ValueError:  # what stands in its place says nothing of itself: it was blocked
+    except ValueError:  # the entry in its place has no spec: it was blocked
         return False
 
 

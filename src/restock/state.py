@@ -26,7 +26,7 @@ class Stateful:
 
     STATE: ClassVar[tuple[str, ...]] = ()
     SAME: ClassVar[tuple[str, ...]] = ()
-    # Of values whose type the restored object's own does not show: `list[EpisodeSpec]`.
+    # Types of values that the restored object does not show: `list[EpisodeSpec]`.
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:

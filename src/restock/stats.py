@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64
 
-MIN_PAIRS = 3  # of which `paired_t` says more than the mean
+MIN_PAIRS = 3  # from which on `paired_t` says more than the mean
 _WEIGHTS_AT_ONCE = 4_000_000  # in memory
 
 
@@ -189,14 +189,14 @@ def difference_of_arms(
     value, episodes = float(second.mean() - first.mean()), first.shape[1]
     if min(len(first), len(second), episodes) < 2:
         return ConfidenceInterval(value, float("nan"), float("nan"))
-    parts = [  # of the variance of the difference, with degrees of freedom
+    parts = [  # variance of the difference, with degrees of freedom
         (float(np.var(second.mean(axis=0) - first.mean(axis=0), ddof=1)) / episodes, episodes - 1),
         *(
             (float(np.var(arm.mean(axis=1), ddof=1)) / len(arm), len(arm) - 1)
             for arm in (first, second)
         ),
     ]
-    # What runs and episodes have together is in both: it counts once.
+    # What runs and episodes share is in both, and counts once.
     both = sum(_interaction(arm) / arm.size for arm in (first, second))
     variance = max(sum(part for part, _ in parts) - both, max(part for part, _ in parts))
     if variance == 0:

@@ -24,10 +24,10 @@ from msgspec import inspect as kinds
 from restock.errors import ConfigError
 
 T = TypeVar("T")
-_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # of a message's path, and what follows it
+_STEP = r"(\.\w[\w-]*|\[\d+\]|\[\.\.\.\])(.*)"  # a step of a message's path, and the rest
 
 
-MAX_DEPTH = 64  # of tables and arrays in each other
+MAX_DEPTH = 64  # nested tables and arrays
 _DEEP_KEY = re.compile(rf"""(?<![\w"'.-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MAX_DEPTH},}}""")
 
 

@@ -76,7 +76,7 @@ FOLDERS = {
 }
 # folders of verbs that multiply no large matrices
 ONE_THREAD_OF_BLAS = ("data", "fleet", "upkeep")
-PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # of work that goes on where nobody reads it
+PRINTS_ON_THE_WAY = ("ingest", "start", "demo")  # goes on working if nobody reads it
 FOLDER_OF = {name: folder for folder, names in FOLDERS.items() for name in names}
 COMPLETION = "--tyro-write-completion"
 
@@ -130,15 +130,15 @@ def _guarded(run: Callable[[list[str]], int], args: list[str]) -> int:
     try:
         with kill_as_interrupt():
             code = run(args)
-        sys.stdout.flush()  # here, where a reader that went away is no error
+        sys.stdout.flush()  # here, so that a reader that went away is no error
         return code
     except KeyboardInterrupt:
         return _interrupted()
     except BrokenPipeError:
-        # The reader of our stdout went away (`| head`): no complaint, and none at exit either.
+        # The reader of stdout went away (`| head`): do not complain, here or at exit.
         drop(sys.stdout)
         return int(ExitCode.OK)
-    except Exception as error:  # noqa: BLE001  (the one place that maps what nobody foresaw)
+    except Exception as error:  # noqa: BLE001  (the one place that maps unforeseen errors)
         if was_interrupted():  # a library reports it as an error of its own
             return _interrupted()
         from restock.cli.failures import as_restock_error

@@ -71,7 +71,7 @@ def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
             remedy="rename the folder; or set a locale of UTF-8, if the shell has none:"
             " LC_ALL=C.UTF-8",
         )
-    if _in_gl(error):  # of MuJoCo as it is imported: any verb that needs the twin
+    if _in_gl(error):  # raised while MuJoCo is imported, by any verb that needs the twin
         return RestockError(
             f"MuJoCo cannot use {os.environ[GL]!r}: {first_line(error)}",
             where=f"{GL} in the environment",

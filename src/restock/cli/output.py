@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from restock.replay.store.store import Store
 
 Row = Mapping[str, Any]
-PIPE_WIDTH = 120  # of a table in a file or a pipe: what does not fit is wrapped, never cut
+PIPE_WIDTH = 120  # columns of a table in a file or a pipe: longer cells are wrapped, never cut
 GAP = 3  # columns between two columns of a table
-SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, for who searches it
+SHORT = 24  # columns of a cell that a file or a pipe gets in one piece, to be searched
 # A cell that is one of these words alone, on a terminal -> how it is shown. NO_COLOR takes it off.
 _STYLES = {
     **dict.fromkeys(("fail", "failed", "wrong", "worse", "untrusted", "reversed"), "bold red"),

@@ -368,7 +368,7 @@ def _print_reward(reward: RewardAudit) -> None:
     output.stdout().print(f"\n{counts or 'nothing to compare: undetermined'}")
 
 
-VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # of a pair of drivers
+VERDICTS = ("reversed", "undetermined", "agrees", "same success")  # for a pair of drivers
 
 
 def _interval(value: float, ends: list[float]) -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from restock.ingest.propose.drives import Drives
     from restock.ingest.propose.kinds import RobotTraits
 
-OFTEN = 0.5  # of the transitions: a label that holds on more is worth a look
+OFTEN = 0.5  # share of transitions: a label that holds more often is worth a look
 
 
 @dataclass

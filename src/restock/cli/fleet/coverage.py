@@ -103,9 +103,9 @@ class CoverageCommand:
         drift: Drift | str
         try:
             drift = measure_drift(store, every=self.every)
-        except ConfigError:  # what was asked for is wrong
+        except ConfigError:  # an option is wrong
             raise
-        except RestockError as error:  # what is logged tells nothing of it
+        except RestockError as error:  # the logs do not show it
             drift = str(error)
         advance(1, "charts")
         return write_coverage_page(store, missing, drift, out, self.figures)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from restock.replay.trace.origin import Origin
 
 _LONG = 6  # entries of a list that are printed
-# Of audited rows, on a terminal that is too narrow for all: with `row` one gets the rest.
+# Columns of audited rows on a narrow terminal; `row` shows the others.
 _NARROW = ("row", "source", "condition", "age_days", "action", "reward", "q", "td")
 _TABLES = ("clocks", "signals", "stand_ins")  # of a manifest: for `--json` and `restock sql`
 

@@ -21,13 +21,18 @@ if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand
     from restock.ingest.task.task import Task
 
-STEPS_A_SECOND = 500  # in the twin, of a free core: what a plan of draws is made for
-WARM_UP_PART = 0.5  # of the draws that few rows allow
-UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with the rest of the way
+STEPS_A_SECOND = 500  # in the twin on a free core, for which draws are planned
+WARM_UP_PART = 0.5  # share of the draws that few rows allow
+UPDATES_A_MINUTE = 400  # on logs alone: 2,000 in five minutes, with all other stages
 INTERVALS = 20  # at least so many points of every curve
-DRIVERS = "behaviour_policies"  # of a row of the coverage
-INSIDE = 0.5  # of the ticks: with returns inside the outline at more, it is not the robot's
-NOT_AGAIN = ("paths", "out", "dry_run", "json")  # of a call: not what the way depends on
+DRIVERS = "behaviour_policies"  # key in a row of the coverage
+INSIDE = 0.5  # share of ticks: with more returns inside the outline, the outline is wrong
+NOT_AGAIN = (
+    "paths",
+    "out",
+    "dry_run",
+    "json",
+)  # options that stages do not depend on
 OF_ONE_ROBOT = ("urdf", "footprint", "robot")
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 MARKER = ".restock-demo"
-LAST_LINES = 20  # of what a command beside another says, where it fails
+LAST_LINES = 20  # shown of a command that runs beside another and fails
 
 
 @dataclass

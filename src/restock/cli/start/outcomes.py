@@ -8,7 +8,7 @@ from typing import Any
 from restock.stats import interval_text
 from restock.words import counted
 
-Document = Mapping[str, Any]  # what a verb prints with --json; empty where it has not run
+Document = Mapping[str, Any]  # what a verb prints with --json; empty if it has not run
 ESTIMATORS = (
     ("logged", "as the logs were driven"),
     ("fqe", "the policy, by a fitted model (fqe)"),
@@ -57,7 +57,14 @@ def check(document: Document) -> list[str]:
     return lines
 
 
-_TELLING = ("scan", "imu", "bumper", "goal", "plan", "wheels")  # of inputs that may be missing
+_TELLING = (
+    "scan",
+    "imu",
+    "bumper",
+    "goal",
+    "plan",
+    "wheels",
+)  # named if missing
 
 
 def ingest(document: Document) -> list[str]:

@@ -15,7 +15,7 @@ COVERAGE = (
     " FROM coverage_by_condition"
 )
 
-UPDATES = 2000  # of a policy from the logs alone: as many as one has that goes on in the twin
+UPDATES = 2000  # for a policy from the logs alone, as many as before driving in the twin
 
 
 def nothing(document: Document) -> list[str]:
@@ -29,17 +29,17 @@ class Stage:
 
     name: str
     title: str
-    why: str  # for `restock demo`, which explains
+    why: str  # shown by `restock demo`, which explains
     command: list[str]
-    reads: tuple[Path, ...] = ()  # files of the user's: where one changes, it is run again
+    reads: tuple[Path, ...] = ()  # the user's files: the stage is run again if one changes
     writes: tuple[Path, ...] = ()
-    expected: tuple[int, ...] = (0,)  # exit codes after which the way goes on
-    remark: str = ""  # of `restock demo`, where the exit code is not 0
+    expected: tuple[int, ...] = (0,)  # exit codes after which the next stage runs
+    remark: str = ""  # shown by `restock demo` if the exit code is not 0
     outcome: Callable[[Document], list[str]] = nothing  # in a line or two
     shows_progress: bool = False  # it takes minutes
-    resume: tuple[str, ...] = ()  # the command that goes on where it was interrupted
-    beside: tuple[str, ...] = ()  # of `restock demo`: a command that runs at the same time
-    # Of `restock demo`: the command, where that depends on what came before; None: not needed.
+    resume: tuple[str, ...] = ()  # the command that continues an interrupted stage
+    beside: tuple[str, ...] = ()  # a command that `restock demo` runs at the same time
+    # The command for `restock demo` if it depends on earlier stages; None: not needed.
     decided: Callable[[], list[str] | None] | None = None
 
     def line(self) -> str:
@@ -62,10 +62,10 @@ class Settings:
 
     logs: tuple[str, ...]
     out: Path
-    profile: Path | str | None = None  # None: the one of the robot that comes with Restock
-    seconds: float = 150.0  # of training
-    episodes: int = 20  # of evaluation, per kind, policy and perturbation
-    kinds: tuple[str, ...] = ()  # of its missions; none: all that the floor has room for
+    profile: Path | str | None = None  # None: that of the shipped robot
+    seconds: float = 150.0  # of training time
+    episodes: int = 20  # evaluated per kind, policy and perturbation
+    kinds: tuple[str, ...] = ()  # kinds of missions; none: all that the floor has room for
     device: str = "cpu"
     mixture: str = "coverage"
     typestore: str | None = None
@@ -73,7 +73,7 @@ class Settings:
     salvage: bool = False
     tags: tuple[str, ...] = ()  # each KEY=VALUE
     map: Path | None = None
-    further_floors: tuple[Path, ...] = ()  # of recordings in other frames than the first floor's
+    further_floors: tuple[Path, ...] = ()  # for recordings in other frames
     train: tuple[str, ...] = ()  # further settings, each key=value
 
     @property

@@ -36,9 +36,9 @@ At the end you see the policies before and after, what the critic was fed of
 each condition, one rare event followed from the recording's message
 to the update that learned from it, and what to try with your own recordings."""
 
-_CELLS = 30  # of a bar of 100 %
+_CELLS = 30  # length of a bar of 100 %
 RARE = "all rare ones"
-FULL_STEPS = 128_000  # of docs/evidence.md
+FULL_STEPS = 128_000  # in docs/evidence.md
 
 
 def before_and_after(to: Settings) -> list[dict[str, str]]:

@@ -38,7 +38,7 @@ from restock.words import counted
 if TYPE_CHECKING:
     from restock.cli.start.start import StartCommand
 
-HELD_OUT = "evaluation split"  # of a panel's rows left out: those that judge
+HELD_OUT = "evaluation split"  # why a panel leaves rows out: they judge the policy
 ODOMETRY = "--odometry-as-command"
 MAX_FLOORS = 6
 SALVAGING = "add --salvage to this command: it reads what is intact in damaged recordings"

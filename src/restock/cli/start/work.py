@@ -25,7 +25,7 @@ from restock.errors import ExitCode, RestockError, visible
 from restock.files import read_json, write_text
 
 FOLDER, RECORD = "start", "stages.json"
-SMALL_BYTES = 1_000_000  # a file up to this is known by its content, a larger one by size and time
+SMALL_BYTES = 1_000_000  # files up to this size are hashed; larger ones are known by size and time
 Dispatch = Callable[[list[str]], int]
 
 
@@ -98,7 +98,7 @@ class Work:
         if goes_on:
             stage = _resumed(stage)
         self.say(f"[cyan]$ {escape(stage.line())}[/cyan]")
-        # Begun, and not yet ended: where this process ends now, the stage is run again.
+        # Begun, not ended: if this process dies now, the stage is run again.
         self._known[stage.name] = {"stamp": stamp, "status": "begun"}
         self._keep()
         self._stamps.append(stamp)
@@ -153,7 +153,7 @@ class Work:
         known = self._known.get(stage.name, {})
         if known.get("status") != "done" or known.get("stamp") != stamp:
             return None
-        if any(ended.status == "done" for ended in self.ended):  # what is before it has changed
+        if any(ended.status == "done" for ended in self.ended):  # an earlier stage has changed
             return None
         if not all(path.exists() for path in stage.writes) or not self._document(stage).exists():
             return None
