@@ -17,10 +17,9 @@ from restock.errors import ConfigError
 def import_extra(
     name: str, extra: str, use: str, *, where: str | None = None, instead: str | None = None
 ) -> Any:
-    """Import the module `name` of an optional extra.
+    """Import the module `name` of one of Restock's optional extras.
 
-    `use` ends in what is needed ("an .rrd file is written by Rerun"); `instead` is what works
-    without it.
+    `use` is a sentence ("a policy is exported with onnx"); `instead` is what does without it.
 
     Raises:
         ConfigError: it cannot be imported; says which extra has it.

@@ -1,4 +1,4 @@
-"""A moment as an MCAP file or an .rrd: read back with the viewers' own readers, value by value."""
+"""A moment as an MCAP file: read back with a reader of ROS, value by value."""
 
 from __future__ import annotations
 
@@ -214,30 +214,6 @@ def test_a_store_alone_shows_what_it_has(event: Event, tmp_path: Path) -> None:
     assert made["topics"].keys().isdisjoint({"/scan", "/restock/scan", "/restock/critic/value"})
     assert made["topics"]["/restock/seen"] == len(event.steps) == made["steps"]
     assert any("--recording" in note for note in made["notes"])
-
-
-def test_an_rrd_is_read_by_rerun(event: Event, tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed: restock[view]")
-    from rerun.chunk import RrdReader
-
-    made = write_view(event.trace, tmp_path / "slip.rrd", options(event))
-    reader = RrdReader(tmp_path / "slip.rrd")
-    assert [entry.recording_id for entry in reader.recordings()] == [
-        str(event.row["transition_id"])
-    ]
-    assert reader.blueprints()
-    rows: dict[str, int] = {}
-    values: dict[str, list[float]] = {}
-    for chunk in reader.stream():
-        name = str(chunk.entity_path).removeprefix("/")
-        rows[name] = rows.get(name, 0) + chunk.num_rows
-        if name in ("reward", "critic/td_error"):
-            batch = chunk.to_record_batch()
-            column = next(n for n in batch.schema.names if "scalars" in n.lower())
-            values.setdefault(name, []).extend(v[0] for v in batch[column].to_pylist())
-    assert {name: rows[name] for name in made["topics"]} == made["topics"]
-    assert values["reward"] == pytest.approx([step["reward"] for step in event.steps])
-    assert len(values["critic/td_error"]) == len(event.steps)
 
 
 @pytest.mark.long

@@ -1,4 +1,4 @@
-"""A traced row's moment, written to a file that Foxglove or Rerun opens."""
+"""A traced row's moment, written to an MCAP file that Foxglove and Rerun open."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from restock.replay.trace.trace import Trace
 from restock.train.view.critic import Critic, critic_along
 from restock.train.view.layout import foxglove_layout
 from restock.train.view.mcap_view import write_mcap
-from restock.train.view.rerun_view import require_rerun, write_rerun
 
 if TYPE_CHECKING:  # it needs the twin and its physics
     from restock.train.view.evaluated import Beside
-
-ENDINGS = (".mcap", ".rrd")
 
 
 @dataclass(frozen=True)
@@ -42,11 +39,11 @@ def write_view(
 
     Args:
         trace: of a row that lies in a store.
-        path: a new file: `.mcap` (Foxglove; its layout is put beside it) or `.rrd` (Rerun).
+        path: a new file, `.mcap`; a layout for Foxglove is put beside it.
 
     Raises:
-        ConfigError: another ending, there is a file already, Rerun is not installed, or the
-            evaluation has no such episode.
+        ConfigError: another ending, there is a file already, or the evaluation has no such
+            episode.
         RunError: driven again that episode is not the recorded one.
         StoreError: the row is of the twin: no store has what was before and after it.
     """
@@ -71,14 +68,13 @@ def write_view(
     temporary = temporary_name(path).with_suffix(path.suffix)
     try:
         counts, layout = _write(temporary, moment, critic, beside)
-        if layout is not None:
-            write_text(layout_of(path), json.dumps(layout, indent=1) + "\n")
+        write_text(layout_of(path), json.dumps(layout, indent=1) + "\n")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
     return {
         "path": str(path),
-        "layout": None if layout is None else str(layout_of(path)),
+        "layout": str(layout_of(path)),
         "steps": len(moment.steps),
         "seconds": (moment.window_ns[1] - moment.window_ns[0]) / 1e9,
         "critic": None if critic is None else f"{critic.run}: {critic.weights}",
@@ -90,18 +86,16 @@ def write_view(
 
 def check_view(path: Path) -> None:
     """Raises ConfigError where nothing can be written to `path`: before anything is looked up."""
-    if path.suffix not in ENDINGS:
+    if path.suffix != ".mcap":
         raise ConfigError(
-            f"{path.name!r} must end in .mcap (Foxglove) or .rrd (Rerun)",
+            f"{path.name!r} must end in .mcap",
             where="--view",
-            remedy="choose another name",
+            remedy="choose another name: Foxglove and Rerun open it",
         )
     if path.exists():
         raise ConfigError(
             "exists already", where=str(path), remedy="remove it, or choose another name"
         )
-    if path.suffix == ".rrd":
-        require_rerun()
 
 
 def layout_of(path: Path) -> Path:
@@ -129,9 +123,7 @@ def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
 
 def _write(
     path: Path, moment: Moment, critic: Critic | None, beside: Beside | None
-) -> tuple[dict[str, int], dict[str, Any] | None]:
-    if path.suffix == ".rrd":
-        return write_rerun(path, moment, critic, beside), None
+) -> tuple[dict[str, int], dict[str, Any]]:
     with path.open("wb") as stream:
         written = write_mcap(stream, moment, critic, beside)
     middle = float(moment.at["pose_x_m"]), float(moment.at["pose_y_m"])

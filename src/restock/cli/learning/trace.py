@@ -32,7 +32,7 @@ class TraceCommand:
     that were held at that tick. For a fresh row, it shows the episode in the twin, and the spec
     that generates it again.
 
-    --view FILE.mcap (or FILE.rrd) writes the seconds around a row for Foxglove (or Rerun): the
+    --view FILE.mcap writes the seconds around a row for Foxglove and Rerun: the
     store's columns of each step, labels, the critic's value and TD error, and, with --recording,
     scans, plans and every topic of the recording.
     """
@@ -55,7 +55,7 @@ class TraceCommand:
     """The new path of the panel, if it was moved."""
     view: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write the seconds around the row: FILE.mcap for Foxglove, with a layout file beside it,
-    or FILE.rrd for Rerun."""
+    and for Rerun."""
     before: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
     """Seconds before the row that --view shows."""
     after: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 5.0
@@ -249,10 +249,7 @@ def _print_view(written: dict[str, Any]) -> None:
     output.print_table(rows, title=f"{written['path']}, {written['seconds']:g} s")
     for note in written["notes"]:
         output.stdout().print(f"note: {note}", markup=False)
-    if written["layout"] is not None:
-        output.say(f"open it in Foxglove and import the layout {written['layout']}")
-    else:
-        output.say(f"`rerun {written['path']}` opens it")
+    output.say(f"open it in Foxglove and import the layout {written['layout']}")
 
 
 def _section(title: str, values: dict[str, Any] | None) -> None:
