@@ -44,15 +44,21 @@ from restock.train.resolve import (
     without_twin,
 )
 from restock.train.run.checkpoint import check_earlier, go_back
-from restock.train.run.fed_panel import run_panel
 from restock.train.run.not_finite import STOPPED
-from restock.train.run.run import Run, check_free, now_ns, panel_document, software_versions
-from restock.train.run.run_lock import RunLock
+from restock.train.run.run import (
+    Run,
+    RunLock,
+    check_free,
+    now_ns,
+    panel_document,
+    software_versions,
+)
 from restock.train.run.run_profile import (
     carries_profile,
     profile_document,
     profile_of_panel,
     profile_of_run,
+    run_panel,
 )
 from restock.train.run.trackers import require_trackers
 from restock.train.session import Session, open_session

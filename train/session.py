@@ -40,8 +40,7 @@ from restock.train.resolve import FIRST_GUESS, planned_draws, planned_env_steps
 from restock.train.run import checkpoint
 from restock.train.run.checkpoint import keep, newest_whole
 from restock.train.run.events import Events, TensorBoard
-from restock.train.run.run import Run
-from restock.train.run.run_lock import RunLock
+from restock.train.run.run import Run, RunLock
 from restock.train.run.trackers import tracker_sinks
 from restock.train.twin.env.interface import Twin
 from restock.train.twin.physics.episode import EpisodeSpec

@@ -17,7 +17,7 @@ from restock.replay.panel.panel import Panel
 from restock.train.dqn.fitted_q import cloned_probabilities
 from restock.train.evaluation import cloned
 from restock.train.evaluation.cloned import load_cloned
-from restock.train.run.clone_quality import read_clones
+from restock.train.run.kept_evaluations import read_clones
 from restock.train.run.run import Run
 
 MIXTURE = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nshare = 0.3\n"

@@ -9,7 +9,7 @@ from support.panels import EVERY, NO_SPLIT, panel_of
 from support.stores import recording_transitions, write_store
 
 from restock.errors import PanelError
-from restock.train.run.fed_panel import run_panel
+from restock.train.run.run_profile import run_panel
 
 
 def test_another_panel_in_its_place_is_refused(tmp_path: Path) -> None:

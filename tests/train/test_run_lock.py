@@ -13,10 +13,9 @@ from pathlib import Path
 import pytest
 
 from restock.errors import RunError
-from restock.train.run.run import Run, check_free
-from restock.train.run.run_lock import LOCK, RunLock
+from restock.train.run.run import LOCK, Run, RunLock, check_free
 
-HOLDS = "import pathlib, sys, time; from restock.train.run.run_lock import RunLock;"
+HOLDS = "import pathlib, sys, time; from restock.train.run.run import RunLock;"
 HOLDS += "lock = RunLock(pathlib.Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 

@@ -31,7 +31,7 @@ from restock.train.dqn.config import ScheduleConfig, TrainConfig
 from restock.train.evaluation.regression import compare_with_baseline, regressed
 from restock.train.prepare import prepare_new
 from restock.train.run import checkpoint
-from restock.train.run.run_lock import RunLock
+from restock.train.run.run import RunLock
 
 TINY = [
     *("--set", "env.num_envs=4", "--set", "schedule.warmup_env_steps=100"),

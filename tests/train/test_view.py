@@ -36,7 +36,7 @@ from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.run.run import Run
 from restock.train.session import Progress
 from restock.train.view.critic import critic_along
-from restock.train.view.view import ViewOptions, layout_of, write_view
+from restock.train.view.write_view import ViewOptions, layout_of, write_view
 
 RECORDING = ROOT / "sample_logs" / "amr_tuesday"
 

@@ -15,9 +15,8 @@ from restock.errors import RestockError
 from restock.train.comparison.diagnose import Diagnosis
 from restock.train.comparison.windows import Cause
 from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_before_training
-from restock.train.run.fed_panel import run_panel
 from restock.train.run.run import Run
-from restock.train.run.run_profile import profile_of_run
+from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 
 _TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too

@@ -22,9 +22,9 @@ from restock.train.dqn.fitted_q import FittedQConfig, cloned_behaviour, cloned_p
 from restock.train.dqn.network import QNetwork
 from restock.train.evaluation.off_policy.dataset import MODEL_ROWS, held_out_rows
 from restock.train.run import checkpoint
-from restock.train.run.clone_quality import CloneQuality, keep_clone
-from restock.train.run.fed_panel import run_panel
+from restock.train.run.kept_evaluations import CloneQuality, keep_clone
 from restock.train.run.run import Run
+from restock.train.run.run_profile import run_panel
 
 CLONED = "cloned"
 UPDATES = (50, 100, 200, 400, 800, 1600)  # that are tried

@@ -26,8 +26,13 @@ from restock.train.evaluation.evaluation_plan import (
     plan_evaluation,
 )
 from restock.train.evaluation.references import FIRST_SEED
-from restock.train.run.clone_quality import CloneQuality, read_clones
-from restock.train.run.kept_evaluations import LIMITED, add_evaluation, shown_evaluation
+from restock.train.run.kept_evaluations import (
+    LIMITED,
+    CloneQuality,
+    add_evaluation,
+    read_clones,
+    shown_evaluation,
+)
 from restock.train.run.measures import summary_rows
 from restock.train.run.run_profile import profile_of_run
 from restock.train.run.run_tables import EVAL_EPISODES

@@ -22,11 +22,10 @@ from restock.train.evaluation.references import (
     reference,
     wrong_seed,
 )
-from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_evaluations import WAYS
 from restock.train.run.kept_policy import PolicyOrigin
 from restock.train.run.run import Run
-from restock.train.run.run_profile import profile_of_run
+from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.twin.env.floor_report import refuse_unfit, unfit_kinds
 from restock.train.twin.env.interface import Policy
 from restock.train.twin.floors.floors import layouts_of_split, open_floors

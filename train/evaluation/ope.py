@@ -39,10 +39,9 @@ from restock.train.evaluation.off_policy.dataset import (
 )
 from restock.train.evaluation.off_policy.estimators import EssGate, OpeEpisodes, estimate
 from restock.train.evaluation.policies import GreedyPolicy, load_agent
-from restock.train.run.fed_panel import run_panel
 from restock.train.run.kept_policy import PolicyOrigin
 from restock.train.run.run import Run
-from restock.train.run.run_profile import profile_of_run
+from restock.train.run.run_profile import profile_of_run, run_panel
 from restock.train.run.run_tables import TABLES
 
 ALL = "all"

@@ -24,15 +24,17 @@ from restock.train.dqn.algorithm import Loss
 from restock.train.feed import interval_tables
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.fresh_log import FreshPerturbations
-from restock.train.feed.held_rows import WAITING, EpisodeLabels, HeldInterval
 from restock.train.feed.interval_tables import GreedyRows, SourceRows
 from restock.train.feed.logs import Logs
 from restock.train.feed.sampled_rows import (
     FRESH,
     GREEDY,
     LOGGED,
+    WAITING,
     BatchValues,
     Columns,
+    EpisodeLabels,
+    HeldInterval,
     SampledRows,
     fresh_audit,
     keep_rows,

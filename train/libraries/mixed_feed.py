@@ -26,8 +26,8 @@ from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batch_record import FeedRecord, row_ids
 from restock.train.feed.batches import ReplayBatch
 from restock.train.feed.collector import conditions_in_twin
-from restock.train.feed.held_rows import EpisodeLabels
 from restock.train.feed.logs import Logs
+from restock.train.feed.sampled_rows import EpisodeLabels
 from restock.train.libraries.fresh_meta import FreshMeta, InfoLabels
 from restock.train.libraries.library_run import PartialTables, create_run, episode_row
 from restock.train.run.not_finite import NotFinite, check_fed

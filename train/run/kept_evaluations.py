@@ -8,6 +8,7 @@ floors, and of the run's own policy its newest version, as of a limited one its 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ import pyarrow.compute as pc
 
 from restock.errors import RunError
 from restock.files import read_table, write_table
-from restock.train.run.run_tables import EVAL_EPISODES
-from restock.words import quoted
+from restock.train.run.run_tables import EVAL_CLONES, EVAL_EPISODES
+from restock.words import counted, quoted
 
 Mission = tuple[str | None, str, int, str]
 FILE = Path("eval") / "episodes.parquet"  # in a run
@@ -144,14 +145,86 @@ def _names(table: pa.Table) -> list[tuple[str, ...]]:
     return list(zip(*columns, map(str, table["episode_seed"].to_pylist()), strict=True))
 
 
+CLONES = Path("eval") / "clones.parquet"  # in a run
+
+
+@dataclass(frozen=True)
+class CloneQuality:
+    """How good a clone is: a row of `RUN/eval/clones.parquet`, whose columns say what each is."""
+
+    policy: str
+    drivers: list[str]
+    rows: int
+    episodes: int
+    updates: int
+    training_log_likelihood: float
+    held_out_rows: int
+    log_likelihood: float | None
+    frequencies_log_likelihood: float | None
+    agreement: float | None
+    repeating: float | None
+    changed_agreement: float | None
+    note: str | None
+
+    @property
+    def poor(self) -> str | None:
+        """Why it is no good stand-in for the drivers; None where nothing says so."""
+        if self.log_likelihood is None or self.agreement is None:
+            return "the quality of the clone is not known: no row of its drivers is held out"
+        if self.log_likelihood <= (self.frequencies_log_likelihood or 0.0):
+            return (
+                "a poor clone: held-out actions are not more likely under it than under the "
+                "frequency of each action"
+            )
+        if self.agreement <= (self.repeating or 0.0):
+            return "a poor clone: repeating the last action agrees as often with held-out rows"
+        return None
+
+    @property
+    def text(self) -> str:
+        """What a reader must know of it, in a sentence or two."""
+        said = (
+            f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
+            f" ({counted(self.rows, 'row')} of"
+            f" {counted(self.episodes, 'episode')})"
+        )
+        if self.agreement is not None:
+            said += (
+                f"; in {self.held_out_rows:,} held-out rows it finds the drivers' action likeliest"
+                f" in {self.agreement:.0%} (repeating the last one: {self.repeating:.0%}"
+            )
+            if self.changed_agreement is not None:
+                said += f"; where they changed it: {self.changed_agreement:.0%}"
+            said += ")"
+        return ". ".join(part for part in (said, self.poor, self.note) if part)
+
+
+def read_clones(run: Path) -> list[CloneQuality]:
+    """One a policy. Raises RunError where the file is damaged."""
+    if not (run / CLONES).is_file():
+        return []
+    table = read_table(run / CLONES, EVAL_CLONES, error=RunError, remedy="remove it")
+    return [CloneQuality(**row) for row in table.to_pylist()]
+
+
+def keep_clone(run: Path, quality: CloneQuality) -> None:
+    """Put one beside the others; one of its name is replaced."""
+    others = [row for row in read_clones(run) if row.policy != quality.policy]
+    rows = [asdict(row) for row in (*others, quality)]
+    write_table(pa.Table.from_pylist(rows, schema=EVAL_CLONES), run / CLONES)
+
+
 __all__ = [
+    "CloneQuality",
     "FILE",
     "LIMITED",
-    "WAYS",
     "Mission",
+    "WAYS",
     "add_evaluation",
+    "keep_clone",
     "mission_of",
     "planner_times",
+    "read_clones",
     "read_evaluations",
     "shown_evaluation",
     "trained_step",

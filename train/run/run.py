@@ -10,7 +10,10 @@ eval/                  what `restock eval` measured
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import platform
 import time
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -29,7 +32,6 @@ from restock.files import (
     write_table,
     write_text,
 )
-from restock.train.run.run_lock import LOCK
 from restock.train.run.run_tables import TABLES
 from restock.words import quoted
 
@@ -309,3 +311,66 @@ def _to_table(columns: Mapping[str, Any], schema: pa.Schema) -> pa.Table:
 
 def _is_column(value: Any) -> bool:
     return hasattr(value, "__len__") and not isinstance(value, str | bytes)
+
+
+LOCK = ".lock"  # in a run; says who writes it: process and machine
+
+
+class RunLock:
+    """Taken when it is made, until `release`."""
+
+    def __init__(self, run: Path) -> None:
+        """Raises RunError: another process trains this run; names it."""
+        run.mkdir(parents=True, exist_ok=True)
+        self._path = run / LOCK
+        self._file: int | None = None
+        while self._file is None:
+            file = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                holder = os.read(file, 256).decode("utf-8", "replace")
+                os.close(file)
+                raise _refused(run, holder) from error
+            except OSError:  # a file system without locks
+                os.close(file)
+                self._path.unlink(missing_ok=True)
+                return
+            if _is_at(file, self._path):
+                self._file = file
+            else:  # whoever held it has removed the file since it was opened
+                os.close(file)
+        os.ftruncate(self._file, 0)
+        os.write(self._file, f"{os.getpid()} {platform.node()}".encode())
+
+    def release(self) -> None:
+        """Let others write the run. Does nothing the second time."""
+        if self._file is not None:
+            self._path.unlink(missing_ok=True)
+            os.close(self._file)
+            self._file = None
+
+
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _refused(run: Path, holder: str) -> RunError:
+    process, _, machine = holder.partition(" ")
+    here = machine == platform.node()
+    named = f"process {process}{'' if here else f' on {machine}'}" if process else "another process"
+    kill = f" (Ctrl-C, or `kill {process}`{'' if here else ' there'})" if process else ""
+    return RunError(
+        f"is being trained by {named}",
+        where=str(run),
+        remedy=f"wait until it has ended, or stop it{kill}; then run the same command again",
+    )
+
+
+__all__ = [
+    "LOCK",
+    "RunLock",
+]

@@ -122,7 +122,7 @@ class TraceCommand:
             without = ("before", "after", "critic")
             refuse(self, without, "has no effect without --view", remedy="give --view FILE")
             return
-        from restock.train.view.view import check_view
+        from restock.train.view.write_view import check_view
 
         check_view(self.view)
         if self.row is None:
@@ -140,7 +140,7 @@ class TraceCommand:
     def _write_view(self, trace: tracing.Trace) -> dict[str, Any] | None:
         if self.view is None:
             return None
-        from restock.train.view.view import ViewOptions, write_view
+        from restock.train.view.write_view import ViewOptions, write_view
 
         own = self.place if trace.audit is not None else None  # of a run
         critic = None if self.critic == "none" else self.critic or own

@@ -111,9 +111,9 @@ def trained(to: Settings) -> str:
 
 def shelves(run: Path) -> list[str]:
     """Return a line a stratum: its share of the logs, its quota, and what the critic was fed."""
-    from restock.train.run.fed_panel import run_panel
     from restock.train.run.fed_shares import fed_shares, shortfalls
     from restock.train.run.run import Run
+    from restock.train.run.run_profile import run_panel
 
     trained = Run.open(run)
     panel: Panel | None = run_panel(trained.document)
