@@ -90,7 +90,7 @@ def test_a_complaint_about_a_job_names_the_help_of_the_job(
     assert set(helps) == {f"restock twin {words[0]} --help"}
 
 
-def test_an_option_that_may_be_left_out_takes_its_names_and_not_none(
+def test_an_optional_choice_does_not_take_none(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert cli.main(["train", "--device", "None"]) == ExitCode.USAGE

@@ -208,7 +208,7 @@ def test_a_network_that_was_edited_is_said_by_who_would_drive_it(
     assert "body." in said[0]  # which of its weights
 
 
-def test_a_table_that_is_missing_is_said_where_it_is_taken_as_empty(
+def test_a_missing_table_is_reported_as_empty(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"

@@ -70,7 +70,7 @@ def test_the_policy_from_the_logs_alone_imitates_whom_there_is(
     assert named == ([] if "operator" in drivers else ['teacher.policies=["joystick", "planner"]'])
 
 
-def test_the_run_that_is_behind_goes_on_until_both_have_driven_as_much(tmp_path: Path) -> None:
+def test_the_run_that_is_behind_catches_up(tmp_path: Path) -> None:
     to = Settings(("logs",), tmp_path, seconds=9)
 
     def driven(run: int, uniform: int) -> list[str] | None:
@@ -132,9 +132,7 @@ def test_an_earlier_demo_is_replaced_and_nothing_else(tmp_path: Path) -> None:
     assert (mine / "thesis.tex").read_text() == "precious"
 
 
-def test_what_the_user_gave_is_neither_removed_nor_mistyped_at_the_earlier_demos_cost(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_demo_keeps_user_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     prepare(out)
     (out / "mine.mcap").write_text("precious")

@@ -120,7 +120,7 @@ def test_what_cannot_be_compared_names_the_option_and_its_store(
         *(("coverage", "--out"), ("coverage drift", "--out"), ("report", "--out")),
     ],
 )
-def test_a_folder_to_write_to_is_refused_before_the_work(
+def test_a_folder_as_output_file_is_refused_early(
     verb: str, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before it is even looked whether there is a store."""

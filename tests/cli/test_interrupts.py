@@ -55,7 +55,7 @@ def test_a_kill_does_what_ctrl_c_does_at_that_moment(number: int) -> None:
 
 
 @pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
-def test_a_process_ends_with_the_block_that_waits_for_it_and_from_another_thread(
+def test_a_process_ends_with_the_block_that_waits_for_it(
     ctrl_c: Any,
 ) -> None:
     """Also where Ctrl-C is ignored, as in the background of a script."""
@@ -117,7 +117,7 @@ def test_ctrl_c_while_duckdb_calls_python_is_an_interruption(
 
 
 @pytest.mark.usefixtures("usual_ctrl_c")
-def test_a_training_says_at_once_that_it_stops_and_a_second_interrupt_ends_it(
+def test_a_second_interrupt_ends_a_training_at_once(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with kill_as_interrupt(), _stop_on_interrupt() as stop:

@@ -21,7 +21,7 @@ def cut(tmp_path: Path) -> Path:
     return bag
 
 
-def test_what_was_lost_is_told_with_the_proposal_and_with_the_check(
+def test_losses_are_reported_by_new_and_by_check(
     tmp_path: Path, cut: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of a bag whose ingest ended with 3, `new` said nothing, and both ended with 0."""

@@ -246,7 +246,7 @@ class Lost(Drive):
         return {name: topics[name] for name in ("/cmd_vel", "/scan")}
 
 
-def test_commands_in_one_recording_and_poses_in_another_are_told_so(
+def test_commands_and_poses_in_different_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of a Nav2 cart only the one was told as missing, though the other recording has it."""
@@ -298,7 +298,7 @@ def test_a_copy_of_a_recording_is_not_counted_twice(
 
 
 @pytest.mark.long
-def test_where_nothing_says_that_the_twin_is_right_a_policy_comes_from_the_logs_alone(
+def test_without_a_trusted_twin_the_policy_is_from_logs_alone(
     tmp_path: Path, quick_models: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = write_bag(Drive(12.0), tmp_path / "drive")
@@ -343,7 +343,7 @@ def test_what_nothing_says_of_the_robot_is_called_a_guess(tmp_path: Path) -> Non
     assert "wheel radius, mass guessed from its outline" in reported
 
 
-def test_several_topics_of_commands_are_for_a_person_to_choose_from(
+def test_a_person_chooses_among_command_topics(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = write_bag(Drive(proposals="/base/cmd_vel"), tmp_path / "drive")

@@ -27,7 +27,7 @@ def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_where_no_mission_fits_there_is_no_training_in_the_twin_whatever_was_asked() -> None:
+def test_without_room_for_a_mission_the_twin_is_not_used() -> None:
     def floor(**document: Any) -> Ended:
         return Ended("floor", "", "done", document=document)
 
@@ -37,7 +37,7 @@ def test_where_no_mission_fits_there_is_no_training_in_the_twin_whatever_was_ask
     assert no_room(Ended("floor", "", "failed")) is None
 
 
-def test_a_fit_that_ends_farther_from_the_logs_is_told_with_its_figures() -> None:
+def test_a_worse_fit_is_reported_with_its_figures() -> None:
     def gap(*ends: tuple[str, str, float, float]) -> dict[str, Any]:
         rows = [
             {"condition": "nominal", "quantity": what, "source": source, "median": m, "p90": p}
@@ -78,7 +78,7 @@ def test_a_lidar_that_sees_into_the_robot_stops_it(
 @pytest.mark.parametrize(
     ("status", "said"), [("done", "cannot be evaluated on logs."), (None, "cannot be evaluated.")]
 )
-def test_what_was_driven_in_the_twin_is_not_told_as_never_evaluated(
+def test_an_evaluation_in_the_twin_is_not_forgotten(
     tmp_path: Path, status: str | None, said: str
 ) -> None:
     def verb(command: list[str]) -> int:

@@ -63,7 +63,7 @@ def damaged(tmp_path: Path) -> Path:
     return bag
 
 
-def test_a_damaged_recording_is_read_as_far_as_it_is_intact_where_that_is_asked_for(
+def test_salvage_reads_a_damaged_recording_as_far_as_intact(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And its map of another frame stops it at the floor."""
@@ -180,30 +180,6 @@ def test_definitions_go_to_every_stage_that_reads_recordings(
     assert given == ["info", "profile", "profile", "ingest", "twin"]
 
 
-@pytest.mark.parametrize(
-    ("flag", "value", "said"),
-    [
-        ("--tag", "north", "'north' is not KEY=VALUE"),
-        ("--definitions", "nowhere", "no such folder of definitions"),
-        ("--map", "no_map.yaml", "no_map.yaml: cannot be read: No such file"),
-        ("--urdf", "box.urdf", "'box' has no wheels: none of its joints (none) turns without end"),
-    ],
-)
-def test_what_cannot_be_used_is_refused_before_anything_is_written(
-    flag: str,
-    value: str,
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("box.urdf").write_text("<robot name='box'><link name='base_link'/></robot>")
-    assert cli.main(["start", "bags", "--out", "out", flag, value]) == 2
-    assert said in capsys.readouterr().err
-    assert not Path("out").exists()
-
-
 def test_a_file_of_any_name_may_lie_beside_the_recordings(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -238,7 +214,7 @@ def test_what_is_no_recording_is_refused_and_nothing_is_written(
 
 
 @pytest.mark.long
-def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on_with(
+def test_several_kinds_of_robots_are_told_apart(
     tmp_path: Path, damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And what cannot be read is named, and does not stop the others."""
@@ -264,7 +240,7 @@ def test_recordings_of_several_kinds_of_robots_are_told_apart_and_one_is_gone_on
     assert f"restock ingest {bags / 'a'} {bags / 'b'} --store" in commands(document)["ingest"]
 
 
-def test_recordings_that_the_proposal_does_not_read_are_of_a_kind_too(
+def test_unread_recordings_are_sorted_by_kind_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The small drive of another robot was ingested with the others."""
@@ -326,7 +302,7 @@ def test_few_rows_are_not_all_drawn_before_the_twin_is_driven() -> None:
     assert alone == f"schedule.offline_updates={int(allowed)}"
 
 
-def test_a_damaged_ros1_bag_is_not_asked_for_as_if_nothing_was_named(
+def test_a_damaged_ros1_bag_is_reported_as_damaged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut = tmp_path / "cut.bag"
@@ -360,9 +336,13 @@ def test_a_task_without_a_goal_is_not_practised_by_success(tmp_path: Path) -> No
         ("--footprint", "wide", "--footprint"),
         ("--minutes", "nan", "--minutes"),
         ("--out", "a_file", "give a folder with --out"),
+        ("--tag", "north", "'north' is not KEY=VALUE"),
+        ("--definitions", "nowhere", "no such folder of definitions"),
+        ("--map", "no_map.yaml", "no_map.yaml: cannot be read: No such file"),
+        ("--urdf", "box.urdf", "'box' has no wheels"),
     ],
 )
-def test_what_is_wrong_with_an_option_is_said_before_the_first_stage(
+def test_wrong_options_are_refused_before_the_first_stage(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -372,6 +352,7 @@ def test_what_is_wrong_with_an_option_is_said_before_the_first_stage(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("a_file").touch()
+    Path("box.urdf").write_text("<robot name='box'><link name='base_link'/></robot>")
     assert cli.main(["start", "no_bag", "--out", "out", option, value]) == 2
     said = capsys.readouterr()
     assert why in said.err

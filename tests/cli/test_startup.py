@@ -48,15 +48,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [("sql", "STORE", "SELECT count(*) FROM transitions"), ("sql", "STORE", "FROM coverage")],
     ids=" ".join,
 )
-def test_a_query_imports_neither_what_learns_nor_what_reads_recordings(
-    command: tuple[str, ...], store: Path
-) -> None:
+def test_a_query_imports_no_learning_and_no_readers(command: tuple[str, ...], store: Path) -> None:
     modules = loaded(*(str(store) if word == "STORE" else word for word in command), "--json")
     assert modules & (SLOW | {"pyarrow.compute", "rich"}) == set()
     assert "duckdb" in modules
 
 
-def test_an_audit_imports_neither_what_learns_nor_what_reads_recordings(store: Path) -> None:
+def test_an_audit_imports_no_learning_and_no_readers(store: Path) -> None:
     assert loaded("audit", str(store)) & SLOW == set()
 
 
@@ -77,7 +75,7 @@ def test_ingest_imports_neither_what_learns_nor_pandas(tmp_path: Path) -> None:
     ],
     ids=["ingest", "sql"],
 )
-def test_what_is_not_there_is_said_before_what_would_read_it_is_imported(
+def test_missing_paths_are_reported_before_heavy_imports(
     command: tuple[str, ...], unused: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -100,13 +98,13 @@ def test_what_few_runs_use_is_not_imported_by_all(module: str, slow: set[str]) -
 
 
 @pytest.mark.parametrize("order", ["import restock, gymnasium", "import gymnasium, restock"])
-def test_the_environment_is_registered_whichever_is_imported_first(order: str) -> None:
+def test_the_environment_is_registered_in_either_order(order: str) -> None:
     code = f"{order}; print(gymnasium.spec('restock/Warehouse-v0').entry_point)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "restock.train.twin.env.vector_env:WarehouseEnv", done.stderr
 
 
-def test_pandas_that_a_command_did_not_look_for_works_once_it_is_imported() -> None:
+def test_pandas_works_once_it_is_imported() -> None:
     """Stable-Baselines3 imports it; Arrow must still make its frames."""
     pytest.importorskip("pandas")
     code = (

@@ -115,7 +115,7 @@ def test_verify_lists_what_is_damaged(store: Path, capsys: pytest.CaptureFixture
     ]
 
 
-def test_a_damaged_manifest_is_found_where_the_store_cannot_be_opened(store: Path) -> None:
+def test_a_damaged_manifest_is_found_in_an_unreadable_store(store: Path) -> None:
     file = next(store.glob("recordings/compacted/*.parquet"))
     flip(file, 1000)
     assert [Path(one.file).name for one in verify_store(store).damaged] == [file.name]
