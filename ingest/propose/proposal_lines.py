@@ -121,7 +121,7 @@ def profile_lines(
         *seen.goal.table_lines(),
         *_robot_lines(seen),
         *_noise_lines(seen, trial),
-        *_clock_lines(seen.clock, trial),
+        *_clock_lines(seen.clock),
     ]
     for role, fitting in seen.roles.items():
         if role == "pose" and seen.poses_from_frames:
@@ -286,7 +286,7 @@ def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
     return fix_noise_lines(seen.recording, topic.name, kind.fields, driven_m)
 
 
-def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
+def _clock_lines(clock: ClockChoice) -> list[str]:
     offset = ""
     if (ahead_s := clock.ahead_s) is not None:
         where = "ahead of" if ahead_s >= 0 else "behind"
@@ -296,9 +296,7 @@ def _clock_lines(clock: ClockChoice, trial: Trial) -> list[str]:
         "[clock]",
         *(f"# {comment}" for comment in clock.comments),
         f'alignment = "{clock.alignment}"' + offset,
-        *trial.comments("clock.steps"),
         f'steps = "{clock.steps}"  # {why}' + ("" if clock.every_s is None else ", mostly"),
-        *trial.comments("clock.max_gap_s"),
         f"max_gap_s = {clock.max_gap_s:g}  # a longer one ends an episode",
         "",
     ]

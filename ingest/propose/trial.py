@@ -83,8 +83,6 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
     requested = _Advisor(profile, topics, steps, episodes)
     advice = [
         *requested.ages(),
-        *requested.gaps(),
-        *requested.ticks(),
         *requested.outline(),
         *requested.limit(),
     ]
@@ -176,41 +174,6 @@ class _Advisor:
             found.append(Advice(f"inputs.{name}.max_age_s", text))
         return found
 
-    def gaps(self) -> list[Advice]:
-        """Whether a longer gap within an episode gives much more."""
-        lone = self.dropped.get("a single step between two cuts", 0)
-        if not self.cuts["gap"] + lone or self.cuts["gap"] + lone < MUCH * len(self.steps):
-            return []
-        stamps = self.steps.signals["stamp_ns"]
-        gaps = np.diff(stamps)[np.diff(self.steps.segment) == 0] / NS
-        limit = self.profile.clock.max_gap_s
-        over = gaps[gaps > limit]
-        for longer in (2 * limit, 4 * limit, 8 * limit):
-            number = self._count(_changed(self.profile, clock={"max_gap_s": longer}))
-            if number > GAIN * self.now:
-                text = (
-                    f"{limit:g} s cuts at {len(over):,} gaps of {over.min():.2f} s and more;"
-                    f" {self.now:,} transitions, {longer:g} s makes {number:,}"
-                )
-                return [Advice("clock.max_gap_s", text)]
-        return []
-
-    def ticks(self) -> list[Advice]:
-        """Whether a tick every period, and commands that hold, give much more."""
-        if self.profile.clock.steps != "command":
-            return []
-        changed = _changed(self.profile, clock={"steps": "rate"})
-        held = _held(changed, "command", None)
-        number = self._count(held)
-        if number <= 2 * self.now:
-            return []
-        text = (
-            f"one tick per command gives {self.now:,} transitions; if the robot continues with "
-            "its last command, steps"
-            f' = "rate" without inputs.command.max_age_s gives {number:,}'
-        )
-        return [Advice("clock.steps", text)]
-
     def limit(self) -> list[Advice]:
         """Whether logged missions take longer than the time limit: cut there, they have failed."""
         task, cut = self.profile.task, self.cuts["time limit"]
@@ -265,7 +228,3 @@ def _held(profile: Profile, name: str, age_s: float | None) -> Profile:
     source = msgspec.structs.replace(getattr(profile.inputs, name), max_age_s=age_s)
     inputs = msgspec.structs.replace(profile.inputs, **{name: source})
     return msgspec.structs.replace(profile, inputs=inputs)
-
-
-def _changed(profile: Profile, *, clock: Mapping[str, float | str]) -> Profile:
-    return msgspec.structs.replace(profile, clock=msgspec.structs.replace(profile.clock, **clock))
