@@ -101,8 +101,10 @@ def ask(store: Path, question: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory(dir=store.parent) as folder:
         began, cpu = time.perf_counter(), time.process_time()
         with contextlib.redirect_stdout(sys.stderr):
-            if question in ("audit", "compact"):
-                code = restock([question, str(store)])
+            if question == "audit":
+                code = restock(["audit", str(store)])
+            elif question == "compact":
+                code = restock(["store", "compact", str(store)])
             elif question == "mix":
                 code = restock(["mix", str(store), "--out", f"{folder}/panel"])
             elif question == "one_day_alone":
