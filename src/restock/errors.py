@@ -109,7 +109,7 @@ class QueryError(RestockError):
 
 
 class MixtureError(RestockError):
-    """A mixture that the store cannot fill, where the mixture says to refuse."""
+    """A mixture that the store cannot fill, if the mixture asks to be refused then."""
 
 
 class PanelError(RestockError):

@@ -140,7 +140,7 @@ _MARKS = {
 
 
 def expect_file_place(path: Path | None, option: str, *, run: Path | None = None) -> None:
-    """Refuse a place where an option's file cannot be, or would be lost: before the work.
+    """Refuse, before the work, a place where an option's file cannot be or would be lost.
 
     Args:
         run: what the file is about, where that is a run: it may lie in the run's folder.
@@ -161,7 +161,7 @@ def expect_file_place(path: Path | None, option: str, *, run: Path | None = None
 
 
 def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
-    """Refuse a place where no new folder can be made, or where one would be lost with another.
+    """Refuse a place where no new folder can be made, or where it would be lost with another.
 
     Raises:
         RestockError: (of the kind `error`) a file or a folder without permission is in the way; or
@@ -181,7 +181,7 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
 
 
 def _within(path: Path, run: Path | None = None) -> str | None:
-    """Why nothing is written there, where it lies within a panel, a store or another run."""
+    """Say why nothing is written there: it lies within a panel, a store or another run."""
     for folder in path.absolute().parents:
         for mark, kind in _MARKS.items():
             own = kind == "the run" and run is not None and run.resolve() == folder.resolve()

@@ -57,7 +57,7 @@ def installed(name: str) -> bool:
 
 
 def when_imported(name: str, action: Callable[[], None]) -> None:
-    """Do it once the module `name` is imported: now where it is, else right after it will be."""
+    """Call `action` once the module `name` is imported: now, or right after its import."""
     if name in sys.modules:
         action()
     else:

@@ -34,7 +34,7 @@ _REMEDIES = {
 
 
 def as_restock_error(error: Exception, args: Sequence[str]) -> RestockError:
-    """Any exception as one of ours; prints its traceback where the environment asks for it."""
+    """Turn any exception into a RestockError; print its traceback if the environment asks."""
     print_traceback(error)
     where = f"restock {' '.join(args)}"
     if full := _out_of_memory(error):

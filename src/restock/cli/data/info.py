@@ -126,7 +126,7 @@ def _is_store(path: str) -> bool:
 
 
 def _size(count: int) -> str:
-    """Bytes, in MB; in kB where they are less than one."""
+    """Format bytes in MB, or in kB below one MB."""
     return f"{count / 1e6:.1f} MB" if count >= 999_950 else f"{count / 1e3:.1f} kB"
 
 
@@ -143,7 +143,7 @@ def _packed(chunks: dict[str, Any]) -> str:
 
 
 def _names(names: list[str]) -> str:
-    """Names, each once, and how often where it is more."""
+    """List names, each once, and how often it occurs if that is more than once."""
     often = Counter(names)
     listed = [
         f"{name or '(unnamed)'}{f' ({count})' if count > 1 else ''}"

@@ -37,7 +37,7 @@ DRAWS_S = 60
 
 
 class Finding(NamedTuple):
-    """One line: what was looked at, how it is, and what to do where it is not well."""
+    """One line of the report: what was checked, its state, and what to do about it."""
 
     part: str
     name: str

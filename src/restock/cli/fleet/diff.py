@@ -40,7 +40,7 @@ class DiffCommand:
     """Print one JSON document with everything."""
 
     def run(self) -> int:
-        """Compare, print, and say with the exit code whether they differ, where that was asked."""
+        """Compare and print; with --exit-code, return whether they differ."""
         from restock.cli import output
         from restock.cli.fleet import diff_tables
 

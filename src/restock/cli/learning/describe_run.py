@@ -108,7 +108,7 @@ def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def no_update(outcome: TrainResult, config: TrainConfig) -> str | None:
-    """Why a run has learnt nothing, or nothing in the twin; None where it has."""
+    """Say why a run has learned nothing, or nothing in the twin; None if it has."""
     if outcome.online_updates:
         return None
     if not outcome.gradient_steps:

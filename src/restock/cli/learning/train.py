@@ -116,7 +116,7 @@ class TrainCommand:
 
 
 def _train(prepared: Prepared, store: Path | None) -> tuple[TrainResult, Flushed | None]:
-    """Train to the end; then flush the twin's episodes, where a store is given."""
+    """Train to the end; then flush the twin's episodes if a store is given."""
     from restock.cli.learning.describe_run import describe_run
     from restock.cli.output import progress, say
     from restock.ingest.store.writer import StoreWriter

@@ -174,19 +174,19 @@ def _task(profile: Path | str | None) -> Task | None:
 
 
 def practice_settings(profile: Path | str | None) -> list[str]:
-    """Practice of missions that go wrong, where a mission can."""
+    """Practise missions that go wrong, if the task has a goal."""
     return ["practice.rule=success"] if has_goal(profile) else []
 
 
 def no_room(floor: Ended) -> str | None:
-    """Why nothing can be driven on the floor that there is; None where something can."""
+    """Say why nothing can be driven on the floor; None if something can."""
     if floor.good and floor.document.get("episodes") == []:
         return "no mission fits on the floor that the recordings show"
     return None
 
 
 def mistrust(floor: Ended, gap: Ended) -> str | None:
-    """Why the twin is not to be trusted in nominal driving; None where it is."""
+    """Say why the twin is not to be trusted in nominal driving; None if it is."""
     if not floor.good:
         return f"there is no floor to drive on: {'; '.join(floor.errors)}"
     if "nominal" not in floor.document["episodes"]:
@@ -202,7 +202,7 @@ def mistrust(floor: Ended, gap: Ended) -> str | None:
 
 
 def fit_is_worse(gap: Document) -> str | None:
-    """Why the fitted twin is farther from the logs than the twin as described; None: it is not.
+    """Say why the fitted twin is farther from the logs than the described one; None if not.
 
     By the position gap of nominal driving, of the same segments: both its median and its 90th
     percentile.
@@ -224,7 +224,7 @@ def fit_is_worse(gap: Document) -> str | None:
 
 
 def no_ways(to: Settings) -> str | None:
-    """Why none of the routes that the panel holds out can be driven; None where one can."""
+    """Say why none of the held-out routes can be driven; None if one can."""
     from restock.replay.panel.panel import Panel
     from restock.train.evaluation.logged_ways import logged_missions
     from restock.train.twin.floors.floors import open_floors

@@ -25,7 +25,7 @@ def nothing(document: Document) -> list[str]:
 
 @dataclass(frozen=True)
 class Stage:
-    """What is run, and when it need not be run again."""
+    """A command of the way from recordings to a report, and when to run it again."""
 
     name: str
     title: str
@@ -50,7 +50,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Stop:
-    """Where a person must decide."""
+    """A point where a person must decide, and what that person can do."""
 
     why: str
     remedies: tuple[str, ...]  # each something to type or to edit
@@ -58,7 +58,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the stages share."""
+    """The user's files, where results go, and how recordings are read."""
 
     logs: tuple[str, ...]
     out: Path
@@ -336,7 +336,7 @@ def gap(to: Settings, horizon_s: float, *, fitted: bool) -> Stage:
 
 
 def train(to: Settings, *, twin: bool = True) -> Stage:
-    """Offline and then in the twin; or on the logs alone."""
+    """Train offline and then in the twin, or on the logs alone."""
     return Stage(
         "train",
         "Train: first on the panel, then online in the twin"
@@ -483,7 +483,7 @@ def fed_uniformly(to: Settings) -> str:
 
 
 def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
-    """Driven in the twin; with `goal` known, also against the way the logs were driven."""
+    """Evaluate in the twin; with `goal` known, also against the way the logs were driven."""
     cloned = ["--policies", "agent,cloned,planner,random"] if goal is not None else []
     return Stage(
         "eval",
@@ -500,7 +500,7 @@ def evaluate(to: Settings, *, goal: bool | None = None) -> Stage:
 
 
 def evaluate_on_ways(to: Settings) -> Stage:
-    """Driven on the ways that robots really drove, where the floor is that of the logs."""
+    """Evaluate on routes that robots really drove, on the floor of the logs."""
     return Stage(
         "ways",
         "Evaluate on the routes of the logs",
@@ -515,7 +515,7 @@ def evaluate_on_ways(to: Settings) -> Stage:
 
 
 def judge(to: Settings) -> Stage:
-    """Off-policy: what the policy is worth by logs that it did not learn from."""
+    """Evaluate off-policy, on logs that the policy did not learn from."""
     return Stage(
         "judge",
         "How good is the policy, by the logs alone, compared with their drivers?",

@@ -77,7 +77,7 @@ class Work:
             self._keep()
 
     def do(self, stage: Stage) -> Ended:
-        """Run a stage, or take what came of it before; says what it does and what came of it.
+        """Run a stage, or take its earlier result; say what it does and what came of it.
 
         Raises:
             KeyboardInterrupt: it was interrupted; the same stage then goes on, or begins again.
@@ -137,7 +137,7 @@ class Work:
         return ended
 
     def _note(self, ended: Ended, *, reported: bool = False) -> Ended:
-        """Say what came of a stage, and its complaints where they were not `told` already."""
+        """Report the result of a stage, and its complaints unless they were `reported` before."""
         self.ended.append(ended)
         for line in ended.outcome:
             self.say(f"   {escape(line)}")
