@@ -37,7 +37,7 @@ PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
 
 
 def coverage_facts(store: Store) -> dict[str, Rows]:
-    """The rows behind every figure of the page."""
+    """Return the rows behind every figure of the page."""
     sql = statements("restock.report.fleet", "coverage.sql")
     names = ("shelves", "weeks", "robots", "totals", "bounds")
     install_named(store.connection, " ".join(sql.values()))
@@ -100,7 +100,7 @@ def coverage_page(
 
 
 def headline(shelves: Rows, gaps: dict[str, Any]) -> str:
-    """The emptiest shelf against what is asked for, and what filling all of them takes."""
+    """Name the condition that is shortest of rows, and what filling all gaps takes."""
     if gaps["closed"]:
         return f"No gaps: the store has all that {gaps['mixture']} asks for"
     short = [gap for gap in gaps["gaps"] if gap["needed"]]

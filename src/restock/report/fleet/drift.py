@@ -75,7 +75,7 @@ def drift_page(drift: Drift) -> dict[str, Any]:
 
 
 def headline(drift: Drift) -> str:
-    """One sentence: what has changed."""
+    """Say in one sentence what has changed."""
     parts: dict[str, list[str]] = {}
     for row in drift.findings:
         if row["part"] not in _BESIDE:
@@ -125,7 +125,7 @@ def findings_section(drift: Drift) -> Section:
 
 
 def _trend(drift: Drift, finding: dict[str, Any]) -> Figure:
-    """One signal of the robots of a site over the periods."""
+    """Draw one signal of a site's robots over the periods."""
     rows = [
         {**row, "period": str(row["period"])}
         for row in drift.periods
@@ -270,7 +270,7 @@ def _conditions_section(drift: Drift, own: Rows) -> Section | None:
 
 
 def _differences_section(drift: Drift) -> Section | None:
-    """What sets a robot apart from the others of its site, changed or not."""
+    """Show what sets a robot apart from the others of its site, changed or not."""
     newest: dict[tuple[str, str], dict[str, Any]] = {}
     for row in drift.tests:
         if row["against"] != OWN and row["part"] not in _BESIDE and row["verdict"] == "differs":
@@ -300,7 +300,7 @@ def _differences_section(drift: Drift) -> Section | None:
 
 
 def _comparisons_section(own: Rows) -> Section | None:
-    """The newest comparison of each hardware signal, with its sizes of effect."""
+    """Show the newest comparison of each hardware signal, with its sizes of effect."""
     newest: dict[tuple[str, str], dict[str, Any]] = {}
     for row in own:
         if row["part"] not in _BESIDE:
@@ -342,12 +342,12 @@ def _comparisons_section(own: Rows) -> Section | None:
 
 
 def _chosen(robots: set[str], first: set[str]) -> list[str]:
-    """At most MAX_ROBOTS, these first; in the order of their names."""
+    """Return at most MAX_ROBOTS robots, these first, sorted by name."""
     return sorted((sorted(robots & first) + sorted(robots - first))[:MAX_ROBOTS])
 
 
 def _newest(rows: Rows) -> Rows:
-    """The rows of the newest periods."""
+    """Return the rows of the newest periods."""
     kept = sorted({row["period"] for row in rows})[-MAX_PERIODS:]
     return [row for row in rows if row["period"] in kept]
 

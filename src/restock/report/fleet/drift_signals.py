@@ -40,12 +40,12 @@ def signal_name(row: dict[str, Any]) -> str:
 
 
 def by_part(row: dict[str, Any]) -> tuple[str, str]:
-    """The order of signals on a page."""
+    """Return the key that sorts signals on a page."""
     return str(row["part"]), str(row["signal"])
 
 
 def meanings(rows: Iterable[dict[str, Any]]) -> Rows:
-    """What the signals of these rows are, in the order of their parts."""
+    """Return what the signals of these rows mean, in the order of their parts."""
     signals = {row["signal"]: row for row in sorted(rows, key=by_part)}
     return [
         {"signal": signal_name(row), "part": row["part"], "what it is": _MEANINGS[name]}
@@ -69,7 +69,7 @@ def change_text(row: dict[str, Any]) -> str:
 
 
 def signed_size(row: dict[str, Any]) -> float:
-    """The size of a change in least changes that matter, below 0 where the signal fell."""
+    """Return the size of a change in least changes that matter, negative for a fall."""
     neutral = 1.0 if row["compared"] == "ratio" else 0.0
     return float(row["size"]) * (1 if row["change"] >= neutral else -1)
 

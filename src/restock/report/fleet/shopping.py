@@ -11,7 +11,7 @@ MAX_GAPS = 20  # in the table
 
 
 def to_log(gaps: dict[str, Any]) -> dict[str, str]:
-    """The card of what to log next."""
+    """Make the card of what to log next."""
     plan, unit = gaps["plan"], gaps["unit"]
     unknown = [gap for gap in gaps["gaps"] if gap["best"] is None]
     if gaps["closed"]:
@@ -34,7 +34,7 @@ def to_log(gaps: dict[str, Any]) -> dict[str, str]:
 
 
 def _to_see_one(gaps: Rows) -> dict[str, int]:
-    """Of gaps without a rate: the episodes of each kind that show one with 95 %, at the least."""
+    """Return, for gaps without a rate, how many episodes of each kind show one with 95 %."""
     least: dict[str, int] = {}
     for gap in gaps:
         kind = words(gap["never_seen_in"])

@@ -17,8 +17,10 @@ BROAD, WIDE = 4, 6  # columns: with more, a phone and a tablet show rows as list
 
 @dataclass(frozen=True)
 class Drawing:
-    """A chart at each width, in CSS pixels, that a page may have for it; it shows the widest
-    that fits."""
+    """A chart, drawn at each width in CSS pixels that a page may have for it.
+
+    The page shows the widest that fits.
+    """
 
     svg: dict[int, str]
     spec: dict[int, dict[str, Any]] = field(default_factory=dict)  # Vega-Lite; none of a map
@@ -70,8 +72,10 @@ class Table:
 
     @property
     def stacks(self) -> str:
-        """Classes of CSS: on a phone, and if wide on a tablet, its rows become lists of column and
-        value."""
+        """Return CSS classes that turn rows into lists of column and value on narrow screens.
+
+        On a phone that is every table, on a tablet only wide ones.
+        """
         if len(self.columns) > WIDE:
             return "broad wide"
         return "broad" if len(self.columns) > BROAD else ""
@@ -98,7 +102,7 @@ def words(name: str) -> str:
 
 
 def estimate(row: dict[str, Any]) -> str:
-    """A value with its interval, or why there is none."""
+    """Return a value with its interval, or why there is none."""
     if row["value"] is None:
         return f"refused: {row['refused']}"
     return interval_text(row["value"], row["low"], row["high"])
@@ -119,7 +123,7 @@ def number(value: float | None) -> str:
 
 
 def span(seconds: float) -> str:
-    """A duration for people."""
+    """Format a duration for people."""
     if not math.isfinite(seconds):
         return "?"
     if seconds < 90:

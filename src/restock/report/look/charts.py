@@ -90,7 +90,7 @@ _numbers = count()
 
 
 def plot(rows: Sequence[Row]) -> Any:
-    """A chart over rows that travel in the page itself: what is no number is a gap in it."""
+    """Make a chart over rows that travel in the page; values that are no numbers leave gaps."""
     values = [{name: _shown(value) for name, value in row.items()} for row in rows]
     return alt.Chart(alt.InlineData(values=values))
 
@@ -103,7 +103,7 @@ def _shown(value: Any) -> Any:
 
 
 def draw(chart_of: Callable[[int], Any], widths: Sequence[int] = HALF) -> Drawing:
-    """A chart at each width; `chart_of` makes it, as wide as it is told or fitted to it.
+    """Draw a chart at each width that a page may have; `chart_of` makes it for a width.
 
     A chart that has no width of its own (a facet has) is fitted, with its axes and legend.
     """
@@ -131,13 +131,13 @@ def _svg(spec: dict[str, Any]) -> str:
 
 
 def own_names(svg: str) -> str:
-    """The same with ids that no other drawing of a page has."""
+    """Rename the ids of a drawing, so that no other drawing of the page has them."""
     number = next(_numbers)
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>d{number}-", svg)
 
 
 def scale(names: Sequence[str], colours: Mapping[str, str]) -> alt.Scale:
-    """A colour scale over the names that occur, known ones in their own colour."""
+    """Return a colour scale over the names that occur, known ones in their own colour."""
     spare = POLICY_SPARES if colours is POLICY_COLOURS else SPARE_COLOURS
     all_of_them = palette(names, colours, spare)
     return alt.Scale(domain=list(names), range=[all_of_them[name] for name in names])
@@ -148,8 +148,11 @@ def palette(
     colours: Mapping[str, str] = CONDITION_COLOURS,
     spare: Sequence[str] = SPARE_COLOURS,
 ) -> dict[str, str]:
-    """A colour for each name, whatever their order: its own, else a spare one that it begins to
-    look for at the same place in every chart, the first that is free as long as one is."""
+    """Return a colour for each name, independent of their order.
+
+    A name gets its own colour, else the first free spare one. The search begins at the same place
+    in every chart.
+    """
     found = {name: colours[name] for name in names if name in colours}
     free: list[str] = []
     for name in sorted(set(names) - set(found)):
@@ -178,7 +181,7 @@ def coloured(
     width: int,
     labels_px: int = 60,
 ) -> alt.Color:
-    """A colour for each name of a column, in the order of `names`, and the legend above."""
+    """Return a colour for each name of a column, in the order of `names`, with a legend."""
     return alt.Color(
         f"{field}:N",
         scale=scale(names, colours),
@@ -193,13 +196,13 @@ def label_px(names: Sequence[str]) -> int:
 
 
 def ordered(rows: Sequence[Row], key: str, first: Mapping[str, str]) -> list[str]:
-    """The values of a column: the known ones in their order, then the others by name."""
+    """Return the values of a column: the known ones in their order, then the others by name."""
     values = {str(row[key]) for row in rows}
     return [name for name in first if name in values] + sorted(values - set(first))
 
 
 def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, labels_px: int) -> Any:
-    """A layered chart for each value of `key`, beside each other where there is room for that.
+    """Make a layered chart for each value of `key`, side by side if there is room.
 
     `labels_px` is the width of the labels of the vertical axis.
     """
@@ -213,7 +216,7 @@ def side_by_side(layered: Any, key: str, names: Sequence[str], width: int, label
 
 
 def in_words(rows: Sequence[Row], key: str = "condition") -> list[dict[str, Any]]:
-    """The rows with a column's names as people read them."""
+    """Return the rows with a column's names as people read them."""
     return [{**row, key: words(row[key])} for row in rows]
 
 
@@ -255,8 +258,11 @@ def lines(
     steps: bool = False,
     marker: float | None = None,
 ) -> Drawing:
-    """Lines over training, by `env_steps` or `gradient_steps`; values hold until the next with
-    `steps`. `marker` is a vertical line (the step of the kept checkpoint)."""
+    """Draw lines over training, by `env_steps` or `gradient_steps`.
+
+    With `steps`, values hold until the next one. `marker` is a vertical line (the step of the kept
+    checkpoint).
+    """
     names = ordered(rows, series, colours)
     # A line of a single point would not be seen.
     points = points or len({row[x] for row in rows}) < FEW_POINTS
@@ -294,7 +300,7 @@ def lines(
 
 
 def x_axis(width: int, labels: str = SHORT_NUMBERS) -> alt.Axis:
-    """A horizontal axis of counts, with no more labels than fit."""
+    """Return a horizontal axis of counts, with no more labels than fit."""
     return alt.Axis(labelExpr=labels, grid=False, tickCount=max(3, width // 80))
 
 
@@ -322,7 +328,7 @@ def ages(rows: Sequence[Row]) -> Drawing:
 def stacked(
     rows: Sequence[Row], *, group: str, part: str, value: str, colours: Mapping[str, str]
 ) -> Drawing:
-    """One horizontal bar per group, split into parts that sum to one."""
+    """Draw one horizontal bar per group, split into parts that sum to one."""
     parts = list(dict.fromkeys(row[part] for row in rows))
     groups = list(dict.fromkeys(row[group] for row in rows))
 

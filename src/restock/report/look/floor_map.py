@@ -36,7 +36,7 @@ class FloorMap:
         return x_m * SCALE, (self.depth_m - y_m) * SCALE
 
     def draw(self, marks: Sequence[str], label: str, above: Sequence[str] = ()) -> Drawing:
-        """The floor with marks between the ground and the racks, and above them.
+        """Draw the floor with marks above the ground and above the racks.
 
         It has no text, so that it may be of any width: the bar below it is `BAR_M` long.
         """

@@ -41,7 +41,7 @@ class Charts:
         self._charts: list[Spec] = []
 
     def add(self, spec: Spec) -> int:
-        """The chart's number; `spec` is Vega-Lite with its rows by name, as Altair makes it."""
+        """Add a chart and return its number; `spec` is Vega-Lite with its rows by name."""
         shown = live(spec)
         rows = shown.pop("datasets", {})
         self._rows |= rows
@@ -49,7 +49,7 @@ class Charts:
         return len(self._charts) - 1
 
     def blocks(self) -> Markup:
-        """The elements that stand at the page's end; nothing where it has no charts."""
+        """Return the elements at the end of the page; nothing if it has no charts."""
         if not self._charts:
             return Markup("")
         document = {"config": self._config, "rows": self._rows, "charts": self._charts}
@@ -64,7 +64,7 @@ class Charts:
 
 
 def policy(charts: bool) -> str:
-    """The page's Content-Security-Policy: it fetches nothing and runs no script but these two."""
+    """Return the page's Content-Security-Policy: no fetches, no scripts but these two."""
     scripts = " ".join(_hash(text) for text in (_script(), _runtime())) if charts else "'none'"
     return (
         "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
@@ -73,7 +73,7 @@ def policy(charts: bool) -> str:
 
 
 def live(spec: Spec) -> Spec:
-    """A specification that answers the pointer, from one that is drawn still."""
+    """Turn the specification of a still chart into one that answers the pointer."""
     found = deepcopy(spec)
     rows = found.get("datasets", {})
     for name in ("config", "$schema"):
@@ -104,7 +104,7 @@ def _mark(unit: Spec) -> Spec:
 
 
 def _is_of_rows(unit: Spec) -> bool:
-    """Whether a mark stands for rows, by a field on each axis, and not for a value or a text."""
+    """Return whether a mark stands for rows, with a field on each axis."""
     encoding = unit["encoding"]
     return _mark(unit)["type"] != "text" and all(
         "field" in encoding.get(axis, {}) for axis in ("x", "y")
@@ -112,7 +112,7 @@ def _is_of_rows(unit: Spec) -> bool:
 
 
 def _series(unit: Spec) -> str | None:
-    """The field whose values the legend names, where it names several."""
+    """Return the field whose values the legend names, if it names several."""
     colour = unit["encoding"].get("color", {})
     several = len(colour.get("scale", {}).get("domain", ())) > 1
     named = colour.get("type") == "nominal" and colour.get("legend", {}) is not None
@@ -120,7 +120,7 @@ def _series(unit: Spec) -> str | None:
 
 
 def _isolate(unit: Spec, series: str, *, first: bool) -> None:
-    """A click on a name of the legend leaves it alone; a second one brings the others back."""
+    """Let a click on a name of the legend show it alone, and a second one all again."""
     full = _mark(unit).get("opacity", 1)
     unit["encoding"]["opacity"] = {
         "condition": {"param": "alone", "value": full},
@@ -132,7 +132,7 @@ def _isolate(unit: Spec, series: str, *, first: bool) -> None:
 
 
 def _points(line: Spec) -> Spec:
-    """The points of a line, wider than they are drawn, and seen where the pointer is."""
+    """Add a line's points, wider than they are drawn and visible under the pointer."""
     mark = {"type": "point", "filled": True, "size": HALO_PX2, "clip": True}
     pointed = {"param": "pointed", "empty": False, "value": HALO_OPACITY}
     select = {"type": "point", "on": "pointerover", "clear": "pointerout"}
@@ -145,7 +145,7 @@ def _points(line: Spec) -> Spec:
 
 
 def _told(units: list[Spec], facet: Spec, rows: Mapping[str, Any]) -> list[Spec]:
-    """What is said of a row: its names, its numbers, and the ends of intervals, each once."""
+    """Return what the tooltip of a row says: names, numbers and ends of intervals."""
     facets = [facet] if "field" in facet else list(facet.values())
     found: dict[str, Spec] = {}
     for channel in (*facets, *_channels(units)):
@@ -164,7 +164,7 @@ def _channels(units: list[Spec]) -> Iterator[Spec]:
 
 
 def _field(name: str, channel: Spec, units: list[Spec], rows: Mapping[str, Any]) -> Spec | None:
-    """None of a name that is everywhere the same."""
+    """Return a field of the tooltip; None for a name that is the same everywhere."""
     end = _end(name)
     title = f"95 %, {end}" if end else channel.get("title") or words(name)
     values = [row[name] for of in rows.values() for row in of if row.get(name) is not None]
@@ -183,7 +183,7 @@ def _end(name: str) -> str:
 
 
 def _is_share(name: str, units: list[Spec]) -> bool:
-    """Whether an axis that it is drawn along is in percent."""
+    """Return whether an axis that the mark is drawn along is in percent."""
     encodings = [unit["encoding"] for unit in units]
     along = {
         channel[0]

@@ -43,7 +43,7 @@ DARK = {
 
 
 def dark_rules() -> str:
-    """The rules of CSS that exchange a figure's colours."""
+    """Return the CSS rules that exchange a figure's colours in the dark theme."""
     return "\n".join(_rules())
 
 

@@ -96,7 +96,7 @@ def _named(sections: Sequence[Section]) -> Iterator[tuple[str, Figure]]:
 
 
 def _on_white(svg: str) -> str:
-    """A drawing that stands alone: on white, whole as XML."""
+    """Return a drawing that stands alone: on white, as complete XML."""
     box = re.search(r'viewBox="([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+)"', svg)
     if box is None:
         return svg
@@ -107,7 +107,7 @@ def _on_white(svg: str) -> str:
 
 
 def _code(text: str) -> Markup:
-    """A sentence as HTML: escaped, and what stands in backticks set as code."""
+    """Return a sentence as escaped HTML, with text in backticks set as code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 

@@ -17,7 +17,7 @@ MIN_TILE_PX = 34  # for a number in it
 
 
 def actions_section(facts: Facts) -> Section | None:
-    """None for a run that kept no such counts."""
+    """Return the section on actions; None for a run that kept no such counts."""
     if not facts.actions:
         return None
     cells = _cells(facts.actions)
@@ -35,13 +35,13 @@ def actions_section(facts: Facts) -> Section | None:
 
 
 def _row_name(row: dict[str, Any]) -> str:
-    """A condition, or the stratum of logs that it is a part of."""
+    """Return the name of a condition, or of the stratum of logs that it belongs to."""
     stratum, condition = words(row["stratum"]), words(row["condition"])
     return condition if stratum == condition else f"{stratum}: {condition}"
 
 
 def _cells(rows: Rows) -> Rows:
-    """One a source, condition and action, with the share of its rows; `wanted` is a source here."""
+    """Return a cell for each source, condition and action; `wanted` is a source here."""
     cells: Rows = []
     for row in rows:
         name = _row_name(row)
@@ -60,7 +60,7 @@ def _cells(rows: Rows) -> Rows:
 
 
 def _short(share: float) -> str:
-    """A share in a tile: never is not the same as seldom."""
+    """Format a share for a tile, where never differs from seldom."""
     if not share:
         return "0"
     return f"{share:.0%}" if share >= 0.01 else "<1%"
@@ -106,7 +106,7 @@ def _heatmap(cells: Rows) -> Drawing:
 
 
 def _table(rows: Rows) -> list[Table]:
-    """What the policy wants most beyond what the logs have, by condition."""
+    """Show which actions the policy wants most beyond the logs, by condition."""
     logged: dict[tuple[str, int], int] = {}
     of_condition: dict[str, int] = {}
     for row in rows:

@@ -15,7 +15,7 @@ from restock.report.run.facts import Facts
 
 
 def capacity_section(facts: Facts) -> Section | None:
-    """None where neither the run nor its panel says what the logs cover."""
+    """Return the section on capacity; None if nothing says what the logs cover."""
     chosen = facts.config.get("ring_capacity")
     ring = facts.config.get("config", {}).get("replay", {}).get("ring_capacity")
     capacity = chosen or _of_panel(facts)

@@ -21,7 +21,7 @@ _UNKNOWN = "unknown: run `restock eval` on a run whose panel and store are at ha
 
 
 def replay_card(facts: Facts) -> dict[str, Any]:
-    """The card as JSON values; null where the run does not say."""
+    """Return the card as JSON values, with null for what the run does not say."""
     settings = facts.config.get("config", {})
     replay, teacher = settings.get("replay", {}), settings.get("teacher", {})
     panel = facts.panel
@@ -175,7 +175,7 @@ _TEACHER = {
 
 
 def as_markdown(card: dict[str, Any]) -> str:
-    """The card as a page of Markdown."""
+    """Write the card as a page of Markdown."""
     capacity, sampling = card["capacity"], card["sampling"]
     lines = [f"# Replay card of {_cell(card['run'])}", ""]
     lines += [f"**Evaluation bias.** {_cell(card['imbalance'] or _UNKNOWN)}", ""]
@@ -212,7 +212,7 @@ def as_markdown(card: dict[str, Any]) -> str:
 
 
 def _teacher(teacher: dict[str, Any] | None, sampled: list[dict[str, Any]]) -> str:
-    """Who says what is plausible; `sampled` are the behaviour policies of the rows drawn."""
+    """Say who decides what is plausible; `sampled` are the policies of the rows drawn."""
     if teacher is None:
         return "none: every action may be chosen"
     ratio = teacher["ratio"]
@@ -241,7 +241,7 @@ def _panel(capacity: dict[str, Any]) -> str:
 
 
 def _rule(mixture: dict[str, Any] | None) -> str | None:
-    """How the logged part of a batch is drawn."""
+    """Say how the logged part of a batch is drawn."""
     if mixture is None:
         return None
     within = str(mixture.get("within", "uniform")).replace("_", " ")
@@ -251,7 +251,7 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
 
 
 def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
-    """How the fresh part of a batch was drawn; None if there was none."""
+    """Say how the fresh part of a batch was drawn; None if there was none."""
     if not _drawn_share(facts, "fresh"):
         return None
     rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
@@ -305,7 +305,7 @@ def _table(rows: Rows, columns: dict[str, str]) -> list[str]:
 
 
 def _shown(row: dict[str, Any], name: str) -> str:
-    """A row's column as its cell shows it."""
+    """Return a row's column as its cell shows it."""
     if name in ("available_rows", "drawn_rows", "rows", "episodes", "asked_rows"):
         return count(row[name])
     if name == "plausible_actions":
@@ -326,7 +326,7 @@ def _or_none(value: Any) -> str:
 
 
 def _words(value: Any) -> str:
-    """A small document for people."""
+    """Write a small document for people."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "none"
     return _or_none(value)

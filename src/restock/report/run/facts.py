@@ -88,7 +88,7 @@ class Facts:
 
     @property
     def target_rule(self) -> str:
-        """How the target network follows, for people."""
+        """Say how the target network follows the online one."""
         rule = self.config.get("config", {}).get("target", {})
         if rule.get("rule") == "polyak":
             return f"Polyak τ {rule['tau']:g}"
@@ -96,16 +96,16 @@ class Facts:
 
     @property
     def twin(self) -> bool:
-        """Whether the run had a twin to drive in."""
+        """Return whether the run had a twin to drive in."""
         return bool(self.config.get("config", {}).get("env", {}).get("twin", True))
 
     @property
     def no_goal(self) -> bool:
-        """Whether the task has no goal: success is not defined."""
+        """Return whether the task has no goal, so that success is not defined."""
         return bool(self.cells) and all(row["success"] is None for row in self.cells)
 
     def clean_cells(self, policy: str = "agent") -> Rows:
-        """The evaluation of a policy without perturbation."""
+        """Return the evaluation of a policy without perturbation."""
         return [
             row for row in self.cells if (row["policy"], row["perturbation"]) == (policy, "none")
         ]
@@ -212,7 +212,7 @@ def _add_panel(facts: Facts) -> None:
 
 
 def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
-    """The floor that is drawn, the first with logs, and what was logged there."""
+    """Add the floor that is drawn, the first with logs, and what was logged there."""
     floors = _floors(facts)
     if not floors:
         return
@@ -240,7 +240,7 @@ def _add_floor(facts: Facts, panel: Panel, store: Store) -> None:
 
 
 def _floors(facts: Facts) -> tuple[Warehouse, ...]:
-    """Those of the run; none where it drove on none, or they cannot be read."""
+    """Return the run's floors; none if it drove on none, or they cannot be read."""
     layouts = facts.config["config"].get("env", {}).get("layouts", DEFAULT)
     if not facts.twin and layouts == DEFAULT:  # the logs are of another floor
         return ()
@@ -256,7 +256,7 @@ def _store_rows(store: Store, name: str, **parameters: Any) -> Rows:
 
 
 def mean_success(cells: Rows) -> float:
-    """The mean over conditions, each counting the same; partly and wholly blocked by half each.
+    """Average success over conditions, partly and wholly blocked counting half each.
 
     It is the one average of success that there is: a study's `rare` and a run's kept policy are
     judged by the same.
@@ -274,7 +274,7 @@ def _by_condition(cells: Rows) -> dict[str, float]:
 
 
 def evaluation_bias(facts: Facts) -> str:
-    """The imbalance most likely to make the evaluation look better than deployment."""
+    """Name the imbalance most likely to make the evaluation look too good."""
     cells = facts.clean_cells()
     if facts.no_goal:
         return NO_GOAL

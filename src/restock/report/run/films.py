@@ -23,7 +23,7 @@ GAP = 24  # SVG units between the frames
 
 
 def films_section(facts: Facts) -> Section | None:
-    """None where nothing was filmed (`restock eval RUN --video`), or of another policy."""
+    """Return the section of films; None if none are of this policy (`--video` makes them)."""
     folder = facts.run / FOLDER
     if not (folder / DOCUMENT).is_file():
         return None
@@ -72,7 +72,7 @@ def _figure(facts: Facts, film: dict[str, Any]) -> Figure:
 
 
 def _strip(plan: FloorMap, film: dict[str, Any]) -> Drawing:
-    """The frames beside each other, two or three in a line."""
+    """Put frames side by side, two or three in a line."""
     width, height = plan.width_m * SCALE + GAP, plan.depth_m * SCALE + GAP
     frames = [_frame(plan, frame, film["track"][: frame["step"] + 1]) for frame in film["strip"]]
     drawn: dict[int, str] = {}
@@ -119,7 +119,7 @@ def _frame(plan: FloorMap, frame: dict[str, Any], track: list[list[float]]) -> s
 
 
 def _within(plan: FloorMap, x0: float, y0: float, x1: float, y1: float) -> Box:
-    """A box's part on the floor."""
+    """Clip a box to the floor."""
     return max(x0, 0.0), max(y0, 0.0), min(x1, plan.width_m), min(y1, plan.depth_m)
 
 

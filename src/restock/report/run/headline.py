@@ -25,7 +25,7 @@ _WITHOUT = "evaluate it together with one: `restock eval --policies agent,planne
 
 
 def headline(facts: Facts) -> str:
-    """The result in one sentence; in another the policy's step, unless that is the run's end."""
+    """Say the result in one sentence, and which step of the policy it is of."""
     if not facts.twin:
         return logs_alone.headline(facts)
     if not facts.clean_cells():
@@ -53,7 +53,7 @@ def _result(facts: Facts) -> str:
 
 
 def _policy_step(facts: Facts) -> str:
-    """Which policy was driven; nothing if it is that of the run's end, evaluated in training."""
+    """Say which policy was driven; nothing if it is that of the run's end."""
     step, policy = facts.driven_step, facts.policy
     if step is None or policy is None:
         return ""
@@ -67,13 +67,15 @@ def _policy_step(facts: Facts) -> str:
 
 
 def baseline(facts: Facts) -> str | None:
-    """Who the run is held against, of those that drove the same episodes."""
+    """Return whom the run is compared with, of those that drove the same episodes."""
     return next((name for name in BASELINES if facts.clean_cells(name)), None)
 
 
 def compared(facts: Facts, name: str | None = None) -> Rows:
-    """`regression`'s rows against the baseline, or another that drove the same episodes, by
-    perturbation and condition; none without one."""
+    """Return `regression`'s rows against the baseline, by perturbation and condition.
+
+    The baseline may be another that drove the same episodes. There are no rows without one.
+    """
     name = name or baseline(facts)
     if name is None or facts.no_goal:
         return []
@@ -87,7 +89,7 @@ def compared(facts: Facts, name: str | None = None) -> Rows:
 
 
 def losses(facts: Facts) -> list[str]:
-    """Where the run's policy is worse than the planner or the clone of whoever drove the logs."""
+    """Find where the policy is worse than the planner or the clone of the logs' drivers."""
     return [
         f"Worse than {BASELINES[name]} in {words(row['condition'])}"
         + ("" if row["perturbation"] == "none" else f" under {row['perturbation']}")
@@ -171,7 +173,7 @@ def _alone(row: dict[str, Any]) -> str:
 
 
 def _distrust(facts: Facts) -> str:
-    """What a success in the twin is worth little by: its gap to these logs."""
+    """Say why success in the twin may mean little: its gap to these logs."""
     gap = find_gap(facts)
     verdicts = () if gap is None else gap.verdicts
     nominal = next((each.verdict for each in verdicts if each.condition == "nominal"), TRUSTED)
@@ -181,7 +183,7 @@ def _distrust(facts: Facts) -> str:
 
 
 def lead(facts: Facts) -> str:
-    """What the headline's numbers are of, and what they cost."""
+    """Say what the headline's numbers are of, and what they cost."""
     took = facts.trained
     if not facts.twin:
         return (
@@ -208,7 +210,7 @@ def lead(facts: Facts) -> str:
 
 
 def _safety(facts: Facts, name: str) -> str:
-    """What the clean episodes cost in bumps and time, beside the baseline's."""
+    """Say what the clean episodes cost in bumps and time, beside the baseline's."""
     own, other = facts.clean.get("agent", {}), facts.clean.get(name, {})
     if own.get("bumps_per_km") is None or other.get("bumps_per_km") is None:
         return ""

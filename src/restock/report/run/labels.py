@@ -10,7 +10,7 @@ from restock.stats import wilson
 
 
 def labels_section(facts: Facts) -> Section | None:
-    """None where no recording of the store knows what was true."""
+    """Return the section on labels; None if no recording of the store knows the truth."""
     if not facts.labels:
         return None
     rows = [_score(row) for row in facts.labels]
@@ -55,7 +55,7 @@ def _with_range(value: float | None, events: int | None) -> str:
 
 
 def _reliability(bins: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """One row a condition, a column a tenth of probability: the share that is true, of how many."""
+    """Show the true share of each condition by tenths of probability."""
     rows: dict[str, dict[str, str]] = {}
     for one in bins:
         blank = {f"{tenth / 10:g}+": "" for tenth in range(10)}

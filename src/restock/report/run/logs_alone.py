@@ -1,5 +1,4 @@
-"""What a page says of a run without a twin: nothing drove, so logs that it did not learn from
-judge it."""
+"""What a page says of a run without a twin, judged by logs that it did not learn from."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ NOTHING_DROVE = (
 
 
 def headline(facts: Facts) -> str:
-    """The most that can honestly be said."""
+    """Say the most that can honestly be said."""
     rows = {(row["measure"], row["estimator"]): row for row in facts.off_policy}
     if not rows and not holds_out(facts):
         return "Trained on the logs alone, which are too short to evaluate it"
@@ -37,13 +36,13 @@ def headline(facts: Facts) -> str:
 
 
 def holds_out(facts: Facts) -> bool:
-    """Whether the panel left some rows for evaluation."""
+    """Return whether the panel left some rows for evaluation."""
     left_out = {} if facts.panel is None else facts.panel.header.left_out
     return any("evaluation split" in why for why, rows in left_out.items() if rows)
 
 
 def judged_section(facts: Facts) -> Section:
-    """The estimates, or how to get them."""
+    """Show the estimates, or how to get them."""
     if not facts.off_policy and not holds_out(facts):
         return Section(
             "judged",

@@ -10,7 +10,7 @@ from restock.report.run.facts import Facts
 
 
 def practice_section(facts: Facts) -> Section | None:
-    """None where the run has no record of it."""
+    """Return the section on practice; None if the run has no record of it."""
     rows = by_arm(facts)
     if not rows:
         return None
@@ -41,7 +41,7 @@ FIXED = ("natural", "even", "shares", "logs", "missions")
 
 
 def by_arm(facts: Facts) -> Rows:
-    """One row an arm: its shares at first and last, and all of its missions that ended."""
+    """Return a row for each arm: its first and last shares, and all missions that ended."""
     arms: dict[str, dict[str, Any]] = {}
     for row in facts.practice:
         arm = arms.setdefault(

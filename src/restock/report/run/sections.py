@@ -82,7 +82,7 @@ def success(facts: Facts) -> Section | None:
 
 
 def _success_table(perturbation: str, rows: Rows) -> Table:
-    """Of one perturbation, folded but for the clean one, without the columns that tell nothing."""
+    """Show the success under one perturbation, folded unless that is the clean one."""
     reported = {name for row in rows for name, value in row.items() if value != ""} - {
         "perturbation"
     }
@@ -110,7 +110,7 @@ def _success_table(perturbation: str, rows: Rows) -> Table:
 
 
 def _table(rows: Rows, texts: set[str], *, title: str = "", caption: str = "") -> Table:
-    """A table whose columns are numbers, but for `texts`."""
+    """Make a table whose columns are numbers, except `texts`."""
     numbers = set(rows[0]) - texts if rows else set()
     return Table(rows, numbers, title=title, caption=caption)
 
@@ -127,7 +127,7 @@ def _place(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
-    """A value with its unit, and its interval where there is one; nothing where it is unknown."""
+    """Format a value with its unit and interval; nothing if it is unknown."""
     if row[name] is None:
         return ""
     low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
@@ -136,7 +136,7 @@ def _told(row: dict[str, Any], name: str, form: str, unit: str = "") -> str:
 
 
 def sampled(facts: Facts) -> Section:
-    """The section that matters most: what the critic was fed."""
+    """Show what the critic was fed: the section that matters most."""
     of_shares = shares.figure(facts)
     figures = [] if of_shares is None else [of_shares]
     if facts.ages:
@@ -169,7 +169,7 @@ def sampled(facts: Facts) -> Section:
 
 
 def _newest(facts: Facts) -> str:
-    """How old the newest row of the panel was then: what is older only for that is not stale."""
+    """Return the age of the panel's newest row: what is only as old is not stale."""
     began_ns = facts.config.get("created_ns")
     if facts.panel is None or began_ns is None:
         return ""
@@ -195,7 +195,7 @@ def _age_rows(facts: Facts) -> Rows:
 
 
 def _span(low: int, unit: str) -> str:
-    """From `low` to twice that, as a label: days of years as those."""
+    """Label ages from `low` to twice that, in years if they are that old."""
     if unit == "d" and low >= _YEARS_FROM_DAYS:
         return f"{low / 365.25:.1f} to {2 * low / 365.25:.1f} y"
     return f"{_short(low)} to {_short(2 * low)} {unit}"
@@ -291,7 +291,7 @@ def critic(facts: Facts) -> Section | None:
 
 
 def floor_section(facts: Facts) -> Section | None:
-    """The map: where the logs have been, and where the agent failed."""
+    """Show on the map where the logs have been, and where the agent failed."""
     layout = facts.floor
     if layout is None:
         return None

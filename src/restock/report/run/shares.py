@@ -48,7 +48,7 @@ def bars(facts: Facts) -> Rows:
 
 
 def fed_table(facts: Facts) -> Table:
-    """The same in numbers, with where the rows came from and what was short, and why."""
+    """Show the feed in numbers, with sources, shortages and their reasons."""
     shares = ("natural", "wanted", "drawn", "logs", "fresh", "short")
     return Table(
         [
@@ -70,7 +70,7 @@ _TITLES = {"logs": "from logs", "fresh": "fresh"}
 
 
 def remarks(facts: Facts) -> list[str]:
-    """Which strata were short, which lose by their weights, and what rows are missing."""
+    """Say which strata were short, which lose by weights, and what rows are missing."""
     natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
     lost = []
     for row in facts.sampled:
@@ -112,7 +112,7 @@ def remarks(facts: Facts) -> list[str]:
 
 
 def table(facts: Facts) -> Table:
-    """The rows of each source, by stratum, after weights too."""
+    """Show the rows of each source by stratum, also after weights."""
     natural = {stratum.name: stratum.natural_share for stratum in facts.strata}
     wanted = {stratum.name: stratum.wanted_share for stratum in facts.strata}
     rows = []

@@ -54,12 +54,12 @@ _MEANING = {
 
 
 def source_name(source: str) -> str:
-    """A source as people read it: nominal is the name of a condition too."""
+    """Name a source for people: nominal is the name of a condition, too."""
     return f"{source} twin" if source in (BEFORE, AFTER) else source
 
 
 def find_gap(facts: Facts) -> TwinGap | None:
-    """The gap measured for a run: RUN/gap, or the gap folder of the store its panel is from."""
+    """Find the gap of a run: RUN/gap, or the gap folder of its panel's store."""
     places = [facts.run / FOLDER]
     if facts.panel is not None and "://" not in str(facts.panel.header.store):
         places.append(Path(facts.panel.header.store) / FOLDER)
@@ -73,7 +73,7 @@ def find_gap(facts: Facts) -> TwinGap | None:
 
 
 def run_section(facts: Facts) -> Section | None:
-    """The section of a run's report; None where no gap was measured."""
+    """Return the section of a run's report; None if no gap was measured."""
     gap = find_gap(facts)
     if gap is None:
         return None
@@ -119,7 +119,7 @@ def gap_page(gap: TwinGap) -> dict[str, Any]:
 
 
 def headline(gap: TwinGap) -> str:
-    """One sentence: where not to trust the twin."""
+    """Say in one sentence where not to trust the twin."""
     names = ", ".join(words(name) for name in gap.untrusted)
     if names:
         return f"Do not trust the twin in: {names}"
@@ -220,7 +220,7 @@ def _positions(rows: Rows) -> Drawing:
 
 
 def _steps_section(gap: TwinGap) -> Section:
-    """One step: reward by term, and observation by component."""
+    """Show the gap of one step: reward by term, observation by component."""
     twins = list(gap.about["twins"])
     gaps = _by_source(gap.rewards, "mean_gap", "condition", "term")
     moves = {(row["condition"], row["term"]) for row in gap.rewards if row["mean_gap"]}
@@ -261,7 +261,7 @@ def _steps_section(gap: TwinGap) -> Section:
 
 
 def _signals_section(gap: TwinGap) -> Section | None:
-    """None where no segment is as long as a horizon."""
+    """Show the gap of signals; None if no segment is as long as a horizon."""
     sources = [source_name(name) for name in dict.fromkeys(row["source"] for row in gap.paths)]
     keys = ("condition", "quantity", "horizon_s")
     medians = _by_source(gap.paths, "median", *keys)

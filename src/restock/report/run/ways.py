@@ -13,7 +13,7 @@ OWN = "agent"
 
 
 def ways_section(facts: Facts) -> Section | None:
-    """None where no logged way was driven, or where they are all that was driven."""
+    """Show logged routes; None if none was driven, or nothing else was."""
     if not facts.ways:
         return None
     rows = sorted(

@@ -22,7 +22,7 @@ _QUIET = alt.Axis(grid=False, ticks=False)
 
 
 def colours(arms: list[str]) -> dict[str, str]:
-    """A colour an arm, the same in every chart of a page; a reference's is its own."""
+    """Return a colour for each arm, the same in every chart; references have their own."""
     found = {arm: POLICY_COLOURS[arm] for arm in arms if arm in POLICY_COLOURS}
     free = [colour for colour in ARM_COLOURS if colour not in found.values()]
     others = [arm for arm in arms if arm not in found]
@@ -74,7 +74,7 @@ def improvements(rows: Rows) -> Drawing:
 
 
 def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Scale) -> Drawing:
-    """A dot and its interval a condition, beside the value that says nothing."""
+    """Draw a dot and its interval for each condition, beside the value of no difference."""
     conditions = _conditions(rows)
     perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))
     low, high = f"{value}_low", f"{value}_high"
@@ -140,7 +140,7 @@ def curves(rows: Rows, arms: list[str]) -> Drawing:
 
 
 def _outcomes(rows: Rows) -> Rows:
-    """With words for names, and differences in points."""
+    """Return outcomes with words for names, and differences in points."""
     points = ("difference", "difference_low", "difference_high")
     return [
         {
@@ -156,7 +156,7 @@ def _outcomes(rows: Rows) -> Rows:
 
 
 def _conditions(rows: Rows) -> list[str]:
-    """In the order that every page has them, as words."""
+    """Return conditions as words, in the order of every page."""
     named = [{"condition": words(row["condition"])} for row in rows]
     return charts.ordered(named, "condition", charts.WORDS_COLOURS)
 

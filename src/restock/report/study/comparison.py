@@ -49,7 +49,7 @@ def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def verdict(found: dict[str, Any]) -> dict[str, str]:
-    """The gate's, as the page's first words."""
+    """Return the gate's verdict, as the page's first words."""
     words_of = {
         "comparable": "gate passed: comparable",
         "inconclusive": "gate refused: inconclusive",
@@ -59,7 +59,7 @@ def verdict(found: dict[str, Any]) -> dict[str, str]:
 
 
 def headline(found: dict[str, Any], first: str, second: str) -> str:
-    """Where the second differs from the first, by how much and how surely."""
+    """Say where the second differs from the first, by how much and how surely."""
     if found["verdict"] != "comparable":
         return f"{second} and {first} cannot be compared: {why_refused(found)}"
     rows = [row for row in found["outcomes"] if row["perturbation"] == "none"] or found["outcomes"]
@@ -82,7 +82,7 @@ def headline(found: dict[str, Any], first: str, second: str) -> str:
 
 
 def why_refused(found: dict[str, Any]) -> str:
-    """What the gate found; a study has said it already."""
+    """Say what the gate found; a study has said it already."""
     if found.get("why"):
         return str(found["why"])
     if found["refused"]:
@@ -113,7 +113,7 @@ def _difference(row: dict[str, Any]) -> str:
 def outcome_sections(
     found: dict[str, Any], first: str, second: str, prefix: str = ""
 ) -> list[Section | None]:
-    """The outcomes, or why there are none."""
+    """Return the outcomes, or why there are none."""
     title, treatment = f"{second} against {first}", _treatment(found)
     if found["verdict"] != "comparable":
         text = f"{verdict(found)['text'].capitalize()}: {why_refused(found)}."
@@ -204,7 +204,7 @@ def _share(value: float | None) -> str:
 
 
 def curves_section(rows: Rows, arms: list[str]) -> Section | None:
-    """How they learnt; None where no run was evaluated on the way."""
+    """Show how they learned; None if no run was evaluated on the way."""
     if not rows:
         return None
     most = max(row["runs"] for row in rows)
@@ -223,7 +223,7 @@ def curves_section(rows: Rows, arms: list[str]) -> Section | None:
 
 
 def gate_section(found: dict[str, Any], first: str, second: str) -> Section:
-    """What differs, and the checks of what was fed."""
+    """Show what differs, and the checks of what was fed."""
     refused = set(found["refused"])
     differences = [
         {
@@ -268,14 +268,14 @@ def _setting(value: object) -> str:
 
 
 def _ends(low: float | None, high: float | None) -> str:
-    """An interval, which has no end where a share was nought in some resample."""
+    """Format an interval, which has no end if a share was zero in some resample."""
     if low is None:
         return "" if high is None else f"up to {high:.3g}"
     return f"{low:.3g} or more" if high is None else f"{low:.3g} to {high:.3g}"
 
 
 def cost_cards(rows: Rows) -> list[dict[str, str]]:
-    """What a run of each arm took."""
+    """Show what a run of each arm took."""
     cards = []
     for row in rows:
         known = {

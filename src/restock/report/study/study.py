@@ -62,7 +62,7 @@ def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
 
 
 def _headline(study: dict[str, Any]) -> str:
-    """The one contrast that the study is for; else its first comparison."""
+    """Return the contrast that the study is for, else its first comparison."""
     primary = next((row for row in study["contrasts"] if row["primary"]), None)
     if primary is None:
         one = study["comparisons"][0]
