@@ -210,7 +210,7 @@ def _interval_is_open(session: Session) -> bool:
 
 
 def _clone_teacher(session: Session, stop: Callable[[], bool]) -> None:
-    """The behaviour network on the logs' rows of the teacher's policies."""
+    """Train the behaviour network on the logs' rows of the teacher's policies."""
     behaviour, imitation = session.learner.behaviour, session.imitation
     if behaviour is None or imitation is None or session.learner.gradient_steps:
         return
@@ -232,7 +232,7 @@ def _updates_due(session: Session) -> int:
 
 
 def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
-    """So many gradient steps, the record of each, and the target's progress."""
+    """Make `count` gradient steps, record each, and advance the target."""
     while count > 0:
         made = _until_due(session, count)
         sync = session.learner.target.last_sync
@@ -244,7 +244,7 @@ def _updates(session: Session, count: int, phase: str, notify: Notify) -> None:
 
 
 def _until_due(session: Session, count: int) -> int:
-    """Of `count` updates those up to where an interval is closed or a target copied."""
+    """Return how many of `count` updates come before an interval ends or a target is copied."""
     if session.blocks is None:
         return 1
     step, rule = session.learner.gradient_steps, session.learner.target.rule
@@ -255,7 +255,7 @@ def _until_due(session: Session, count: int) -> int:
 
 
 def _made(session: Session, count: int, phase: str) -> Iterator[Made]:
-    """So many updates."""
+    """Make `count` updates."""
     progress, learner = session.progress, session.learner
     conservative = _conservative_weight(session, phase)
     imitation = session.imitation if phase == "online" else None
@@ -292,7 +292,7 @@ def _note(
     tail: Tensor | None,
     phase: str,
 ) -> None:
-    """The record of the update just counted; `last_sync` is the target's, before it."""
+    """Record the update just counted; `last_sync` is the target's, before it."""
     steps, interval = session.steps, session.interval
     session.feed.batch(
         steps["gradient_steps"], steps["env_steps"], batch, loss, last_sync, tail=tail
@@ -305,7 +305,7 @@ def _note(
 
 
 def _follow(session: Session, phase: str, notify: Notify) -> None:
-    """The target's progress after an update, and the end of an interval."""
+    """Advance the target after an update, and close the interval at its end."""
     learner, interval = session.learner, session.interval
     step, every = learner.gradient_steps, session.config.record.every_updates
     rule = learner.target.rule
@@ -321,7 +321,7 @@ def _follow(session: Session, phase: str, notify: Notify) -> None:
 
 
 def _conservative_weight(session: Session, phase: str) -> float:
-    """The CQL term's weight: constant offline, then linear to its online end."""
+    """Return the CQL term's weight: constant offline, then linear to its online end."""
     loss, progress = session.config.loss, session.progress
     if phase == "offline" or progress.online_from is None:
         return loss.conservative
@@ -330,7 +330,7 @@ def _conservative_weight(session: Session, phase: str) -> float:
 
 
 def _close_interval(session: Session, phase: str, notify: Notify) -> None:
-    """One row of `progress`, with the feed's sums and the probe's measures."""
+    """Write one row of `progress`, with the feed's sums and the probe's measures."""
     check_parameters(session)
     progress, learner, interval = session.progress, session.learner, session.interval
     means = session.feed.flush(progress.env_steps, learner.gradient_steps, phase)
@@ -392,7 +392,7 @@ def _note_silence(session: Session, notify: Notify) -> None:
 
 
 def _evaluate_off_policy(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
-    """The policy as it is now, on held-out logs, into the table `off_policy`; none without any."""
+    """Evaluate the policy on held-out logs into the table `off_policy`, if any are held out."""
     if session.logs is None or session.logs.panel is None or not session.logs.panel.splits:
         return
     if session.run.table("off_policy").num_rows:  # before the run stopped
@@ -419,7 +419,7 @@ def _evaluate_if_due(session: Session, notify: Notify, stop: Callable[[], bool])
 
 
 def _evaluate(session: Session, notify: Notify, stop: Callable[[], bool]) -> None:
-    """The fixed episodes, greedily; the policy is kept if it is the best so far.
+    """Drive the fixed episodes greedily, and keep the policy if it is the best so far.
 
     Without a twin nothing drives: what is learnt by now is kept.
     """
@@ -492,8 +492,11 @@ def nothing_to_do(session: Session) -> str | None:
 
 
 def _interrupt(session: Session, stop: Callable[[], bool]) -> None:
-    """Ends the run where `stop` says so. Also within what changes nothing of it until it is done:
-    the run that goes on does that again, from its beginning."""
+    """Save and end the run if `stop` says so.
+
+    An evaluation or another step that is abandoned here is made again, from its beginning, by the
+    run that goes on.
+    """
     if stop():
         _save(session)
         session.write_held()

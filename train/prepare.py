@@ -117,7 +117,7 @@ class Prepared:
         return session
 
     def _run(self) -> Run:
-        """The new directory, or the old one as the checkpoint to go on from left it."""
+        """Create the run's directory, or open the old one as its checkpoint left it."""
         if self.resumed is None:
             return Run.create(self.path, self.document)
         self.resumed.remove_leftovers()
@@ -210,7 +210,7 @@ def prepare_new(
     config: TrainConfig | Path | None,
     overrides: Sequence[str] = (),
 ) -> Prepared:
-    """A new run, checked; `config` may be the path of a TOML file, None for the defaults.
+    """Check a new run; `config` may be the path of a TOML file, None for the defaults.
 
     Raises:
         RunError: `out` already exists.
@@ -260,7 +260,7 @@ def prepare_new(
 def prepare_resumed(
     path: Path, overrides: Sequence[str] = (), from_env_steps: int | None = None
 ) -> Prepared:
-    """A run to go on with; `overrides` may extend its budget or move it to another device.
+    """Check a run to go on with; `overrides` may extend its budget or move it to another device.
 
     `from_env_steps` names an earlier checkpoint than the latest: `Prepared.open` goes back to it.
 
@@ -292,7 +292,7 @@ def prepare_resumed(
 
 
 def told_in_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
-    """The conditions and the exposures of a profile that can be told of fresh rows."""
+    """Return the conditions and exposures of a profile that can be evaluated on fresh rows."""
     conditions, exposures = (
         conditions_in_twin(kind, profile.signals, lidar=profile.task.lidar)[0]
         for kind in (profile.conditions, profile.exposures)
@@ -328,7 +328,7 @@ def refuse_short_budget(session: Session, seconds: float) -> None:
 
 
 def open_panel(path: Path, config: TrainConfig, profile: Profile) -> Panel:
-    """A panel, every byte of it checked, and against the twin's task and the config's discount.
+    """Open a panel, check its bytes, and compare it with the twin's task and the config's discount.
 
     Raises:
         PanelError: it is damaged, or does not fit; says which side says what.

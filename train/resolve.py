@@ -32,7 +32,7 @@ from restock.train.twin.physics.perturbation import PERTURBATIONS, find_perturba
 
 
 def resolve_config(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """What the config leaves to whether there is a panel: how to begin online."""
+    """Fill in exploration, perturbation and missions, which the config may leave open."""
     epsilon = config.epsilon
     if epsilon.start is None:
         learns_first = panel is not None and config.schedule.offline_updates > 0
@@ -50,7 +50,7 @@ FIRST_GUESS = 800.0  # environment steps a second, of a budget in seconds, until
 
 
 def planned_env_steps(config: TrainConfig) -> int:
-    """The environment steps that a budget allows, before the speed of this machine is known."""
+    """Return the environment steps a budget allows, before this machine's speed is known."""
     schedule = config.schedule
     if schedule.seconds is None:
         return schedule.env_steps
@@ -58,7 +58,7 @@ def planned_env_steps(config: TrainConfig) -> int:
 
 
 def planned_draws(config: TrainConfig, env_steps: int | None = None) -> PlannedDraws:
-    """The rows that a run will draw in so many environment steps; None: `planned_env_steps`."""
+    """Count the rows that a run will draw in `env_steps` (None: `planned_env_steps`)."""
     schedule, batch_size = config.schedule, config.replay.batch_size
     end = planned_env_steps(config) if env_steps is None else env_steps
     begin = min(schedule.warmup_env_steps, end)
@@ -75,7 +75,7 @@ _MAX_UPDATES = 10.0  # times the critic's
 
 
 def resolve_teacher(config: TrainConfig, profile: Profile, panel: Panel | None) -> TrainConfig:
-    """What the config leaves open: the operator drives to goals; where there are none, nobody.
+    """Fill in the teacher's open settings: the operator teaches if the task has a goal.
 
     Raises:
         ConfigError: rows are to be mirrored, and an action has no opposite; successes are to be
@@ -111,7 +111,7 @@ def _clones_successes(teacher: TeacherConfig, profile: Profile) -> bool:
 
 
 def mirrors(teacher: TeacherConfig, task: Task) -> bool:
-    """Whether the behaviour network learns from mirror images, where that is asked or left open.
+    """Decide whether the behaviour network learns from mirror images.
 
     Raises ConfigError where it is asked, and an action has no opposite.
     """
@@ -136,7 +136,7 @@ _SLOT_BYTES = 18  # of a row's stratum, its place there, and its age
 def resolve_ring_capacity(
     config: TrainConfig, panel: Panel | None
 ) -> tuple[TrainConfig, dict[str, Any] | None]:
-    """The config with a number of rows, and what `config.json` says of how it was chosen.
+    """Choose the ring's number of rows, and return how it was chosen for `config.json`.
 
     Raises:
         ConfigError: it is to be chosen, and there is no panel to choose it by.
@@ -162,7 +162,7 @@ def resolve_ring_capacity(
 
 
 def row_bytes(observation_size: int) -> int:
-    """What one row of a ring takes."""
+    """Count the bytes of one row of a ring."""
     meta = sum(np.dtype(kind).itemsize for kind in META.values())
     return row_width(observation_size) * 4 + meta + _SLOT_BYTES
 
@@ -200,7 +200,7 @@ def _refuse_no_effect(config: TrainConfig) -> None:
 
 
 def _refuse_too_large(config: TrainConfig, task: Task) -> None:
-    """Raises ConfigError where the run's largest arrays exceed the machine's memory."""
+    """Raise ConfigError if the run's largest arrays exceed the machine's memory."""
     critic = _parameters(task.observation_size, config.network.hidden, len(task.actions))
     behaviour = _parameters(task.observation_size, config.teacher.hidden, len(task.actions))
     taken = {
@@ -224,7 +224,7 @@ def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
 
 
 def without_twin(config: TrainConfig, panel: Panel | None) -> TrainConfig:
-    """The config of a run whose `env.twin` is false: no environment step, nobody in the twin asked.
+    """Return the config of a run without a twin: no environment steps, no teacher in the twin.
 
     Raises:
         ConfigError: it has no panel, or something of it needs a twin.

@@ -280,8 +280,7 @@ def _refuse_edited(run: Run, before: Mapping[str, Any] | None) -> None:
 
 
 def drawn_episodes(config: TrainConfig) -> list[EpisodeSpec]:
-    """The fixed episodes of every kind that is named: also those with a share of 0, which training
-    never meets."""
+    """Draw the fixed episodes of every named kind, including those with a share of 0."""
     chosen = config.evaluation
     return fixed_episodes(list(config.env.conditions), chosen.episodes, chosen.seed)
 

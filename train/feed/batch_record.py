@@ -165,7 +165,7 @@ class FeedRecord(Stateful):
             self._audit(step, batch, last_sync)
 
     def last_batch(self, *, before: bool = False) -> list[dict[str, Any]]:
-        """The ids of the rows of the batch last kept, or of the one before it, in its order."""
+        """Return the ids of the rows of the last batch, or of the one before it, in order."""
         return row_ids(self.logs, *(self._before if before else self._last))
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
@@ -211,7 +211,7 @@ class FeedRecord(Stateful):
         self._held = [HeldInterval(**interval) for interval in held]
 
     def _closed(self, clocks: dict[str, int], phase: str) -> HeldInterval:
-        """The fresh rows of the open interval."""
+        """Return the fresh rows of the open interval."""
         ring, filled = self.ring, len(self.ring)
         waiting = ring.by_condition.stratum[:filled] == WAITING
         available = self._by_stratum(ring.stratum[:filled][~waiting])
@@ -233,8 +233,11 @@ class FeedRecord(Stateful):
         return np.bincount(_told(stratum, size), minlength=size + 1)
 
     def _quotas_met(self) -> dict[str, NDArray[Any]] | None:
-        """Of the open interval, by stratum (S,): the quota of the batches, how often the logs have
-        it, the logged rows drawn, and why it is short if it is."""
+        """Return the open interval's quotas by stratum, (S,).
+
+        That is the quota of the batches, how often the logs have it, the logged rows drawn, and why
+        it is short if it is.
+        """
         quotas = self.quotas
         if quotas is None or not self._batches:
             return None
@@ -399,7 +402,7 @@ def _told(code: NDArray[Any], kinds: int) -> Ints:
 def row_ids(
     logs: Logs | None, panel_row: Ints, episode: Ints, episode_step: Ints
 ) -> list[dict[str, Any]]:
-    """The ids of a batch's rows: logged ones (L,), then fresh ones by episode and step (F,)."""
+    """Return the ids of a batch's rows: logged ones (L,), then fresh ones (F,)."""
     known = [] if logs is None else logs.transition_id[panel_row].tolist()
     logged = zip(panel_row.tolist(), known, strict=True)
     fresh = zip(episode.tolist(), episode_step.tolist(), strict=True)

@@ -111,12 +111,12 @@ class Batches(Stateful):
 
     @property
     def needs_td(self) -> bool:
-        """Whether the next batch depends on the TD errors of the last."""
+        """True if the next batch depends on the TD errors of the last."""
         return self._draws is not None and self._draws.needs_td
 
     @property
     def reads_chunks(self) -> bool:
-        """Whether the logs' rows are not in memory."""
+        """True if the logs' rows are not in memory."""
         return self._draws is not None and self._draws.reads_chunks
 
     def describe(self) -> list[dict[str, Any]]:
@@ -124,7 +124,7 @@ class Batches(Stateful):
         return self._draws.describe() if self._draws is not None else []
 
     def draw_offline(self) -> ReplayBatch:
-        """A batch from logs alone.
+        """Draw a batch from logs alone.
 
         Raises:
             MixtureError: every row was drawn as often as it may be.
@@ -140,7 +140,7 @@ class Batches(Stateful):
         return self._gather(drawn, _NO_ROWS)
 
     def draw_online(self, env_steps: int = 0) -> ReplayBatch:
-        """A batch from logs and the fresh ring, after `env_steps` environment steps."""
+        """Draw a batch from logs and the fresh ring, after `env_steps` environment steps."""
         drawn = _NOTHING
         if self._draws is not None:
             stock = self.ring.by_stratum.counts / self.batch_size
@@ -187,7 +187,7 @@ class Batches(Stateful):
         return slots
 
     def learnt(self, batch: ReplayBatch, td: Tensor) -> None:
-        """The TD errors (B,) of a batch, once it was learnt from: priorities and shares follow."""
+        """Update priorities and shares by the TD errors (B,) of a batch that was learnt from."""
         if self._draws is not None and self._draws.needs_td and batch.logged:
             td_abs = td[: batch.logged].detach().abs().cpu().numpy()
             self._draws.update(batch.log_rows, batch.log_stratum, td_abs)

@@ -138,7 +138,7 @@ class Collector(Stateful):
         return self.log
 
     def check_conditions(self) -> None:
-        """Raises ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
+        """Raise ConfigError now, not after minutes of driving, if a condition's SQL cannot run."""
         columns: dict[str, Any] = {
             name: np.zeros(0, np.int64) for name in ("episode_index", "step_index")
         }
@@ -151,7 +151,7 @@ class Collector(Stateful):
 
     @property
     def steps(self) -> NDArray[np.int64]:
-        """Of the episode under way in each environment so far, (N,)."""
+        """Steps so far of the episode under way in each environment, (N,)."""
         return self._steps
 
     def start(
@@ -290,7 +290,7 @@ class Collector(Stateful):
         return [f"{floor.name}/{zone}" for zone in floor.zone_of(x, y)]
 
     def _drop(self, keys: NDArray[np.int64], invalid: NDArray[np.bool_]) -> None:
-        """A step whose physics blew up must not be learnt from: its row repeats the one before."""
+        """Drop a step whose physics blew up: its row repeats the one before."""
         ring = self.ring
         for key in keys[invalid]:
             slots = np.flatnonzero(ring.meta["episode"][: len(ring)] == key)
@@ -362,7 +362,7 @@ class Collector(Stateful):
         return {**super().state_dict(), "log": saved(self.log)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the collector where `state_dict` found it; the twin has its own state."""
+        """Put the collector where `state_dict` found it; the twin has its own state."""
         super().load_state_dict(state)
         self._unlabelled = [EndedEpisode(**episode) for episode in state["unlabelled"]]
         self._saved_log = state["log"]
@@ -371,7 +371,7 @@ class Collector(Stateful):
 def conditions_in_twin(
     conditions: Sequence[Condition], signals: Collection[str], *, lidar: bool = True
 ) -> tuple[list[Condition], dict[str, list[str]]]:
-    """The conditions that the twin's signals can say, and of the others the `signals` they need.
+    """Return the conditions that can be evaluated in the twin, and the `signals` the others lack.
 
     Of a robot without a lidar that leaves out those that no log tells either.
 
@@ -395,13 +395,13 @@ def conditions_in_twin(
 
 
 def ring_conditions(conditions: Sequence[Condition]) -> list[str]:
-    """The names that a ring's labels index: by priority, nominal last."""
+    """Return the names that a ring's labels index: by priority, nominal last."""
     ordered = sorted(conditions, key=lambda condition: (condition.priority, condition.name))
     return [condition.name for condition in ordered] + [NOMINAL]
 
 
 def steps_table(episodes: Sequence[EndedEpisode]) -> pa.Table:
-    """The steps of episodes, as `restock.ingest.task.conditions.label` takes them."""
+    """Return the steps of episodes as `restock.ingest.task.conditions.label` takes them."""
     lengths = [episode.steps + 1 for episode in episodes]
     columns: dict[str, Any] = {
         "episode_index": np.repeat(np.arange(len(episodes)), lengths),

@@ -85,7 +85,7 @@ def _content_id(episodes: Sequence[FreshEpisode]) -> str:
 
 
 def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
-    """All steps one after the other, as if one robot had driven the episodes in turn."""
+    """Lay all steps one after the other, as if one robot had driven the episodes in turn."""
     lengths = np.array([episode.count + 1 for episode in episodes], np.int64)
     first = np.concatenate([[0], np.cumsum(lengths)])[:-1].astype(np.int64)
     tick = np.arange(lengths.sum(), dtype=np.int64)
@@ -116,7 +116,7 @@ def _lay_out(episodes: Sequence[FreshEpisode], profile: Profile) -> EpisodeRows:
 def _values(
     rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile, run: str
 ) -> TransitionValues:
-    """What was kept of each step, end to end."""
+    """Collect the values that were kept of each step, end to end."""
     begin = rows.starts
     number = rows.episode[begin]
     version = [f"{run}@{episode.version}" for episode in episodes]
@@ -145,7 +145,7 @@ def _values(
 def _zones(
     rows: EpisodeRows, episodes: Sequence[FreshEpisode], profile: Profile
 ) -> NDArray[np.object_]:
-    """The zone of every step: the profile's on the floor that it describes, else the layout's."""
+    """Return the zone of every step: the profile's on the floor it describes, else the layout's."""
     names = profile.zone_of(rows.signals["pose_x_m"], rows.signals["pose_y_m"])
     zones = np.array(names, object)
     for number, episode in enumerate(episodes):
@@ -155,7 +155,7 @@ def _zones(
 
 
 def _perturbed(episodes: Sequence[FreshEpisode]) -> Perturbed:
-    """What was in force in each episode."""
+    """Return the perturbation of each episode."""
     known = [
         (episode.perturbation, json.loads(episode.perturbation_values)) for episode in episodes
     ]
@@ -165,7 +165,7 @@ def _perturbed(episodes: Sequence[FreshEpisode]) -> Perturbed:
 def _manifest(
     rows: EpisodeRows, table: pa.Table, profile: Profile, provenance: Provenance, dropped_steps: int
 ) -> dict[str, Any]:
-    """The row of `recordings`. Log time is such that the last step was just now."""
+    """Make the row of `recordings`, with log times such that the last step was just now."""
     stamps = rows.signals["stamp_ns"]
     return manifest_row(
         profile,

@@ -104,7 +104,7 @@ class FreshLog(Stateful):
         terminated: bool,
         broken: bool,
     ) -> None:
-        """An episode is over, with observation `last` (D,); `broken` where its physics blew up."""
+        """End an episode with observation `last` (D,); `broken` if its physics blew up."""
         if not self._whole[env]:
             return
         count = episode.steps - int(broken)  # a step that blew up does not count
@@ -151,12 +151,12 @@ class FreshLog(Stateful):
 
 
 def episode_files(folder: Path) -> list[Path]:
-    """The files of a log, in order."""
+    """List the files of a log, in order."""
     return sorted(folder.glob("*.episodes"))
 
 
 def write_episodes(path: Path, episodes: Sequence[FreshEpisode]) -> None:
-    """A file of episodes, in order."""
+    """Write a file of episodes, in order."""
     checkpoint.save(path, {f"{at:06d}": saved(episode) for at, episode in enumerate(episodes)})
 
 
@@ -183,7 +183,7 @@ class FreshPerturbations(Stateful):
         self._of: dict[int, tuple[str, str]] = {}  # name, values as JSON
 
     def note(self, keys: NDArray[np.int64], names: Sequence[str], values: Sequence[str]) -> None:
-        """What is in force in the running episodes `keys` (N,)."""
+        """Keep the names and values in force in the running episodes `keys` (N,)."""
         for place, key in enumerate(keys.tolist()):
             if key not in self._of:
                 self._of[key] = str(names[place]), str(values[place])
@@ -195,11 +195,11 @@ class FreshPerturbations(Stateful):
             self._of = {key: entry for key, entry in self._of.items() if key in alive}
 
     def names(self, keys: NDArray[np.int64]) -> list[str | None]:
-        """The name in force in each of these episodes; None where it is not known."""
+        """Return the name in force in each of these episodes; None if it is not known."""
         return [entry[0] if (entry := self._of.get(key)) else None for key in keys.tolist()]
 
     def values(self, keys: NDArray[np.int64]) -> list[Entries | None]:
-        """The values that are not nominal, as entries of a map."""
+        """Return the values that are not nominal, as entries of a map."""
         return [
             values_entries(entry[1]) if (entry := self._of.get(key)) else None
             for key in keys.tolist()
@@ -207,5 +207,5 @@ class FreshPerturbations(Stateful):
 
 
 def values_entries(values: str) -> Entries:
-    """A JSON object of numbers as the entries of a map column."""
+    """Return a JSON object of numbers as the entries of a map column."""
     return [(field, float(value)) for field, value in json.loads(values).items()]

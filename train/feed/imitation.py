@@ -37,7 +37,7 @@ _MEASURED = 128  # rows a condition
 
 
 def of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
-    """The rows (n,) of these behaviour policies."""
+    """Select the rows (n,) of these behaviour policies."""
     codes = [policy.names.index(name) for name in policies if name in policy.names[:-1]]
     return np.isin(policy.codes, codes)
 
@@ -45,7 +45,7 @@ def of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
 def of_successes(
     policy: Coded, episode: Coded, reward: F32, discount: F32, policies: Sequence[str]
 ) -> Bools:
-    """The rows (n,) of episodes that reached their goal, and in which none of `policies` drove.
+    """Select the rows (n,) of episodes that reached their goal without any of `policies`.
 
     An episode reached it where it was terminated (discount 0) with a reward above 0.
     """
@@ -67,7 +67,7 @@ def packed_successes(policy: Coded, episode: Coded, packed: F32, policies: Seque
 
 
 def cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
-    """The rows (n,) of a panel that are cloned before the first environment step."""
+    """Select the rows (n,) of a panel that are cloned before the first environment step."""
     policy = Coded.of(panel.meta["behaviour_policy"])
     rows = of_policies(policy, teacher.policies)
     if teacher.successes:
@@ -127,11 +127,11 @@ class Imitation(Stateful):
         return self._online.rows
 
     def draw_offline(self) -> Labelled:
-        """A batch (M,) of logged rows alone."""
+        """Draw a batch (M,) of logged rows alone."""
         return self._gather(self._offline, self.batch_size)
 
     def draw_online(self) -> Labelled:
-        """A batch (M,): the logged share of it, then fresh rows."""
+        """Draw a batch (M,): its logged share, then fresh rows."""
         return self._gather(self._online, self._logged if len(self.ring) else self.batch_size)
 
     def _gather(self, drawn: _Drawn, logged: int) -> Labelled:
@@ -186,7 +186,7 @@ def _some(rows: Ints, rng: np.random.Generator) -> Ints:
 
 @torch.no_grad()
 def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, Any]:
-    """What the filter does in states (n, D), of which the teacher's actions are (n,)."""
+    """Measure what the filter does in states (n, D) with the teacher's actions (n,)."""
     if learner.behaviour is None:
         raise RuntimeError("there is no behaviour network to measure")
     states = torch.from_numpy(observation).to(learner.device)
@@ -215,7 +215,7 @@ def _measured(learner: Learner, observation: F32, action: Ints) -> Mapping[str, 
 
 
 def refuse_nothing_to_learn(config: TeacherConfig, logged: Sequence[str] | None) -> None:
-    """Raises ConfigError where none of the teacher's policies is in the logs, and one must be.
+    """Raise ConfigError if the logs must have rows of the teacher's policies, but have none.
 
     One must where the teacher is `logs`; or where they were chosen: only the default ones, of a
     teacher that is asked, may be absent.

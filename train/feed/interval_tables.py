@@ -49,12 +49,12 @@ class SourceRows:
 
     @property
     def pairs(self) -> int:
-        """How many combinations of stratum and condition there are."""
+        """Number of combinations of stratum and condition."""
         return len(self.strata) * len(self.conditions)
 
     @cached_property
     def action_count(self) -> int:
-        """How many actions cells tell apart."""
+        """Number of actions that cells distinguish."""
         return int(self.rows["action"].max(initial=0)) + 1
 
     @cached_property
@@ -68,13 +68,13 @@ class SourceRows:
         return self._by_cell(one_of_each(self.row * len(self.strata) + self.stratum))
 
     def summed(self, values: NDArray[Any]) -> F64:
-        """Sums of `values` (n,) by stratum and condition (S, C)."""
+        """Sum `values` (n,) by stratum and condition, (S, C)."""
         sums: F64 = np.bincount(self.pair, values, minlength=self.pairs).astype(np.float64)
         return sums.reshape(len(self.strata), len(self.conditions))
 
     @cached_property
     def sums(self) -> dict[str, F64]:
-        """Of what is averaged, by stratum and condition (S, C)."""
+        """Sums of the averaged columns by stratum and condition, (S, C)."""
         rows = self.rows
         return {
             "weight": self.summed(rows["weight"]),
@@ -85,14 +85,14 @@ class SourceRows:
         }
 
     def _by_cell(self, chosen: slice | Ints) -> Ints:
-        """How many of the chosen rows are in each cell."""
+        """Count the chosen rows in each cell."""
         shape = len(self.strata), len(self.conditions), self.action_count
         cell = self.pair[chosen] * self.action_count + self.rows["action"][chosen]
         return np.bincount(cell, minlength=self.pairs * self.action_count).reshape(shape)
 
 
 def one_of_each(key: Ints) -> Ints:
-    """Of each different value of `key` (n,), one of its places, in the values' order.
+    """Return the place of one row for each distinct value of `key` (n,), ordered by value.
 
     Keys of rows are dense enough to be marked in place, which takes a thirtieth of sorting them.
     """
@@ -117,7 +117,7 @@ class GreedyRows:
 
 
 def strata(source: SourceRows, total: Ints) -> Columns:
-    """Of `strata`. `total` (S,) are rows since the run began."""
+    """Compute the columns of `strata`; `total` (S,) are rows since the run began."""
     drawn, unique = (of.sum(axis=(1, 2)) for of in (source.drawn, source.unique))
     sums = {name: by_pair.sum(axis=1) for name, by_pair in source.sums.items()}
 
@@ -148,7 +148,7 @@ def strata(source: SourceRows, total: Ints) -> Columns:
 def fed(
     names: Sequence[str], quotas: Mapping[str, NDArray[Any]], fresh: Ints, available: Ints
 ) -> Columns:
-    """Of `fed`: a row a stratum (S,), and one of rows in none if there are any.
+    """Compute the columns of `fed`: a row per stratum (S,), and one of rows in none, if any.
 
     Args:
         quotas: `wanted` and `natural` shares, `logged` rows drawn, and the `reason` for one that is
@@ -183,7 +183,7 @@ def fed(
 
 
 def conditions(source: SourceRows) -> Columns:
-    """Of `conditions`."""
+    """Compute the columns of `conditions`."""
     drawn = source.drawn.sum(axis=(0, 2))
     weight, td, q = (source.sums[name].sum(axis=0) for name in ("weight", "td_abs", "q"))
     observed = np.flatnonzero(drawn)
@@ -199,7 +199,7 @@ def conditions(source: SourceRows) -> Columns:
 
 
 def actions(source: SourceRows, names: Sequence[str]) -> Columns:
-    """Of `actions`: every action of each stratum and condition that was met, those never drawn too.
+    """Compute the columns of `actions`, including actions that were never drawn.
 
     `names` (A,) are the task's.
     """
@@ -239,7 +239,7 @@ def actions(source: SourceRows, names: Sequence[str]) -> Columns:
 
 
 def ages(unit: str, age: F64) -> Columns:
-    """Of `ages`, without the source."""
+    """Compute the columns of `ages`, except the source."""
     # 2**bucket <= age < 2**(bucket + 1); -1 below 1
     rows = np.bincount(np.frexp(np.maximum(age, 0.5))[1])
     observed = np.flatnonzero(rows)
@@ -253,7 +253,7 @@ def ages(unit: str, age: F64) -> Columns:
 
 
 def sampled_episodes(source: SourceRows) -> Columns:
-    """Of `sampled_episodes`."""
+    """Compute the columns of `sampled_episodes`."""
     sums = episode_sums(source.episode, source.pair, source.rows["weight"], source.pairs)
     key, pair, size = sums["episode"], sums.pop("pair"), len(source.conditions)
     return {
@@ -266,7 +266,7 @@ def sampled_episodes(source: SourceRows) -> Columns:
 
 
 def policies(source: SourceRows) -> Columns:
-    """Of `policies`."""
+    """Compute the columns of `policies`."""
     counts = np.bincount(source.policy, minlength=len(source.policies))
     observed = np.flatnonzero(counts)
     return {

@@ -45,7 +45,7 @@ class Coded:
         return str(self.names[self.codes[row]])
 
     def known(self, row: int) -> str | None:
-        """The same, or None where the column has none."""
+        """Return the text of a row, or None if the column has none."""
         code = self.codes[row]
         return str(self.names[code]) if code < len(self.names) - 1 else None
 
@@ -82,7 +82,7 @@ class Logs:
         *,
         as_of_ns: int | None = None,
     ) -> Logs:
-        """A panel's rows in memory (memory-mapped where it is larger than 4 GiB).
+        """Read a panel's rows into memory (memory-mapped if it is larger than 4 GiB).
 
         Their ages are against `as_of_ns`, when training began; None: against their newest.
         """
@@ -128,7 +128,7 @@ class Logs:
         seed: int,
         fresh: Bools | None = None,
     ) -> LoggedSampler:
-        """What draws from them: by the mixture of their panel, else by their shares.
+        """Make the sampler of the logs: by the mixture of their panel, else by their shares.
 
         `fresh` (S,): which strata rows of a ring beside them can be in; None: there is no ring.
 
@@ -165,7 +165,7 @@ class LogTerms:
 
     @classmethod
     def of(cls, loss: LossConfig, logs: Logs | None, device: torch.device) -> LogTerms:
-        """What `loss` asks of these logs.
+        """Make the terms of `loss` on these logs.
 
         Raises:
             ConfigError: it names a behaviour policy or stratum that they do not have, or there are
@@ -210,7 +210,7 @@ def _refuse_unknown(loss: LossConfig, policies: list[str], strata: list[str]) ->
 
 
 def _expert(loss: LossConfig, logs: Logs) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """The rows, (n,), of `margin_policies` in `margin_strata`."""
+    """Select the rows (n,) of `margin_policies` in `margin_strata`."""
     policy = logs.behaviour_policy
     _refuse_unknown(loss, policy.names, logs.strata)
     chosen = np.isin(policy.codes, [policy.names.index(name) for name in loss.margin_policies])

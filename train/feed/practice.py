@@ -152,7 +152,7 @@ class Practice(Stateful):
 
     @property
     def believed(self) -> Bools:
-        """Whether each arm has ended often enough, (K,)."""
+        """True for each arm that has ended often enough, (K,)."""
         return self._seen >= self.config.warmup_episodes
 
     @property

@@ -49,7 +49,7 @@ class Probe:
 
     @classmethod
     def of_logs(cls, logs: Logs, per_condition: int) -> Probe | None:
-        """The rows of each condition whose hashed transition ids come first."""
+        """Choose the rows of each condition whose hashed transition ids come first."""
         codes, names = logs.condition.codes, logs.condition.names
         return cls._choose(codes, names, logs.transition_id, per_condition, logs.rows, "logs")
 
@@ -111,7 +111,7 @@ class Probe:
 
 
 def _scramble(key: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """A fixed mixing of ids (splitmix64), so that the choice depends on ids, not on order."""
+    """Mix ids (splitmix64), so that the choice depends on ids, not on order."""
     return splitmix64(key.astype(np.uint64) + np.uint64(GOLDEN))
 
 
@@ -137,12 +137,12 @@ class LogFidelity:
 
     @classmethod
     def of(cls, logs: Logs, observation_size: int) -> LogFidelity | None:
-        """None where there is no row."""
+        """Make it from a run's logs; None if they have no row."""
         rows = Probe.of_logs(logs, ROWS)
         return cls(rows, observation_size) if rows is not None else None
 
     def agreement(self, *fresh: Probe) -> dict[str, float]:
-        """The share of each condition's rows that fresh steps of known condition confirm."""
+        """Return the share of each condition's rows that fresh steps of known condition confirm."""
         size = self._observation.shape[1]
         steps: dict[str, list[F64]] = {}
         for probe in fresh:
@@ -189,7 +189,7 @@ class LogFidelity:
 
 
 def discriminant(classes: list[F64], rows: F64) -> NDArray[np.int64]:
-    """Which class each of `rows` (m, D) most likely is of, (m,), all classes being equally likely.
+    """Return the most likely class of each of `rows` (m, D), (m,), with equal priors.
 
     `classes` are rows (n_k, D) of each; their covariance is taken to be the same.
     """

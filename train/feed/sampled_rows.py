@@ -90,13 +90,13 @@ class SampledRows(Stateful):
         return self._since(self._last)
 
     def last_of(self, *names: str) -> tuple[NDArray[Any], ...]:
-        """Some columns of the rows last appended."""
+        """Return some columns of the rows last appended."""
         part = slice(self._last, self._count)
         return tuple(self._held[self._places[name]][part] for name in names)
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All rows."""
+        """Return all rows."""
         return self._since(0)
 
     @columns.setter
@@ -232,7 +232,7 @@ def fresh_audit(
     ring: FreshRing,
     perturbations: FreshPerturbations | None = None,
 ) -> Columns:
-    """The same of its fresh rows, without the names of conditions: `named` adds those."""
+    """Return the audit's columns of fresh rows, without names of conditions: `named` adds those."""
     keys = rows["episode"]
     return {
         "source": "fresh",
@@ -257,7 +257,7 @@ def fresh_audit(
 def named(
     audit: Columns, conditions: Sequence[str], strata: Sequence[str], unlabelled: str
 ) -> Columns:
-    """What `fresh_audit` gave, once conditions are known; `unlabelled` is the stratum of others."""
+    """Add names to the columns of `fresh_audit`; `unlabelled` is the stratum of the others."""
     names = [conditions[code] if code >= 0 else None for code in audit["condition"].tolist()]
     of_strata = audit["of_stratum"].tolist()
     values = audit["perturbation_values"]  # a checkpoint gives back lists
@@ -292,14 +292,17 @@ class EpisodeLabels(Stateful):
         self._given_up: list[int] = []  # keys
 
     def note(self, key: int, codes: NDArray[Any], strata: NDArray[Any] | None = None) -> None:
-        """Episode `key` ended; `codes[t]` (T,) is the condition of its step t, `strata[t]` its
-        stratum; None: as the condition."""
+        """Keep the labels of ended episode `key`.
+
+        `codes[t]` (T,) is the condition of its step t, `strata[t]` its stratum; None: as the
+        condition.
+        """
         self._keys.append(int(key))
         both = (codes, codes if strata is None else strata)
         self._codes.append(np.asarray(np.stack(both), np.int16))
 
     def give_up(self, key: int) -> None:
-        """No labels will come for episode `key`."""
+        """Mark episode `key` as one that will never have labels."""
         self._given_up.append(int(key))
 
     def clear(self) -> None:
@@ -312,8 +315,7 @@ class EpisodeLabels(Stateful):
     def fill(
         self, condition: NDArray[Any], stratum: NDArray[Any], key: Ints, step: NDArray[Any]
     ) -> None:
-        """Give the rows (n,) of `condition` that are WAITING theirs, and their stratum, where they
-        are known by now."""
+        """Fill in conditions and strata of WAITING rows (n,) that have labels by now."""
         waiting = np.flatnonzero(condition == WAITING)
         if self._given_up:
             lost = np.isin(key[waiting], self._given_up)
@@ -360,7 +362,7 @@ class HeldInterval:
 
     @property
     def waits(self) -> bool:
-        """Whether a row has no condition yet, and may get one."""
+        """True if a row has no condition yet, and may get one."""
         parts = (self.rows, self.open_rows)
         return any((part["condition"] == WAITING).any() for part in parts)
 

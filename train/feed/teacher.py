@@ -52,7 +52,7 @@ class OperatorTeacher(Stateful):
         self._operator = Operator(epsilon=0.0, seed=seed)
 
     def act(self, env: Any, observation: F32, /) -> Ints:
-        """What it would do, (N,).
+        """Return the teacher's action in each environment, (N,).
 
         Raises:
             ConfigError: the environment is not the warehouse twin.
@@ -94,7 +94,7 @@ class AskedTeacher(Stateful):
         self.requested = self.answered = 0  # states since this process began
 
     def ask(self, env: Any, observation: F32) -> Label:
-        """What it would do, (N,); UNKNOWN where it has no opinion.
+        """Return the teacher's action in each environment, (N,); UNKNOWN if it has no opinion.
 
         Raises:
             TeacherFailed: it raised an error, gave no action, other than N of them, or one that
@@ -144,7 +144,7 @@ class AskedTeacher(Stateful):
 def open_teacher(
     config: TeacherConfig, task: Task, *, seed: int, given: Any = None
 ) -> AskedTeacher | None:
-    """The teacher that a run asks in the twin; None where it asks none.
+    """Make the teacher that a run queries in the twin; None if there is none.
 
     Args:
         given: in place of what the config names: an object with `act`, or a function like it.
@@ -175,7 +175,7 @@ def open_teacher(
 
 @contextmanager
 def _of_the_user(what: str, called: Any) -> Iterator[None]:
-    """An error of the user's code names its file and line, for it is no bug of Restock's.
+    """Turn an error of the user's code into one that names its file and line.
 
     So does SystemExit, which would end a run without a word.
     """
@@ -220,7 +220,7 @@ def _place(called: Any, error: BaseException) -> str:
 
 
 def _imported(source: str) -> Any:
-    """What `module:name` names; modules of the working directory are found too."""
+    """Import what `module:name` names; modules of the working directory are found too."""
     if source == GIVEN:
         raise ConfigError(
             "the run's teacher was passed in from Python, and none is given now",

@@ -25,7 +25,7 @@ MISSIONS = "env.missions"
 
 
 def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
-    """The missions that a share of the episodes follows; none where the config names none.
+    """Read the missions that a share of the episodes follows; none if the config names none.
 
     Raises:
         ConfigError: their file cannot be read, or says something else.
@@ -35,7 +35,7 @@ def mission_orders(config: TrainConfig) -> tuple[MissionOrder, ...]:
 
 
 def mission_arms(config: TrainConfig) -> MissionArms:
-    """The arms that a run's missions are of.
+    """Make the arms of a run's missions.
 
     Raises:
         ConfigError: an order that the floors cannot hold, or `practice.by` that says nothing.
@@ -55,7 +55,7 @@ def mission_arms(config: TrainConfig) -> MissionArms:
 
 
 def check_missions(config: TrainConfig, profile: Profile) -> None:
-    """What the twin is to drive is refused now, before anything is written, if it cannot be.
+    """Refuse missions that the twin cannot drive, before anything is written.
 
     Raises:
         ConfigError: an order, arm or floor of practice that the floors cannot hold.
@@ -72,7 +72,7 @@ def make_twin(
     nthread: int = 1,
     layouts: str | None = None,
 ) -> Twin:
-    """The warehouse, as training uses it; on other floors where `layouts` names them."""
+    """Make the warehouse as training uses it, on other floors if `layouts` names them."""
     if not config.env.twin:
         return NoTwin(profile.task)
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
