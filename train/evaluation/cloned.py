@@ -49,13 +49,13 @@ class ClonedPolicy:
 
 
 def is_cloned(name: str) -> bool:
-    """Whether a policy's name is `cloned`, or `cloned:DRIVER`."""
+    """Tell whether a policy's name is `cloned`, or `cloned:DRIVER`."""
     kind, sign, driver = name.partition(":")
     return kind == CLONED and bool(driver) == bool(sign)
 
 
 def cloned_panel(run: Run, name: str) -> Panel:
-    """The panel of the rows that a clone is made of.
+    """Open the panel of the rows that a clone is made of.
 
     Raises:
         ConfigError: the run learnt from no logs, or nobody of that name drove in them.
@@ -81,7 +81,7 @@ def cloned_panel(run: Run, name: str) -> Panel:
 
 
 def load_cloned(run: Run, name: str, *, seed: int = 0) -> ClonedPolicy:
-    """The clone of the logs' drivers, trained on first use and kept in `RUN/eval`.
+    """Load the clone of the logs' drivers, trained on first use and kept in `RUN/eval`.
 
     Args:
         name: `cloned`, of all rows of the run's panel, or `cloned:DRIVER`, of one driver's.
@@ -146,7 +146,7 @@ def clone_of(panel: Panel, name: str) -> tuple[QNetwork, CloneQuality]:
 
 
 def best_updates(observation: F32, action: Ints, episode: Ints, actions: int) -> int:
-    """How many updates give episodes that were set aside the largest likelihood.
+    """Return the number of updates that gives held-out episodes the largest likelihood.
 
     Of a single episode its last fifth is set aside. More updates than that learn rows by heart.
     """
@@ -182,7 +182,10 @@ def _held_out(panel: Panel, driver: str) -> tuple[F32, Ints, str | None]:
 def _judged(
     network: QNetwork, observation: F32, action: Ints, frequencies: F32, first: int
 ) -> dict[str, Any]:
-    """The held-out part of a `CloneQuality`; `first`: where an observation has the last action."""
+    """Compute the held-out part of a `CloneQuality`.
+
+    `first` is where an observation has the last action.
+    """
     if not len(action):
         unknown = ("log_likelihood", "frequencies_log_likelihood", "agreement", "repeating")
         return {"held_out_rows": 0, **dict.fromkeys((*unknown, "changed_agreement"))}
@@ -200,13 +203,13 @@ def _judged(
 
 
 def _frequencies(action: Ints, actions: int) -> F32:
-    """How often each action was taken (A,), with one more of each: none has probability 0."""
+    """Count how often each action was taken (A,), plus one each, so that none has probability 0."""
     counts = np.bincount(action, minlength=actions) + 1
     return np.asarray(counts / counts.sum(), np.float32)
 
 
 def _log_likelihood(network: QNetwork, observation: F32, action: Ints) -> float:
-    """The mean of log G(a|s) over rows, in nats."""
+    """Return the mean of log G(a|s) over rows, in nats."""
     probability = cloned_probabilities(network, observation)[np.arange(len(action)), action]
     return float(np.log(np.maximum(probability, 1e-12)).mean())
 

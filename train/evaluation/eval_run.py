@@ -136,7 +136,7 @@ def drive_evaluation(
 
 
 def recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
-    """The episodes of a run's last evaluation, and in words which they are.
+    """Return the episodes of a run's last evaluation, and a text that says which they are.
 
     Raises:
         RunError: nothing was driven, or the file is damaged.
@@ -152,12 +152,12 @@ def recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
 
 
 def clones_driven(plan: EvaluationPlan) -> list[CloneQuality]:
-    """How good the clones among the policies are; empty before they were driven."""
+    """Return how good the clones among the policies are; empty before they were driven."""
     return [one for one in read_clones(plan.run.path) if one.policy in plan.policies]
 
 
 def episodes_table(results: Results, plan: EvaluationPlan, versions: Mapping[str, str]) -> pa.Table:
-    """One row an episode."""
+    """Make the table of episodes, one row each."""
     origins = {name: origin.env_steps for name, origin in plan.origins.items()}
     rows = [
         {

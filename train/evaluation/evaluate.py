@@ -53,7 +53,7 @@ class EpisodeResult:
 
     @property
     def row(self) -> dict[str, Any]:
-        """What every table of episodes says of one."""
+        """The columns that every table of episodes has."""
         return {
             "condition": self.condition,
             "block": self.block,
@@ -72,7 +72,7 @@ class EpisodeResult:
 
 
 def fixed_episodes(conditions: Sequence[str], episodes: int, first_seed: int) -> list[EpisodeSpec]:
-    """The same episodes always: `episodes` per condition, seeds from `first_seed`."""
+    """Return `episodes` fixed episodes per condition, with seeds from `first_seed`."""
     return [
         EpisodeSpec(condition, first_seed + index)
         for index in range(episodes)

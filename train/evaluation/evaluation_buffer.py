@@ -134,7 +134,7 @@ class EvaluationBuffer:
 
 
 def _explained_share(td: Tensor, target: Tensor) -> float | None:
-    """The share of the targets' variance (n,) that the critic explains; None without variance."""
+    """Return the explained share of the targets' variance (n,); None without variance."""
     spread = float(target.var(unbiased=False))
     return 1.0 - float(td.var(unbiased=False)) / spread if spread > 0 else None
 

@@ -109,7 +109,7 @@ class EvaluationPlan:
 
     @property
     def origins(self) -> dict[str, PolicyOrigin]:
-        """From which step of training the run's own policy is, and that of each other run."""
+        """The training step of the run's own policy, and that of each other run's."""
         own = {n: p.origin for n, p in self.loaded.items() if isinstance(p, GreedyPolicy)}
         return {name: origin for name, origin in own.items() if origin is not None}
 
@@ -177,7 +177,7 @@ def plan_evaluation(
 def refuse_unknown(
     what: Literal["policies", "perturbations"], names: Sequence[str], *, where: str
 ) -> None:
-    """Raises ConfigError where `restock eval` does not know a name, or there are no names."""
+    """Raise ConfigError if `restock eval` does not know a name, or there are no names."""
     if what == "policies":
         choices, paths = ["agent", *REFERENCES, CLONED], _PATHS
     else:
@@ -237,7 +237,7 @@ def _is_path(what: str, name: str) -> bool:
 
 
 def make_policy(name: str, plan: EvaluationPlan) -> Policy:
-    """The run's policy, a scripted one, or one that is named."""
+    """Make the run's policy, a scripted one, or one that is named."""
     if name in plan.loaded:
         return plan.loaded[name]
     if name == "agent":
@@ -251,7 +251,7 @@ def make_policy(name: str, plan: EvaluationPlan) -> Policy:
 def _missions(
     run: Run, named: str, floors: Sequence[Warehouse], kinds: Sequence[str]
 ) -> LoggedMissions | None:
-    """Those of the logs where they are asked for.
+    """Return the missions of the logs, if they are requested.
 
     Raises:
         ConfigError: no such missions, no logs, or none of them can be driven.
@@ -270,7 +270,7 @@ def _missions(
 
 
 def _limits(run: Run, named: str) -> Limits:
-    """The limits of a run's robot, by its profile or by a TOML file.
+    """Return the limits of a run's robot, by its profile or by a TOML file.
 
     Raises:
         ConfigError: no such file, or its `[limiter]` cannot be used.
@@ -286,7 +286,7 @@ def _limits(run: Run, named: str) -> Limits:
 
 
 def _perturb(name: str) -> Perturbation | None:
-    """The parameters that episodes are driven under; None: as they are.
+    """Return the perturbation of the episodes; None: as they are.
 
     Raises:
         ConfigError: no such name or file, a schedule, or another timestep than evaluation's.
@@ -307,7 +307,7 @@ def _perturb(name: str) -> Perturbation | None:
 
 
 def settings(plan: EvaluationPlan) -> dict[str, Any]:
-    """What was asked, for the JSON output."""
+    """Return the settings of an evaluation for the JSON output."""
     return {
         "run": str(plan.run.path),
         "policies": list(plan.policies),

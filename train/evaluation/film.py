@@ -61,9 +61,12 @@ class Scene:
 
 
 def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
-    """Of each condition, unperturbed: the agent's failure of the lowest return, and the episode of
-    the highest that it ended well and another policy did not: preferably that of another run, and
-    of these the one that arrives least often. Those that there are."""
+    """Choose the scenes to film: per condition, unperturbed, a failure and a success of the agent.
+
+    The failure is the one of the lowest return. The success is the one of the highest return in
+    which another policy failed: preferably that of another run, and of these the one that arrives
+    least often. Scenes that do not exist are left out.
+    """
     clean = [row for row in rows if row["perturbation"] == CLEAN and row["success"] is not None]
     others = {
         (row["policy"], row["condition"], row["episode_seed"], row["layouts"]): row
@@ -98,8 +101,9 @@ def scenes(rows: Sequence[dict[str, Any]]) -> list[Scene]:
 def film_evaluation(
     plan: EvaluationPlan, progress: Callable[[int], None] | None = None
 ) -> tuple[list[Path], list[str]]:
-    """Film the scenes of what is recorded of a run: files below RUN/eval/films, and what is not
-    filmed with the reason.
+    """Film the scenes of a run's recorded evaluation.
+
+    Returns files below RUN/eval/films, and what is not filmed with the reason.
 
     Raises:
         RunError: nothing was driven on the plan's floors, or the run kept no policy.
@@ -144,8 +148,11 @@ def film_evaluation(
 
 
 def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8]] | None:
-    """Pictures of another policy's drive; None where it cannot be driven as it was: its run is gone
-    or another now, or what it does depends on what drove beside it."""
+    """Film another policy's drive; None if it cannot be driven as it was.
+
+    That is so if its run is gone or has changed, or if what it does depends on what drove beside
+    it.
+    """
     try:
         result, frames, _ = drive_again(plan, row)
     except RestockError:
@@ -156,8 +163,11 @@ def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8
 def drive_again(
     plan: EvaluationPlan, row: dict[str, Any]
 ) -> tuple[EpisodeResult, list[NDArray[np.uint8]], list[dict[str, Any]]]:
-    """Drive an episode once more with the policy that drove it: how it went, a picture of each step
-    (H, W, 3), and where everything was (metres and radians, in the map frame)."""
+    """Drive an episode once more with the policy that drove it.
+
+    Returns how it went, a picture of each step (H, W, 3), and where everything was (metres and
+    radians, in the map frame).
+    """
     frames: list[NDArray[np.uint8]] = []
     states: list[dict[str, Any]] = []
 
@@ -183,8 +193,7 @@ def drive_row(
     row: dict[str, Any],
     watched: Callable[[WarehouseVectorEnv], Stepper],
 ) -> EpisodeResult:
-    """Drive an episode once more with the policy that drove it, with the steps that `watched` makes
-    of its twin."""
+    """Drive an episode once more with its policy, stepping the twin by what `watched` makes."""
     from restock.train.twin.env.vector_env import WarehouseVectorEnv
 
     profile = profile_of_run(plan.run)
@@ -213,7 +222,7 @@ def drive_row(
 
 
 def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
-    """In what an episode that was driven again is not the recorded one; empty where it is."""
+    """List the fields in which an episode driven again differs from the recorded one."""
     now = {**result.row, "failure": result.failure}
     differing = [name for name in _SAME if now[name] != row[name]]
     ends = np.array([result.end_x_m - row["end_x_m"], result.end_y_m - row["end_y_m"]])
@@ -221,8 +230,10 @@ def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
 
 
 def everything(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
-    """Where robot, people, forklifts, pallets and patches are, the plan and the goal: metres and
-    radians in the map frame, rounded to millimetres."""
+    """Return where everything is: robot, people, forklifts, pallets, patches, plan and goal.
+
+    In metres and radians in the map frame, rounded to millimetres.
+    """
     sim, navigation = env.simulation, env.navigation
     traffic = sim.traffic
     here = np.isfinite(sim.traffic.gaps_m(sim.middle(sim.pose()))[0])
@@ -274,7 +285,7 @@ def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str
 
 
 def _told(row: dict[str, Any]) -> str:
-    """Who drove and how it ended, in words that fit above a picture."""
+    """Say who drove and how it ended, in words that fit above a picture."""
     ended = "arrives" if row["success"] else row["failure"]
     who = policy_words([row["policy"]])[row["policy"]]
     return f"{who}: {ended}, {row['time_s']:.1f} s"
@@ -283,8 +294,10 @@ def _told(row: dict[str, Any]) -> str:
 def _beside(
     left: list[NDArray[np.uint8]], right: list[NDArray[np.uint8]], captions: Sequence[str]
 ) -> list[NDArray[np.uint8]]:
-    """Two drives from their first steps on, each under its caption; the shorter one's last picture
-    stays."""
+    """Put two drives side by side from their first steps, each under its caption.
+
+    The shorter one's last picture stays.
+    """
     height, width = left[0].shape[:2]
     font = ImageFont.load_default(size=28)
     canvas = Image.new("RGB", (2 * width + GAP_PIXELS, height + CAPTION_PIXELS), "white")
@@ -303,7 +316,7 @@ def _beside(
 
 
 def _animation(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """An endless WebP of at most MAX_FRAMES frames; the last one stays for a second."""
+    """Encode an endless WebP of at most MAX_FRAMES frames; the last one stays for a second."""
     from io import BytesIO
 
     picked = np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))

@@ -66,7 +66,7 @@ class LoggedMissions:
 
     @property
     def text(self) -> str:
-        """What they are, in a sentence."""
+        """The counts in a sentence."""
         said = f"missions of the logs: {self.ways} of {self.logged} can be driven"
         parts = [f"{said} ({self.source})"]
         parts += [f"{count} not: {why}" for why, count in self.left_out.items()]
@@ -77,7 +77,7 @@ class LoggedMissions:
 def logged_missions(
     panel: Panel, floors: Sequence[Warehouse], kinds: Sequence[str], *, every: bool = False
 ) -> LoggedMissions:
-    """The ways of the episodes that a panel holds out, as missions on floors of their frames.
+    """Turn the held-out episodes of a panel into missions on floors of their frames.
 
     Args:
         every: those that were trained on too; also where nothing is held out.
@@ -151,7 +151,7 @@ def logged_missions(
 
 
 def logged_ways(connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task) -> LoggedWays:
-    """The ways of the episodes with some of these rows, where the rows tell them."""
+    """Return the ways of the episodes with some of these rows, if the rows show them."""
     query = (files("restock.train.evaluation") / "logged_ways.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         columns = connection.sql(query).fetchnumpy()
@@ -170,7 +170,7 @@ def logged_ways(connection: duckdb.DuckDBPyConnection, ids: Ints, task: Task) ->
 
 
 def goal_of(rows: F64, far_m: float) -> F64 | None:
-    """Where an episode was sent, (2,), by its rows (N, 7); None where they do not tell.
+    """Find the goal of an episode, (2,), from its rows (N, 7); None if they do not show it.
 
     Columns: pose x, y, yaw; far waypoint forward, left; route left; distance to the goal.
     """
@@ -199,7 +199,7 @@ def goal_of(rows: F64, far_m: float) -> F64 | None:
 
 
 def _in_frame(way: Way, floor: Warehouse) -> Way:
-    """A way of the logs in a floor's own frame."""
+    """Transform a way of the logs into a floor's own frame."""
     of = np.asarray(way, np.float64)
     ends = into_frame(np.stack([of[:2], of[3:5]]), floor.map_origin)
     x, y, goal_x, goal_y = ends.ravel().round(3).tolist()
@@ -227,14 +227,14 @@ def _has_room(spec: EpisodeSpec, floor: Warehouse, planner: Planner) -> bool:
 
 
 def _seed(way: Way) -> int:
-    """The way names its mission: the same seed in every run, another for another way."""
+    """Return the seed of a way's mission: the same in every run, and different for another way."""
     return zlib.crc32(np.asarray(way, np.float64).tobytes()) >> 1
 
 
 def ways_to_evaluate(
     config: TrainConfig, layouts: str, panel: Panel | None
 ) -> list[EpisodeSpec] | None:
-    """The ways of its logs that a run's evaluations drive on these floors; None: drawn missions.
+    """Return the logged ways that a run's evaluations drive on these floors; None: drawn missions.
 
     Raises:
         ConfigError: ways are asked for, and there are no logs, no goal, or none of them can be

@@ -34,9 +34,10 @@ _OPSET = 18
 
 
 def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
-    """Write a run's policy to `out`: input `observation` (N, D), outputs `values` (N, A) and
-    `action` (N,). With a teacher's filter both networks are in it, and the values of actions that
-    are not plausible are -inf.
+    """Write a run's policy to `out`: input `observation` (N, D), outputs `values` and `action`.
+
+    `values` are (N, A), `action` is (N,). With a teacher's filter both networks are in it, and the
+    values of actions that are not plausible are -inf.
 
     Raises:
         RunError: no such run, no policy yet, or there is something at `out` already.
@@ -71,7 +72,7 @@ def export_onnx(run_path: Path, out: Path) -> dict[str, Any]:
 
 
 def to_onnx(network: PolicyNetwork) -> Any:
-    """The network as an ONNX model, node for layer; where it is filtered, both in one graph."""
+    """Translate the network into an ONNX model, node for layer; a filter is in the same graph."""
     onnx = _onnx()
     graph = _Graph(onnx)
     plain = network.values if isinstance(network, FilteredNetwork) else network
@@ -123,7 +124,7 @@ class _Graph:
         return self.node("Gemm", [inputs, weight, bias], name, transB=1)
 
     def values(self, network: QNetwork, name: str) -> str:
-        """Action values (N, A) of one network."""
+        """Add the nodes of one network's action values (N, A)."""
         if type(network) is not QNetwork:  # of an algorithm with a network of its own
             raise ConfigError(
                 f"a {type(network).__name__} cannot be written as ONNX",
@@ -146,7 +147,7 @@ class _Graph:
         return self.linear(network.advantage, now, f"{name}.advantage")
 
     def filter(self, network: FilteredNetwork, values: str, output: str) -> str:
-        """The values (N, A) where an action is plausible, -inf elsewhere."""
+        """Add the nodes that set values (N, A) of implausible actions to -inf."""
         logits = self.values(network.behaviour, "behaviour")
         axes = self.constant("behaviour.axes", np.array([1], np.int64))
         largest = self.node("ReduceMax", [logits, axes], "behaviour.largest", keepdims=1)
@@ -188,7 +189,7 @@ class OnnxPolicy:
         self.name, self.version = f"onnx:{path}", metadata.get("version", "")
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, F32]:
-        """The best action (N,) of each observation (N, D), and 1 for its probability."""
+        """Return the best action (N,) of each observation (N, D), and 1 for its probability."""
         (output,) = self._session.run([self._output], {self._input: observation})
         action = output if output.ndim == 1 else output.argmax(axis=1)
         if action.shape != (len(observation),) or not np.isin(action, range(self._actions)).all():

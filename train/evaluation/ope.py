@@ -90,7 +90,7 @@ class OpePlan:
 
     @property
     def updates(self) -> int:
-        """How often a model is updated."""
+        """Number of updates of all models."""
         model = self.config.model
         cloned = bool(self.dataset.evaluation.unlogged.any())
         return model.cloning_updates * cloned + (
@@ -98,7 +98,7 @@ class OpePlan:
         )
 
     def document(self) -> dict[str, Any]:
-        """What would be evaluated, as JSON."""
+        """Return what would be evaluated, as JSON."""
         evaluated = self.dataset.evaluation
         return {
             "run": str(self.path),
@@ -116,7 +116,7 @@ class OpePlan:
 
 
 def plan_off_policy(path: Path, logs: str | None, config: OpeConfig) -> OpePlan:
-    """The run and the logs of an evaluation, read and checked; raises as that does."""
+    """Read and check the run and the logs of an evaluation; raises as these do."""
     run = Run.open(path)
     trained = parse_config(run.document["config"], where=str(path / "config.json"))
     agent = load_agent(run)
@@ -151,7 +151,7 @@ def evaluate_run_off_policy(
 def evaluate_planned(
     plan: OpePlan, progress: Callable[[int], None] | None = None, *, write: bool = True
 ) -> OpeResult:
-    """As `evaluate_run_off_policy`."""
+    """Evaluate as `evaluate_run_off_policy` does."""
     with torch_threads(plan.trained.threads):
         rows = evaluate_off_policy(
             plan.policy.network,
@@ -172,12 +172,12 @@ def evaluate_planned(
 
 
 def notes_of(task: Task, dataset: OpeDataset, config: OpeConfig) -> tuple[str, ...]:
-    """What is worth saying of the logs, and of the model on them."""
+    """Return notes on the logs, and on the model fitted to them."""
     return dataset.notes + _beyond_the_model(task, dataset.evaluation, config.model.iterations)
 
 
 def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...]:
-    """What is worth saying of episodes that may take more steps than the model looks ahead."""
+    """Warn of episodes that may take more steps than the model looks ahead."""
     if task.time_limit_steps <= reach:
         return ()
     lengths = np.bincount(steps.episode)
@@ -190,7 +190,7 @@ def _beyond_the_model(task: Task, steps: OpeSteps, reach: int) -> tuple[str, ...
 
 
 def measures_of(task: Task, dataset: OpeDataset) -> tuple[Measure, ...]:
-    """What can be measured on logs: without a goal, or with goals in hindsight, no success."""
+    """Return what can be measured on logs: no success without goals, or with goals in hindsight."""
     logged = task.goal == "route" and not dataset.hindsight
     return ("return", "success") if logged else ("return",)
 
@@ -294,7 +294,7 @@ def behaviour_probability(
     config: OpeConfig,
     between: Callable[[], None] = lambda: None,
 ) -> tuple[F64, float]:
-    """Of each logged action (N,), and the share of rows in which it had to be estimated.
+    """Return the probability of each logged action (N,), and the share that had to be estimated.
 
     As logged; where the logs do not say, by cloning the behaviour of the training rows.
     """

@@ -42,7 +42,7 @@ class GreedyPolicy:
 
 
 def load_policy(name: str, task: Task) -> Policy | None:
-    """The policy that `run:DIRECTORY` or `onnx:FILE` names; None for other names.
+    """Load the policy that `run:DIRECTORY` or `onnx:FILE` names; None for other names.
 
     Raises:
         ConfigError: no such file, or a policy of another task.
@@ -68,7 +68,7 @@ def load_policy(name: str, task: Task) -> Policy | None:
 
 
 def load_agent(run: Run) -> GreedyPolicy:
-    """The policy of a run that drives, as `kept_policy` says: greedy, with its step as `origin`.
+    """Load the policy that drives, as `kept_policy` says: greedy, with its step as `origin`.
 
     Raises:
         RunError: it has made no update yet, its policy is missing or damaged, or it is of a task
@@ -109,7 +109,7 @@ def load_agent(run: Run) -> GreedyPolicy:
 
 
 def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
-    """The policy of the last checkpoint, as `save_agent` would have written it.
+    """Load the policy of the last checkpoint, as `save_agent` would have written it.
 
     Raises:
         RunError: the checkpoint is damaged, or not of the networks that config.json describes.
@@ -136,12 +136,12 @@ def _latest_agent(run: Run, config: TrainConfig, task: Task) -> dict[str, Any]:
 
 
 def kept_one(state: Mapping[str, Any]) -> bool:
-    """Whether a run had kept a policy when this checkpoint of it was taken."""
+    """Tell whether a run had kept a policy when this checkpoint of it was taken."""
     return bool(state["progress"]["evaluated_at"] >= 0)
 
 
 def load_kept(run: Run) -> dict[str, Any]:
-    """What `save_agent` wrote, of a run that has kept a policy.
+    """Load what `save_agent` wrote, of a run that has kept a policy.
 
     Raises:
         RunError: its file is missing or damaged.

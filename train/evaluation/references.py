@@ -15,7 +15,7 @@ FIRST_SEED = 10_000
 
 
 def wrong_seed(seed: int, count: int = 1) -> str | None:
-    """What is wrong with a seed, or with the first of `count` seeds in a row; None: nothing."""
+    """Return what is wrong with a seed, or with the first of `count` in a row; None: nothing."""
     if 0 <= seed <= LAST_SEED + 1 - count:
         return None
     last = f" ({count:,} seeds from there on)" if count > 1 else ""
@@ -23,7 +23,7 @@ def wrong_seed(seed: int, count: int = 1) -> str | None:
 
 
 def reference(name: str, seed: int = 0) -> Policy:
-    """A reference by its name.
+    """Make a reference driver by its name.
 
     Raises:
         ConfigError: there is none of the name.

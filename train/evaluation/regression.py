@@ -48,7 +48,7 @@ class Evaluated:
 
 
 def of_run(path: Path, policy: str = AGENT) -> Evaluated:
-    """What `restock eval` wrote of a run's own policy, or of another that it drove beside it.
+    """Read what `restock eval` wrote of a run's own policy, or of another that it drove beside it.
 
     Raises:
         RunError: no run, or it was not evaluated.
@@ -59,13 +59,13 @@ def of_run(path: Path, policy: str = AGENT) -> Evaluated:
 
 
 def check_margin(margin: float) -> None:
-    """Raises ConfigError where nothing could be worse by more than that, or a rise would be."""
+    """Raise ConfigError if nothing could be worse by this margin, or an improvement would be."""
     if not 0 <= margin <= 1:  # NaN is neither
         raise ConfigError(f"must be from 0 to 1, got {margin}", where="--margin")
 
 
 def of_baseline(name: str) -> Evaluated:
-    """A baseline by the directory of a run, a file, or the name that it was saved under.
+    """Read a baseline by the directory of a run, a file, or the name that it was saved under.
 
     Raises:
         RunError: there is none.
@@ -112,7 +112,7 @@ def baseline_file(name: str) -> Path:
 def regression(
     baseline: Evaluated, candidate: Evaluated, *, margin: float = 0.05, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """One row a perturbation and condition of the baseline, and one of each perturbation's all.
+    """Compare with a baseline: a row per perturbation and condition, and one over all conditions.
 
     `worse` is a success lower by more than `margin`, with the paired 95 % interval below 0;
     `better` is an interval above 0. From fewer than `MIN_EPISODES` neither is told: the row is
@@ -148,7 +148,7 @@ def regression(
 def compare_with_baseline(
     run: Path | str, baseline: str, *, margin: float = 0.05, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """A run beside a baseline on the same episodes, as `restock eval --baseline`.
+    """Compare a run with a baseline on the same episodes, as `restock eval --baseline`.
 
     Returns a row a perturbation and condition, with the difference in success, its 95 % interval
     and a verdict. `regressed` says whether one of them should stop a pipeline.
@@ -165,7 +165,7 @@ def compare_with_baseline(
 
 
 def regressed(rows: Sequence[dict[str, Any]]) -> bool:
-    """Whether a pipeline should stop: a row is worse, or could not be compared."""
+    """Tell whether a pipeline should stop: a row is worse, or could not be compared."""
     return any(row["verdict"] in ("worse", "refused") for row in rows)
 
 
@@ -231,7 +231,7 @@ def _refused(cell: tuple[str, str], before: _Episodes, after: _Episodes) -> dict
 
 
 def agent_episodes(run: Run, policy: str = AGENT) -> pa.Table | None:
-    """What `restock eval` wrote of the run's own policy, or of another; None: none drove."""
+    """Read what `restock eval` wrote of the run's own policy, or of another; None: none drove."""
     import pyarrow.compute as pc  # slow to import
 
     table, _ = shown_evaluation(run.path)

@@ -52,7 +52,7 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """What `save` was given: arrays as numpy where they were numpy, else as CPU tensors.
+    """Load what `save` was given: arrays as numpy if they were numpy, else as CPU tensors.
 
     Raises:
         RunError: no such file, or not one that `save` wrote.
@@ -146,7 +146,7 @@ def _put_together(value: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
 
 
 def earlier(latest: Path) -> dict[int, Path]:
-    """The checkpoints before the latest, oldest first, by their environment steps."""
+    """Return the checkpoints before the latest, oldest first, by their environment steps."""
     kept = {}
     for path in latest.parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         steps = path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX)
@@ -156,7 +156,7 @@ def earlier(latest: Path) -> dict[int, Path]:
 
 
 def newest_whole(latest: Path) -> int | None:
-    """The environment steps of the newest earlier checkpoint that is not damaged; None: none is."""
+    """Return the steps of the newest earlier checkpoint that is not damaged, or None."""
     for steps, path in reversed(earlier(latest).items()):
         try:
             load(path)
@@ -179,7 +179,7 @@ def keep(latest: Path, env_steps: int, count: int) -> None:
 
 
 def check_earlier(latest: Path, env_steps: int) -> dict[int, Path]:
-    """The checkpoints before the latest, one of which was taken after these environment steps.
+    """Return the earlier checkpoints, one of which must be of these environment steps.
 
     Raises:
         RunError: no such checkpoint; names those that are kept.
@@ -210,7 +210,7 @@ def go_back(latest: Path, env_steps: int) -> None:
 
 
 def _put(source: Path, target: Path) -> None:
-    """The same file under another name, in one step; a copy where the disk has no hard links."""
+    """Put a file under another name in one step; copy it if the disk has no hard links."""
     temporary = temporary_name(target)
     temporary.unlink(missing_ok=True)
     try:

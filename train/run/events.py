@@ -29,13 +29,13 @@ class Sink(Protocol):
         """Numbers by `group/name`, after `step` environment steps."""
 
     def flush(self) -> None:
-        """What was given is to be readable from here on."""
+        """Make what was given readable from here on."""
 
     def close(self) -> None:
-        """No more will come."""
+        """Close the sink: nothing more will come."""
 
     def describe(self) -> dict[str, Any]:
-        """Where the run is found again: ids and addresses."""
+        """Return the ids and addresses by which the run is found again."""
 
 
 class TensorBoard:
@@ -154,7 +154,7 @@ class Events:
 
 
 def tracked(run: Path) -> dict[str, Any]:
-    """What `RUN/tracking.json` says; empty where it is not there or cannot be read."""
+    """Read `RUN/tracking.json`; empty if it does not exist or cannot be read."""
     try:
         known = json.loads((run / TRACKING).read_text(encoding="utf-8"))
     except (OSError, ValueError):

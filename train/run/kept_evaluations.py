@@ -28,7 +28,7 @@ _NAME = ("policy", "version", "layouts", "perturbation", "perturbation_values", 
 
 
 def read_evaluations(run: Path) -> pa.Table:
-    """All that was driven of a run; no rows where nothing was.
+    """Read all episodes that a run's evaluations drove; no rows if there are none.
 
     Raises:
         RunError: the file is damaged.
@@ -69,7 +69,7 @@ def add_evaluation(run: Path, driven: pa.Table) -> pa.Table:
 
 
 def planner_times(rows: Iterable[Mapping[str, Any]]) -> dict[Mission, float]:
-    """How long the planner took on the missions in which it arrived, of rows of an evaluation."""
+    """Return how long the planner took on each mission in which it arrived."""
     return {
         mission_of(row): row["time_s"]
         for row in rows
@@ -78,13 +78,13 @@ def planner_times(rows: Iterable[Mapping[str, Any]]) -> dict[Mission, float]:
 
 
 def mission_of(row: Mapping[str, Any]) -> Mission:
-    """What makes two rows the same mission: floors, condition, seed, and parameters in force."""
+    """Return what identifies a mission: floors, condition, seed, and parameters in force."""
     values = str(sorted(row["perturbation_values"] or ()))
     return row["layouts"], row["condition"], row["episode_seed"], values
 
 
 def shown_evaluation(run: Path, *, ways: bool = False) -> tuple[pa.Table, str]:
-    """The episodes to show and to compare, and in words which they are of how many.
+    """Return the episodes to show and compare, and a text that says which of how many they are.
 
     With `ways` only those on the ways of logs are looked at; without, the others, if there are any.
 
@@ -136,7 +136,7 @@ def _floors(layouts: str) -> str:
 
 
 def _changes(policy: str) -> bool:
-    """Whether a policy of this name is another as the run goes on, or by the limiter's settings."""
+    """Tell whether a policy of this name changes with the run, or with the limiter's settings."""
     return policy == "agent" or policy.startswith(LIMITED)
 
 
@@ -182,7 +182,7 @@ class CloneQuality:
 
     @property
     def text(self) -> str:
-        """What a reader must know of it, in a sentence or two."""
+        """The warning to the reader, in a sentence or two."""
         said = (
             f"{self.policy} is behaviour cloning of {', '.join(self.drivers) or 'unnamed drivers'}"
             f" ({counted(self.rows, 'row')} of"
@@ -200,7 +200,7 @@ class CloneQuality:
 
 
 def read_clones(run: Path) -> list[CloneQuality]:
-    """One a policy. Raises RunError where the file is damaged."""
+    """Read the clones' qualities, one per policy; raise RunError if the file is damaged."""
     if not (run / CLONES).is_file():
         return []
     table = read_table(run / CLONES, EVAL_CLONES, error=RunError, remedy="remove it")

@@ -28,7 +28,7 @@ class PolicyOrigin:
 
     @property
     def text(self) -> str:
-        """For people: `policy of step 120,000 of 192,000, the best in training`."""
+        """The origin for people: `policy of step 120,000 of 192,000, the best in training`."""
         if not self.run_env_steps:
             return f"policy of update {self.gradient_steps:,}, from the logs alone"
         of = "" if self.env_steps == self.run_env_steps else f" of {self.run_env_steps:,}"
@@ -38,13 +38,12 @@ class PolicyOrigin:
 
     @property
     def document(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The fields and the text as JSON values."""
         return {**asdict(self), "text": self.text}
 
 
 def kept_policy(run: Run) -> PolicyOrigin | None:
-    """What would drive now, by the run's checkpoints or, without them, its evaluations; None if
-    it has neither."""
+    """Return the policy that would drive now; None without checkpoint and evaluation."""
     chosen: Literal["best", "latest"] = "latest" if latest_drives(run) else "best"
     clocks = run_clocks(run) if chosen == "latest" else _values(run.best)
     if not clocks:
@@ -56,7 +55,7 @@ def kept_policy(run: Run) -> PolicyOrigin | None:
 
 
 def latest_drives(run: Run) -> bool:
-    """Whether the run has learned, but never evaluated what it learned in the twin."""
+    """Tell whether the run has learned, but never evaluated what it learned in the twin."""
     latest, best = _values(run.latest), _values(run.best)
     if not latest:
         return False
@@ -68,7 +67,7 @@ def latest_drives(run: Run) -> bool:
 
 
 def run_clocks(run: Run) -> dict[str, Any]:
-    """The clocks of a run's last checkpoint: steps, updates and seconds; empty without one."""
+    """Return the last checkpoint's clocks: steps, updates and seconds; empty without one."""
     latest = _values(run.latest)
     if not latest:
         return {}

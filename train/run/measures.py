@@ -24,8 +24,10 @@ def cell_name(condition: str, block: str) -> str:
 
 
 def summary_rows(episodes: Iterable[Row]) -> list[dict[str, Any]]:
-    """Per policy, perturbation and condition, blocked aisles by partial and full: a table's rows,
-    with the `measures` of each."""
+    """Compute the `measures` per policy, perturbation and condition.
+
+    Blocked aisles are split into partial and full.
+    """
     cells: dict[tuple[str, str], dict[str, list[Row]]] = {}
     for row in episodes:
         of = cells.setdefault((row["policy"], row["perturbation"]), {})
@@ -38,7 +40,7 @@ def summary_rows(episodes: Iterable[Row]) -> list[dict[str, Any]]:
 
 
 def measures(episodes: Sequence[Row]) -> dict[str, Any]:
-    """Of the episodes of one cell; None is what none of them tells.
+    """Compute the measures of one cell's episodes; None if no episode has the value.
 
     Success is unknown of a task without a goal, the closest approach where nobody was about, time
     lost where the planner did not arrive or was not driven, the rest in files from before it was
@@ -74,7 +76,7 @@ def measures(episodes: Sequence[Row]) -> dict[str, Any]:
 
 
 def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
-    """The share of the driven time that a limiter held commands back, and of that to a stop."""
+    """Return the share of driven time that a limiter held commands back, and of that to a stop."""
     behind = [row for row in episodes if row.get("limited_s") is not None]
     time_s = sum(row["time_s"] for row in behind)
     return {
@@ -84,7 +86,7 @@ def _limited(episodes: Sequence[Row]) -> dict[str, float | None]:
 
 
 def _bumps_per_km(episodes: Sequence[Row]) -> ConfidenceInterval:
-    """All bumps over all kilometres: an episode counts by how far it went.
+    """Return all bumps over all kilometres: an episode counts by how far it went.
 
     Where nothing was touched resamples do not vary: the upper end is then that of a Poisson rate.
     """

@@ -46,7 +46,7 @@ def check_fed(
     run: Path | None,
     steps: Mapping[str, int],
 ) -> None:
-    """A batch (B, W) of another library's loop, with its TD errors (B,) where they are known.
+    """Check a batch (B, W) of another library's loop, with its TD errors (B,) if they are known.
 
     Args:
         rows: the ids of its rows, as `FeedRecord.last_batch` has them.

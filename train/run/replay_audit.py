@@ -56,12 +56,12 @@ class ReplayAudit(Sequence[ReplayAuditRecord]):
                 yield ReplayAuditRecord(**row)
 
     def to_arrow(self) -> pa.Table:
-        """The records as a table, a column a field."""
+        """Return the records as a table, with a column per field."""
         return self._table
 
 
 def replay_audit(run: Path | str) -> ReplayAudit:
-    """The replay audit of a run: `restock sql RUN "FROM replay_audit"` in Python.
+    """Return the replay audit of a run: `restock sql RUN "FROM replay_audit"` in Python.
 
     Raises:
         RunError: no run there, or one without audited rows' table.

@@ -69,7 +69,7 @@ class Run:
 
     @classmethod
     def create(cls, path: Path | str, document: Mapping[str, Any]) -> Run:
-        """A new directory with `config.json`.
+        """Create a directory with `config.json`.
 
         Raises:
             RunError: there is something at `path` already.
@@ -86,7 +86,7 @@ class Run:
 
     @classmethod
     def open(cls, path: Path | str) -> Run:
-        """An existing run.
+        """Open an existing run.
 
         Raises:
             RunError: there is none at `path`, or of a format this version does not know. What is
@@ -154,7 +154,7 @@ class Run:
         self._pending[table].append(_to_table(columns, TABLES[table]))
 
     def table(self, name: str) -> pa.Table:
-        """A table with all rows appended so far, flushed or not.
+        """Return a table with all rows appended so far, flushed or not.
 
         Raises:
             RunError: its file is damaged, or a run has no such table.
@@ -170,7 +170,7 @@ class Run:
         return written
 
     def _flushed(self, name: str) -> pa.Table:
-        """A table without what was appended since; of an opened run read when it is asked for."""
+        """Return a table without what was appended since; an opened run reads it on request."""
         if name not in self._written:
             file, schema = self.path / f"{name}.parquet", TABLES[name]
             self._written[name] = (
@@ -235,8 +235,10 @@ class Run:
 
 
 def check_free(path: Path, remedy: str | None = None) -> None:
-    """Raises RunError when there is something at `path` that a new run would overwrite, or when no
-    run can be made there; `remedy` is what to do about a run that is there."""
+    """Raise RunError if `path` is taken, or no run can be made there.
+
+    `remedy` is what to do about a run that is there.
+    """
     expect_place(path, RunError)
     if path.exists() and (not path.is_dir() or any(file.name != LOCK for file in path.iterdir())):
         raise RunError(
@@ -248,12 +250,12 @@ def check_free(path: Path, remedy: str | None = None) -> None:
 
 
 def resuming(path: Path) -> str:
-    """The command that continues a run, to be pasted in a shell."""
+    """Return the command that continues a run, to be pasted in a shell."""
     return f"`restock train --resume {quoted(path)}`"
 
 
 def software_versions() -> dict[str, str]:
-    """What decides a run's numbers besides its config."""
+    """Return the versions that decide a run's numbers besides its config."""
     from platform import python_version
 
     from restock import __version__
@@ -267,7 +269,7 @@ def software_versions() -> dict[str, str]:
 
 
 def panel_document(panel: Panel) -> dict[str, Any]:
-    """What a run's `config.json` says of its panel, for every library."""
+    """Return the part of a run's `config.json` about its panel, for every library."""
     header = panel.header
     return {
         "path": str(panel.path.resolve()),
@@ -320,7 +322,7 @@ class RunLock:
     """Taken when it is made, until `release`."""
 
     def __init__(self, run: Path) -> None:
-        """Raises RunError: another process trains this run; names it."""
+        """Take the lock; raise RunError if another process trains this run."""
         run.mkdir(parents=True, exist_ok=True)
         self._path = run / LOCK
         self._file: int | None = None

@@ -23,7 +23,7 @@ from restock.train.run.run import Run
 
 
 def profile_document(profile: Profile) -> dict[str, object]:
-    """What a run's `config.json` says of its profile, for every library."""
+    """Return the part of a run's `config.json` about its profile, for every library."""
     return {
         "task_hash": profile.task.hash,
         "actions": profile.task.action_names,
@@ -34,7 +34,7 @@ def profile_document(profile: Profile) -> dict[str, object]:
 
 
 def profile_of_run(run: Run) -> Profile:
-    """The profile that a run was trained with: the text that it keeps.
+    """Return the profile that a run was trained with: the text that it keeps.
 
     Raises:
         RunError: that text cannot be read.
@@ -55,13 +55,13 @@ def profile_of_run(run: Run) -> Profile:
 
 
 def carries_profile(panel: Panel, name: str) -> bool:
-    """Whether this names the profile that the panel carries, and no other."""
+    """Tell whether `name` is the profile that the panel carries."""
     own = panel.header.profile_toml and name == panel.header.profile
     return bool(own) and name not in shipped_profiles() and not Path(name).is_file()
 
 
 def profile_of_panel(panel: Panel) -> Profile:
-    """The profile whose task the panel's rows are of, where no other is named.
+    """Return the profile of the task of a panel's rows, if no other is named.
 
     Raises:
         PanelError: the panel carries none that can be used, and none that comes with Restock has
@@ -76,7 +76,7 @@ def profile_of_panel(panel: Panel) -> Profile:
 def carried_profile(
     name: str, text: str, task_hash: str, where: str, option: str, error: type[RestockError]
 ) -> Profile:
-    """The profile of a task: the `text` that its rows carry, else one that comes with Restock.
+    """Return the profile of a task: the `text` that its rows carry, else one that Restock ships.
 
     `option` says how another is given.
 
@@ -112,7 +112,7 @@ def carried_profile(
 
 
 def run_panel(document: Mapping[str, Any]) -> Panel | None:
-    """The panel that a run learnt from, by its `config.json`; None where it had none.
+    """Open the panel that a run learnt from, by its `config.json`; None if it had none.
 
     Raises:
         PanelError: it cannot be read, or another one is in its place.

@@ -33,7 +33,7 @@ class Critic:
 
 
 def critic_along(path: str | Path, moment: Moment) -> Critic:
-    """What a run's critic says of a moment's steps.
+    """Compute what a run's critic says of a moment's steps.
 
     The target is that of one step, by the target network of the last checkpoint; a run of which
     only its best policy is left bootstraps from that.
@@ -58,7 +58,7 @@ def critic_along(path: str | Path, moment: Moment) -> Critic:
 
 
 def _packed(moment: Moment, discount: float) -> F32:
-    """The steps as rows of a batch, (T, 2D + 3)."""
+    """Pack the steps as rows of a batch, (T, 2D + 3)."""
     after = np.asarray(moment.column("next_observation"), np.float32)
     goes_on = ~np.asarray(moment.column("terminated"), np.bool_)
     last = np.stack(

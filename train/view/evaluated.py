@@ -55,7 +55,7 @@ class Beside:
 
 
 def evaluated_moment(run: Path, name: str, *, begins_ns: int) -> Evaluated:
-    """An episode of the agent's evaluation on unperturbed missions, driven again.
+    """Drive an episode of the agent's evaluation on unperturbed missions again.
 
     Args:
         run: whose evaluation; its kept policy drives.
@@ -121,7 +121,7 @@ def evaluated_moment(run: Path, name: str, *, begins_ns: int) -> Evaluated:
 
 
 def _recorded(plan: EvaluationPlan, name: str) -> dict[str, Any]:
-    """The row of the evaluation that is meant."""
+    """Return the row of the evaluation that `name` means."""
     version = make_policy("agent", plan).version
     rows: list[dict[str, Any]] = [
         row

@@ -60,8 +60,10 @@ _Shown = tuple[int, str, str, Any]
 def write_mcap(
     stream: BinaryIO, moment: Moment, critic: Critic | None, beside: Beside | None = None
 ) -> dict[str, tuple[str, int]]:
-    """Write the moment, and an episode of an evaluation beside it; returns of each topic its type
-    and how many messages it holds."""
+    """Write the moment, and an episode of an evaluation beside it.
+
+    Returns the type and the number of messages of each topic.
+    """
     writer = Writer(stream, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library="restock")
     counts, types = Counter[str](), dict[str, str]()
@@ -101,7 +103,7 @@ def write_mcap(
 def _own_channel(
     writer: Writer, channel: Channel, schemas: dict[tuple[str, bytes], int]
 ) -> int | None:
-    """A channel of the recording, in this file; None where nobody says what its messages are."""
+    """Register a channel of the recording in this file; None if its message type is unknown."""
     definition, form, kind = channel.definition, channel.definition_format, channel.type
     if not definition:  # an older bag: what the distribution defines
         if channel.encoding != "cdr" or kind not in typestore().types:
@@ -178,7 +180,7 @@ def _shown(moment: Moment, critic: Critic | None, side: _Side, reported: str) ->
 
 
 def _recorded(moment: Moment, side: _Side) -> Iterator[_Shown]:
-    """The scan, plan and goal that the profile read, where they are new."""
+    """Yield the scan, plan and goal that the profile read, whenever they are new."""
     if moment.seen is None:
         return
     seen, before, ordered, drawn = moment.seen, None, None, -1
@@ -212,7 +214,7 @@ def _recorded(moment: Moment, side: _Side) -> Iterator[_Shown]:
 
 
 def _beside(beside: Beside) -> Iterator[_Shown]:
-    """The episode of the evaluation: what the logged one has, and what only a twin knows."""
+    """Yield the evaluation's episode: what the logged one has, and what only a twin knows."""
     evaluated, side = beside.evaluated, _EVALUATED
     moment = evaluated.moment
     reported = about_evaluated(evaluated, beside.critic)
@@ -348,7 +350,7 @@ if TYPE_CHECKING:  # it needs the twin and its physics
 
 
 def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str]:
-    """What is said of a step in words: labels, driver, action."""
+    """Return a step's texts: labels, driver, action."""
     step, names = moment.steps[index], moment.task.action_names
     texts = {
         "condition": step["condition"],
@@ -363,12 +365,12 @@ def texts_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, str
 
 
 def _conditions(names: list[str] | None) -> str:
-    """All that a step is labelled as; nothing where nobody labelled it."""
+    """Join the labels of a step; empty if nobody labelled it."""
     return "" if names is None else ", ".join(names) or "nominal"
 
 
 def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, float]:
-    """What is plotted of a step, as far as the store has it."""
+    """Return a step's numbers to plot, as far as the store has them."""
     step = moment.steps[index]
     names = {
         "reward": "reward",
@@ -391,7 +393,7 @@ def numbers_of(moment: Moment, critic: Critic | None, index: int) -> dict[str, f
 
 
 def about(moment: Moment, critic: Critic | None) -> str:
-    """Which transition the moment is about, as JSON."""
+    """Return as JSON which transition the moment is about."""
     keys = ("transition_id", "episode_id", "step_index", "stamp_ns", "condition", "zone")
     reported = {key: moment.at[key] for key in (*keys, "behaviour_policy", "reward", "source_file")}
     if critic is not None:
@@ -400,7 +402,7 @@ def about(moment: Moment, critic: Critic | None) -> str:
 
 
 def about_evaluated(evaluated: Evaluated, critic: Critic | None) -> str:
-    """Which episode of an evaluation it is, and how it went, as JSON."""
+    """Return as JSON which episode of an evaluation it is, and how it went."""
     keys = ("condition", "block", "episode_seed", "layout", "version", "success", "failure")
     reported = {key: evaluated.outcome[key] for key in (*keys, "bumps", "time_s", "return")}
     if critic is not None:

@@ -85,7 +85,7 @@ def write_view(
 
 
 def check_view(path: Path) -> None:
-    """Raises ConfigError where nothing can be written to `path`: before anything is looked up."""
+    """Raise ConfigError if nothing can be written to `path`, before anything is looked up."""
     if path.suffix != ".mcap":
         raise ConfigError(
             f"{path.name!r} must end in .mcap",
@@ -99,12 +99,12 @@ def check_view(path: Path) -> None:
 
 
 def layout_of(path: Path) -> Path:
-    """Where the Foxglove layout of a file lies."""
+    """Return where the Foxglove layout of a file lies."""
     return path.with_suffix(".foxglove.json")
 
 
 def _beside(options: ViewOptions, moment: Moment) -> Beside | None:
-    """The episode of the evaluation that was asked for, from the moment's beginning on."""
+    """Drive the requested episode of the evaluation, from the moment's beginning on."""
     if options.beside is None:
         return None
     if options.beside_run is None:
@@ -156,7 +156,7 @@ _DRAWN: dict[str, dict[str, Any]] = {
 def foxglove_layout(
     topics: Mapping[str, str], floors: Mapping[str, tuple[str, tuple[float, float]]]
 ) -> dict[str, Any]:
-    """A layout to import in Foxglove.
+    """Make a layout to import in Foxglove.
 
     Args:
         topics: those of the file -> their types; what is not among them is not shown.
@@ -224,7 +224,7 @@ def foxglove_layout(
 
 
 def _both(topic: str) -> tuple[str, str]:
-    """Of the logged episode, and of the evaluation's."""
+    """Return the topic of the logged episode, and that of the evaluation's."""
     return topic, topic.replace("/restock/", _EVALUATION)
 
 

@@ -42,7 +42,7 @@ class OpeSteps:
     bumped_before: Bools  # (N,) a contact in the episode up to t
 
     def measured(self, measure: Measure) -> OpeSteps:
-        """The same rows with what is measured as their reward.
+        """Return the same rows with the measure as their reward.
 
         `return` is the task's own reward. `success` is 1 on reaching the goal and 0 else, and a
         contact ends the episode: discounted by 1 it is the probability to arrive without any.
@@ -154,12 +154,12 @@ def load_ope_dataset(
 
 
 def _unsplit(trained: Panel | None) -> bool:
-    """Whether a panel's logs had nothing to spare."""
+    """Tell whether a panel's logs had no rows to hold out."""
     return trained is not None and not trained.splits and bool(trained.header.split_note)
 
 
 def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
-    """Whether some of these rows' goals are where the robot got to."""
+    """Tell whether some of these rows' goals are where the robot got to."""
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         ((found,),) = connection.sql(
             "SELECT coalesce(bool_or(goal_source = 'hindsight'), false) FROM transitions"
@@ -169,7 +169,7 @@ def _by_hindsight(connection: duckdb.DuckDBPyConnection, ids: Ints) -> bool:
 
 
 def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, Ints]:
-    """The store of the logs, and the ids of the rows in question."""
+    """Open the store of the logs, and return the ids of the rows in question."""
     panel = trained
     if logs is not None:
         location = Location.of(logs)
@@ -196,7 +196,7 @@ def _open(logs: str | None, trained: Panel | None, task: Task) -> tuple[Store, I
 
 
 def held_out_of(panel: Panel) -> Ints:
-    """The ids (n,) of the rows that a panel holds out. Raises PanelError where they are damaged."""
+    """Return the ids (n,) of held-out rows of a panel; raise PanelError if they are damaged."""
     split = panel.path / EVALUATION_SPLIT
     panel.header.files[EVALUATION_SPLIT].check(split, verify=True)
     table = read_table(split, columns=["transition_id"], error=PanelError)
@@ -204,7 +204,7 @@ def held_out_of(panel: Panel) -> Ints:
 
 
 def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
-    """What a panel holds out of its first store; of one behaviour policy where it is named.
+    """Return the held-out rows of a panel's first store; of one behaviour policy if it is named.
 
     Raises:
         StoreError, PanelError: the store or the list of rows is no longer there.
@@ -223,7 +223,7 @@ def held_out_rows(panel: Panel, driver: str | None = None) -> Transitions:
 
 
 def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
-    """The rows of these ids, by recording, episode and step."""
+    """Read the rows of these ids, by recording, episode and step."""
     query = files(__package__).joinpath("episodes.sql").read_text(encoding="utf-8")
     with passed_in(connection, wanted=pa.table({"transition_id": ids})):
         table = connection.sql(query).to_arrow_table()
@@ -252,14 +252,14 @@ def read_steps(connection: duckdb.DuckDBPyConnection, ids: Ints) -> OpeSteps:
 
 
 def _matrix(column: pa.ChunkedArray) -> F32:
-    """A list column of N rows as (N, D)."""
+    """Return a list column of N rows as (N, D)."""
     lists = column.combine_chunks()
     flat = np.array(lists.flatten().to_numpy(zero_copy_only=False), np.float32)
     return flat.reshape(len(lists), -1) if len(lists) else np.zeros((0, 0), np.float32)
 
 
 def panel_store(panel: Panel) -> Store:
-    """The store of a panel, at its version. Raises StoreError where it was kept nowhere."""
+    """Open the store of a panel, at its version; raise StoreError if no store was kept."""
     if panel.store_version < 0:
         raise StoreError(
             "was mixed from a table in memory: its held-out rows were not stored",
@@ -270,7 +270,7 @@ def panel_store(panel: Panel) -> Store:
 
 
 def _unseen(store: Store, trained: Panel, ids: Ints) -> tuple[Ints, int]:
-    """Those of the rows whose episode has no row in the panel; and how many episodes had.
+    """Return the rows whose episode has no row in the panel, and how many episodes had one.
 
     An episode that shows a row of the panel again, under another id, has one.
     """

@@ -38,7 +38,7 @@ class OpeEpisodes:
         return len(self.ratio)
 
     def select(self, episodes: Bools) -> OpeEpisodes:
-        """Some of the episodes."""
+        """Select some of the episodes."""
         return replace(
             self,
             ratio=self.ratio[episodes],
@@ -52,7 +52,7 @@ class OpeEpisodes:
 
     @property
     def discounts(self) -> F64:
-        """Of each step, (T,)."""
+        """The discount of each step, (T,)."""
         return np.asarray(self.discount ** np.arange(self.reward.shape[1]), np.float64)
 
 
@@ -62,7 +62,7 @@ def once(episodes: int) -> F64:
 
 
 def log_weights(ratio: F64) -> F64:
-    """The log of each episode's product of ratios up to each step, (n, T); -inf for 0."""
+    """Return the log of each episode's product of ratios up to each step, (n, T); -inf for 0."""
     with np.errstate(divide="ignore"):
         return np.cumsum(np.log(ratio), axis=1)
 
@@ -86,17 +86,17 @@ def per_decision(logged: OpeEpisodes, counts: F64, *, weighted: bool = True) -> 
 
 
 def fitted(logged: OpeEpisodes, counts: F64) -> F64:
-    """The model's word: the mean value of the starts; `counts` (B, n) -> (B,)."""
+    """Return the model's mean value of the starts; `counts` (B, n) -> (B,)."""
     return np.asarray(counts @ logged.start_value / counts.sum(axis=1), np.float64)
 
 
 def observed(logged: OpeEpisodes, counts: F64) -> F64:
-    """What the behaviour policies got themselves; `counts` (B, n) -> (B,)."""
+    """Return what the behaviour policies achieved themselves; `counts` (B, n) -> (B,)."""
     return np.asarray(counts @ (logged.reward @ logged.discounts) / counts.sum(axis=1), np.float64)
 
 
 def effective_episodes(ratio: F64) -> F64:
-    """How many equally weighted episodes the weights are worth at each step, (T,) (Kish 1965)."""
+    """Return the effective number of episodes at each step, (T,) (Kish 1965)."""
     weight = relative_weights(ratio)
     return np.asarray(
         weight.sum(axis=0) ** 2 / np.maximum((weight**2).sum(axis=0), _TINY), np.float64
@@ -125,7 +125,7 @@ class EssGate:
         )
 
     def measure(self, logged: OpeEpisodes) -> tuple[float, int]:
-        """The least effective number of episodes, and for how many first steps it is enough."""
+        """Return the least effective number of episodes, and how many first steps have enough."""
         if not len(logged):
             return 0.0, 0
         effective = effective_episodes(logged.ratio)
