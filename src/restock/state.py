@@ -30,7 +30,7 @@ class Stateful:
     STATE_TYPES: ClassVar[Mapping[str, Any]] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
+        """Return arrays and JSON values, by the names in `STATE` (without a leading underscore)."""
         return {_key(name): saved(getattr(self, name)) for name in (*self.SAME, *self.STATE)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -173,7 +173,7 @@ def mean_over_strata(
 def difference_of_arms(
     first: NDArray[Any], second: NDArray[Any], *, confidence: float = 0.95
 ) -> ConfidenceInterval:
-    """mean(second) - mean(first) of two arms that drove the same episodes.
+    """Return mean(second) - mean(first) of two arms that drove the same episodes.
 
     Runs and episodes are crossed random effects, runs of each arm, episodes common to both (the
     pairing), so the interval holds both what another seed and what other episodes would have
@@ -298,7 +298,7 @@ def clustered_quantiles(
     resamples: int = 1000,
     confidence: float = 0.95,
 ) -> list[ConfidenceInterval]:
-    """Quantiles of values (N,) whose clusters are (N,), each value counting once.
+    """Return quantiles of values (N,) with clusters (N,), each value counting once.
 
     A quantile is the smallest value that has at least that share of the values at or below it.
     With one cluster there is nothing to resample: the ends are NaN.
@@ -328,7 +328,7 @@ def clustered_ratio(
     resamples: int = 1000,
     confidence: float = 0.95,
 ) -> ConfidenceInterval:
-    """sum(above) / sum(below) of (N,) each; a mean where `below` is ones.
+    """Return sum(above) / sum(below) of (N,) each; a mean if `below` is all ones.
 
     With one cluster there is nothing to resample: the ends are NaN.
     """

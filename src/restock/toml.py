@@ -174,7 +174,7 @@ def _item(kind: kinds.Type) -> kinds.Type | None:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and arrays of NumPy as Python's, which JSON and TOML can hold; the rest as it is."""
+    """Turn NumPy's numbers and arrays into Python's, which JSON and TOML can hold."""
     if type(value).__module__ == "numpy":
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -341,7 +341,7 @@ def _has(document: Any, keys: list[str]) -> bool:
 
 
 def _join(*parts: str) -> str:
-    """Keys with dots between them; an index stands by itself: `a.b[0].c`."""
+    """Join keys with dots; an index stands by itself: `a.b[0].c`."""
     text = ""
     for part in parts:
         part = part.lstrip(".")
@@ -350,7 +350,7 @@ def _join(*parts: str) -> str:
 
 
 def by_path(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each nested setting by its path, as `--set` names it."""
+    """Yield each nested setting by its path, as `--set` names it."""
     for key, value in settings.items():
         if isinstance(value, Mapping):
             yield from by_path(value, f"{prefix}{key}.")
@@ -400,7 +400,7 @@ def json_schema(kind: type, title: str) -> str:
 
 
 def _structs(kind: kinds.Type, seen: set[type]) -> Iterator[type]:
-    """Every struct that a type holds."""
+    """Yield every struct that a type contains."""
     if isinstance(kind, kinds.StructType):
         if kind.cls in seen:
             return

@@ -54,7 +54,7 @@ def verdict_said(verdict: str, *, decides: bool) -> str:
 
 
 def policy_words(policies: Iterable[str]) -> dict[str, str]:
-    """Policies as people read them, by the names that `restock eval --policies` takes.
+    """Return policies as people read them, by the names that `--policies` takes.
 
     `run:demo/logs-alone` is `logs alone`. Folders and files of one name are told apart by those
     that they are in.

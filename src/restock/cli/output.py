@@ -40,7 +40,7 @@ _STYLES = {
 
 @cache
 def _console_type() -> type[Console]:
-    """rich's console, which leaves it to `cli.main` what a closed pipe means (rich: exit 1)."""
+    """Return rich's console, changed to leave a closed pipe to `cli.main` (rich: exit 1)."""
     from rich.console import Console  # slow to import, and a count needs none
 
     class PipedConsole(Console):
@@ -61,7 +61,7 @@ def stdout() -> Console:
 
 
 def table_width() -> int:
-    """Columns of a table: the terminal's, or those of a file or a pipe."""
+    """Return the columns of a table: the terminal's, or those of a file or a pipe."""
     return stdout().width if sys.stdout.isatty() else PIPE_WIDTH
 
 

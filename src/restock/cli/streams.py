@@ -22,7 +22,7 @@ def substitute_what_cannot_be_shown() -> None:
 
 
 def _substituted(error: UnicodeError) -> tuple[str, int]:
-    """Lines and dots in ASCII, and other characters by their numbers, as JSON has them."""
+    """Replace lines and dots by ASCII, and other characters by their numbers, as JSON does."""
     import json
 
     if not isinstance(error, UnicodeEncodeError):

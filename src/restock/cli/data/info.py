@@ -154,7 +154,7 @@ def _names(names: list[str]) -> str:
 
 
 def _qos(profile: dict[str, Any]) -> str:
-    """reliable, volatile, 10: how many messages are kept last, or keep_all."""
+    """Describe a QoS profile, as in `reliable, volatile, 10` (messages kept) or `keep_all`."""
     kept = profile.get("history")
     if kept == "keep_last" and "depth" in profile:
         kept = str(profile["depth"])

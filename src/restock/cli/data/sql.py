@@ -126,7 +126,7 @@ class SqlCommand:
             output.print_table(rows, columns)
 
     def _prompt(self, connection: duckdb.DuckDBPyConnection) -> None:
-        """Questions one after the other: each ends with a semicolon, Ctrl-D ends it all."""
+        """Answer queries one after the other: a semicolon ends each, Ctrl-D ends the prompt."""
         from restock.cli import output
 
         with contextlib.suppress(ImportError):

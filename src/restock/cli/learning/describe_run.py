@@ -91,7 +91,7 @@ def describe_forecast(fed: dict[str, Any], config: TrainConfig) -> list[str]:
 
 
 def fed_table(fed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows for people of what the critic was fed, in % of all rows: `fed_shares`."""
+    """Return rows for people of what the critic was fed, in % of all rows (`fed_shares`)."""
     columns = {
         "natural": "natural_share",
         "wanted": "wanted_share",

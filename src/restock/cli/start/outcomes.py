@@ -105,7 +105,7 @@ def _some(lines: list[str], most: int = 3) -> list[str]:
 
 
 def coverage(document: Document) -> list[str]:
-    """Rows that hold each condition."""
+    """Count the rows that hold each condition."""
     rows = document["rows"]
     held = [f"{row['condition']} {row['rows_held']:,}" for row in rows if row["rows_held"]]
     none = [row["condition"] for row in rows if row["rows_held"] == 0]
@@ -130,7 +130,7 @@ def audit(document: Document) -> list[str]:
 
 
 def mix(document: Document) -> list[str]:
-    """Rows and what is short."""
+    """Count the rows, and say what is short."""
     short = [line["stratum"] for line in document["strata"] if line["missing_rows"]]
     lines = [f"panel {document['id']}: {counted(document['rows'], 'row')} to learn from"]
     if held := document["evaluation_split"]["rows"]:
@@ -197,7 +197,7 @@ def train(document: Document) -> list[str]:
 
 
 def driven(document: Document) -> list[str]:
-    """Success (or return) of each policy in the twin, clean, with its interval per condition."""
+    """Show success (or return) of each policy in the twin, with intervals by condition."""
     clean = [row for row in document["results"] if row["perturbation"] == "none"]
     lines = []
     for policy in dict.fromkeys(row["policy"] for row in clean):

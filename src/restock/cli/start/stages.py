@@ -90,7 +90,7 @@ class Settings:
 
     @property
     def logs_alone(self) -> Path:
-        """The run that never drives: what fine-tuning is compared with."""
+        """Return the run that never drives, to compare fine-tuning with."""
         return self.out / "logs-alone"
 
     @property
@@ -99,7 +99,7 @@ class Settings:
 
     @property
     def uniform(self) -> Path:
-        """The run that is fed the logs as they come."""
+        """Return the run that is fed the logs as they are."""
         return self.out / "fed-uniformly"
 
     @property
@@ -123,7 +123,7 @@ class Settings:
 
     @property
     def recordings(self) -> tuple[Path, ...]:
-        """The user's files and folders."""
+        """Return the user's files and folders."""
         return tuple(Path(path) for path in self.logs)
 
     @property

@@ -235,7 +235,7 @@ class Way:
         return floor
 
     def _further_floors(self, floor: Ended) -> tuple[Path, ...]:
-        """Floors of recordings in other frames than that floor's, with room for the same."""
+        """Make floors for recordings in other frames, and keep those with room for the same."""
         kinds, used = set(floor.document.get("episodes", [])), []
         left = list(floor.document.get("elsewhere", [])) if kinds else []
         for number in range(2, MAX_FLOORS + 1):

@@ -206,7 +206,7 @@ class _Both:
 
 
 def escape(text: str) -> str:
-    """Text as it is, for a console that reads markup."""
+    """Escape text for a console that reads markup."""
     return visible(text, keep="\n").replace("[", r"\[")
 
 

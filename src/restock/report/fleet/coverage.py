@@ -55,7 +55,7 @@ def coverage_facts(store: Store) -> dict[str, Rows]:
 def coverage_page(
     found: dict[str, Rows], gaps: dict[str, Any], drift: Drift | str
 ) -> dict[str, Any]:
-    """Everything the template asks for.
+    """Return everything that the page's template needs.
 
     Args:
         found: of `coverage_facts`.

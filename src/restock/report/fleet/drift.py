@@ -37,7 +37,7 @@ _SCOPE = {
 
 
 def drift_page(drift: Drift) -> dict[str, Any]:
-    """Everything the page's template asks for."""
+    """Return everything that the page's template needs."""
     robots = {row["robot"] for row in drift.periods}
     periods = {row["period"] for row in drift.periods}
     own = drift.own

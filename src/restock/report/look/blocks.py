@@ -38,17 +38,17 @@ class Figure:
 
     @property
     def widest(self) -> str:
-        """The SVG at its widest."""
+        """Return the SVG at its widest."""
         return self.drawing.svg[max(self.drawing.svg)]
 
     @property
     def kind(self) -> str:
-        """A class of CSS: half of a line, or all of it."""
+        """Return the CSS class: half of a line, or all of it."""
         return "half" if max(self.drawing.svg) < 500 else "full"
 
     @property
     def shown(self) -> list[tuple[str, str, dict[str, Any] | None]]:
-        """A class of CSS (`w470`), the SVG, and its specification where it has one."""
+        """Return the CSS class (`w470`), the SVG, and its specification if it has one."""
         drawn = sorted(self.drawing.svg.items())
         return [
             ("any" if len(drawn) == 1 else f"w{width}", svg, self.drawing.spec.get(width))

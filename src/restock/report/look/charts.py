@@ -221,7 +221,7 @@ def in_words(rows: Sequence[Row], key: str = "condition") -> list[dict[str, Any]
 
 
 def success(rows: Sequence[Row]) -> Drawing:
-    """Success with intervals: rows of cell, perturbation, policy, success, low, high."""
+    """Draw success with intervals: rows of cell, perturbation, policy, success, low, high."""
     policies = ordered(rows, "policy", POLICY_COLOURS)
     cells = list(dict.fromkeys(row["cell"] for row in rows))
     perturbations = list(dict.fromkeys(row["perturbation"] for row in rows))

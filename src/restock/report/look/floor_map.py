@@ -62,7 +62,7 @@ class FloorMap:
 
 
 def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> Drawing:
-    """Cells of x_m, y_m (their south-west corner) and rows, darker where the logs have more."""
+    """Draw cells of x_m, y_m (their south-west corner) and rows, darker with more rows."""
     most = max((row["rows"] for row in cells), default=1)
     marks = []
     for row in cells:
@@ -75,7 +75,7 @@ def visited(floor: FloorMap, cells: Sequence[Row], cell_m: float) -> Drawing:
 def events(
     floor: FloorMap, logged: Sequence[Row], failures: Sequence[Row], colours: Mapping[str, str]
 ) -> Drawing:
-    """Dots where a rare condition was logged, crosses where the agent's episodes failed."""
+    """Draw dots for logged rare conditions, and crosses where the agent's episodes failed."""
     marks = []
     for row in logged:
         x, y = floor.at(row["x_m"], row["y_m"])

@@ -72,7 +72,7 @@ def _table_lines(table: Table) -> list[str]:
 
 
 def write_figures(sections: Sequence[Section], folder: Path) -> list[Path]:
-    """Each figure as SVG and PNG, on white, named after its section and title."""
+    """Write each figure as SVG and PNG, on white, named after its section and title."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, figure in _named(sections):

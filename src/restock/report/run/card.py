@@ -275,7 +275,7 @@ def _keys(rows: Rows, *names: str) -> list[tuple[Any, ...]]:
 
 
 def _ages(rows: Rows, source: str, unit: str) -> dict[str, Any]:
-    """Quantiles of a log2 histogram: the upper end of the bucket that each falls into."""
+    """Return quantiles of a log2 histogram: the upper ends of the buckets they fall into."""
     buckets = sorted(
         (row["bucket"], float(row["rows"]))
         for row in rows
@@ -333,7 +333,7 @@ def _words(value: Any) -> str:
 
 
 def _cell(value: Any) -> str:
-    """Text that cannot leave its cell, nor be markup: names come from recordings."""
+    """Return text that cannot leave its cell or be markup: names come from recordings."""
     text = "" if value is None else str(value)
     return text.replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("\n", " ")
 

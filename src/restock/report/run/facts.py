@@ -177,9 +177,9 @@ def gather(path: Path) -> Facts:
 
 
 def _off_policy(run: Run, twin: bool) -> Rows:
-    """Estimates on held-out logs: of the policy kept, where nothing drove; else of the one before.
+    """Return estimates on held-out logs, of the kept policy if nothing drove.
 
-    Of a run in the twin they are of the policy that began to drive there (`off_policy`).
+    For a run in the twin they are of the policy that began to drive there (`off_policy`).
     """
     kept = run.path / "eval" / "off_policy.parquet"
     table = run.table("off_policy") if twin or not kept.is_file() else read_table(kept)
@@ -266,7 +266,7 @@ def mean_success(cells: Rows) -> float:
 
 
 def _by_condition(cells: Rows) -> dict[str, float]:
-    """Success by condition, over its cells."""
+    """Return success by condition, over its cells."""
     found: dict[str, list[float]] = {}
     for row in cells:
         found.setdefault(row["cell"].split(" (")[0], []).append(row["success"])

@@ -158,13 +158,13 @@ def _listed(names: list[str]) -> str:
 
 
 def _difference(row: dict[str, Any]) -> str:
-    """Points of success, with their interval."""
+    """Format points of success, with their interval."""
     low, high = _signed(row["difference_low"]), _signed(row["difference_high"])
     return f"{_signed(row['difference'])} points [{low}, {high}]"
 
 
 def _signed(value: float) -> str:
-    """Points of a share, with a minus that is one."""
+    """Format points of a share, with a true minus sign."""
     return f"{100 * value:+.0f}".replace("-", "−")
 
 

@@ -27,7 +27,7 @@ from restock.words import counted
 
 
 def page(facts: Facts) -> dict[str, Any]:
-    """Everything the template asks for."""
+    """Return everything that the page's template needs."""
     sections = [
         success(facts) if facts.twin else logs_alone.judged_section(facts),
         ways_section(facts),

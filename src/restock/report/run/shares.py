@@ -39,7 +39,7 @@ def figure(facts: Facts) -> Figure | None:
 
 
 def bars(facts: Facts) -> Rows:
-    """stratum, kind, share: of all rows that the critic was fed."""
+    """Return stratum, kind and share of all rows that the critic was fed."""
     return [
         {"stratum": words(row["stratum"]), "kind": kind, "share": row[f"{kind}_share"]}
         for row in facts.fed
@@ -147,7 +147,7 @@ def table(facts: Facts) -> Table:
 
 
 def _drawn(rows: Rows) -> Drawing:
-    """Bars on a square-root axis, so that the rare strata can be seen at all."""
+    """Draw bars on a square-root axis, so that rare strata can be seen."""
     strata = list(dict.fromkeys(row["stratum"] for row in rows))
     kinds = charts.ordered(rows, "kind", COLOURS)
 

@@ -88,7 +88,7 @@ def run_section(facts: Facts) -> Section | None:
 
 
 def gap_page(gap: TwinGap) -> dict[str, Any]:
-    """Everything the page's template asks for, of a gap alone."""
+    """Return everything that the template needs for a page about a gap alone."""
     about = gap.about
     return {
         "kicker": "gap between twin and logs",
@@ -298,7 +298,7 @@ def _signals_section(gap: TwinGap) -> Section | None:
 
 
 def _by_source(rows: Rows, value: str, *keys: str) -> dict[tuple[Any, ...], dict[str, str]]:
-    """Values of the keys -> the name of a source -> its value."""
+    """Map values of the keys to the name of a source and its value."""
     cells: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in rows:
         key = tuple(row[name] for name in keys)

@@ -30,7 +30,7 @@ def colours(arms: list[str]) -> dict[str, str]:
 
 
 def intervals(rows: Rows, arms: list[str]) -> Drawing:
-    """Success by condition: rows of arm, condition, value, low, high (None: no interval)."""
+    """Draw success by condition: rows of arm, condition, value, low, high (None: unknown)."""
     conditions = _conditions(rows)
     shown = charts.in_words(rows)
     known = [row for row in shown if row["low"] is not None]
@@ -62,13 +62,13 @@ def intervals(rows: Rows, arms: list[str]) -> Drawing:
 
 
 def differences(rows: Rows) -> Drawing:
-    """Outcomes of a comparison: difference in success by condition, perturbations side by side."""
+    """Draw differences in success by condition, perturbations side by side."""
     shown = _outcomes(rows)
     return _forest(shown, "difference", "difference in success (points)", 0.0, scale=alt.Scale())
 
 
 def improvements(rows: Rows) -> Drawing:
-    """Outcomes of a comparison: the probability that the second arm's return is higher."""
+    """Draw the probability that the second arm's return is higher."""
     shown = _outcomes(rows)
     return _forest(shown, "improvement", "P(higher return)", 0.5, scale=alt.Scale(domain=[0, 1]))
 
@@ -108,7 +108,7 @@ def _forest(rows: Rows, value: str, title: str, neutral: float, *, scale: alt.Sc
 
 
 def curves(rows: Rows, arms: list[str]) -> Drawing:
-    """Success over environment steps, a panel a condition, bands where there are intervals."""
+    """Draw success over environment steps for each condition, with bands for intervals."""
     conditions = _conditions(rows)
     shown = charts.in_words(rows)
 

@@ -23,7 +23,7 @@ _INTERVALS = (
 
 
 def comparison_page(found: dict[str, Any]) -> dict[str, Any]:
-    """Everything the template asks for.
+    """Return everything that the page's template needs.
 
     Args:
         found: a comparison's JSON values with `names` of both arms, the gate's `sentence`,

@@ -26,7 +26,7 @@ SAFETY = {
 
 
 def study_page(study: dict[str, Any], name: str = "") -> dict[str, Any]:
-    """Everything the template asks for, from a study's findings (`study.json`)."""
+    """Return everything that the template needs, from a study's findings (`study.json`)."""
     comparisons = study["comparisons"]
     refused = [one for one in comparisons if one["verdict"] != "comparable"]
     arms = list(study["runs"])
@@ -142,7 +142,7 @@ def _p(value: float | None) -> str:
 
 
 def _arms(arms: Rows, order: list[str]) -> Section | None:
-    """Success by condition of every arm and reference, and what it costs in safety."""
+    """Show success by condition of every arm and reference, and its cost in safety."""
     if not arms:
         return None
     cells = [
