@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def check_profile(profile: Profile, where: str) -> None:
-    """Raises ConfigError, naming the key, where a profile says what cannot be."""
+    """Raise ConfigError, naming the key, if a profile contradicts itself."""
     kinds: tuple[tuple[Kind, str, Sequence[str]], ...] = (
         ("outcome", "conditions", profile.shipped_conditions),
         ("exposure", "exposures", profile.shipped_exposures),
@@ -125,7 +125,7 @@ def check_profile(profile: Profile, where: str) -> None:
 
 
 def _check_goal(profile: Profile, where: str) -> None:
-    """That goals and plans come from somewhere, and from one place alone."""
+    """Check that goals and plans come from somewhere, and from one place alone."""
     if profile.task.goal == "none":
         if profile.goal.source == "hindsight":
             raise ConfigError(
@@ -172,7 +172,7 @@ def _check_goal_rules(profile: Profile, where: str) -> None:
 
 
 def _check_conditions(profile: Profile, where: str) -> None:
-    """That every condition of the profile's own binds to the steps that there will be."""
+    """Check that each condition of the profile's own binds to the columns of steps."""
     fields = [signal.field(name) for name, signal in profile.signals.items()]
     steps = steps_schema(fields).empty_table()
     for place, condition in enumerate(profile.own_conditions):

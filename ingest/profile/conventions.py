@@ -21,7 +21,7 @@ from restock.ingest.profile.signal_paths import element_of
 
 @dataclass(frozen=True)
 class Convention:
-    """How messages of one type say that some of their values are no reading.
+    """A way in which messages of one type mark values that were not measured.
 
     `read` takes values (V,) and, for each of them, what the fields `said_by` say of its message; it
     returns the values with NaN for what was not measured.
@@ -35,16 +35,16 @@ class Convention:
 
     @property
     def fields(self) -> list[str]:
-        """The field paths to read for it."""
+        """Return the field paths to read for it."""
         return [element_of(path)[0] for path in self.said_by]
 
     @property
     def of_messages(self) -> bool:
-        """Whether a message says it of all these values at once, whatever they are."""
+        """Return whether a message marks all these values at once, whatever they are."""
         return self.read is _unless_minus_one or self.read is _unless_negative
 
     def flags(self, columns: Mapping[str, FieldColumn]) -> Bools:
-        """(N,) which messages give up these values."""
+        """Return which messages (N,) give up these values."""
         said = [said_in(columns, path) for path in self.said_by]
         return np.asarray(np.isnan(self.read(np.zeros(len(said[0])), *said)), np.bool_)
 
@@ -62,7 +62,7 @@ def _unless_nan(values: F64) -> F64:
 
 
 def _within(values: F64, low: F64, high: F64) -> F64:
-    """-inf is too close to be measured (REP 117); what is outside the limits is discarded."""
+    """Return the values with NaN outside the limits; -inf is too close to be measured (REP 117)."""
     near = np.where(np.isneginf(values), low, values)
     given = (high > 0) & (low <= high)  # else the driver gives no limits
     return np.where(given & ~((near >= low) & (near <= high)), np.nan, near)

@@ -82,7 +82,7 @@ class CustomSignal(Checked, frozen=True):
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """Fields of the message at the end of the path that are read, where it is a message."""
+        """Return the fields to read of the message at the end of the path, if it is a message."""
         return QUATERNION if self.reduce == "yaw" else ()
 
     @property
@@ -91,22 +91,22 @@ class CustomSignal(Checked, frozen=True):
 
     @property
     def picks(self) -> bool:
-        """Whether it means one certain element, which a message may not have."""
+        """Return whether it means one certain element, which a message may lack."""
         return any(s.choice is not None and not s.choice.many for s in self.read.steps)
 
     def wanted(self) -> list[str]:
-        """The field paths to read for it."""
+        """Return the field paths to read for it."""
         return self.read.wanted(*self.ends)
 
     def field(self, name: str) -> pa.Field:
-        """Its column, with unit and source in the metadata."""
+        """Return its column, with unit and source in the metadata."""
         about = {"unit": self.unit, "topic": self.topic, "path": self.path, "meaning": self.doc}
         about |= {"length": str(self.length or "")}
         kind = LIST if self.is_list else NUMBER
         return pa.field(name, kind, nullable=True, metadata={k: v for k, v in about.items() if v})
 
     def problem(self, leaves: Sequence[Leaf]) -> str | None:
-        """Why messages with these fields do not have it, or None."""
+        """Say why messages with these fields lack it; None if they have it."""
         try:
             kinds = self.read.check(leaves, *self.ends)
         except PathProblem as problem:
@@ -117,7 +117,7 @@ class CustomSignal(Checked, frozen=True):
 
 
 def name_problem(name: str) -> str | None:
-    """Why a custom signal may not have this name, or None."""
+    """Say why a custom signal may not have this name; None if it may."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         return "a name consists of lower-case letters, digits and _"
     if name in _TAKEN:

@@ -86,12 +86,12 @@ _APPLIES_TO = {
 
 
 def last_part(kind: str) -> str:
-    """Of a message type, without package or namespace: "Twist" of `ros.geometry_msgs.Twist`."""
+    """Return a message type without package and namespace: "Twist" of `ros.geometry_msgs.Twist`."""
     return re.split(r"[/.:]", kind)[-1]
 
 
 def is_motion(kind: str) -> bool:
-    """Whether messages of this type say what was measured, not what was commanded."""
+    """Return whether messages of this type hold measurements and no commands."""
     return last_part(kind) == MOTION
 
 
@@ -118,7 +118,7 @@ class Input(Checked, frozen=True):
 
     @property
     def by_fix(self) -> bool:
-        """Whether it is a position by latitude and longitude."""
+        """Return whether it is a position by latitude and longitude."""
         return "latitude_deg" in self.fields
 
 
@@ -151,12 +151,12 @@ class Inputs(Checked, frozen=True):
 
     @property
     def scans(self) -> dict[str, Input]:
-        """The lidars, by name."""
+        """Return the lidars, by name."""
         return {name: source for name, source in self.items() if name in SCANS}
 
 
 def check_input(name: str, source: Input, where: str, *, framed: bool) -> None:
-    """That an input says what it must; `framed` where transforms can give its pose.
+    """Check that an input has the fields it needs; `framed` if transforms can give its pose.
 
     Raises:
         ConfigError: it does not; names the key.
@@ -212,7 +212,7 @@ def _check_settings(key: str, name: str, source: Input, where: str) -> None:
 
 
 def check_scans(scans: Mapping[str, Input], where: str) -> None:
-    """That several lidars go together.
+    """Check that the settings of several lidars go together.
 
     Raises:
         ConfigError: they do not; names the key.
@@ -275,7 +275,7 @@ def _check_wheelbase(key: str, source: Input, where: str) -> None:
 
 
 def check_command_source(key: str, source: Input, command: Input, where: str) -> None:
-    """That it says what it commands as the command does, or what is pressed while it drives.
+    """Check that a source has the command's fields, or says what is pressed while it drives.
 
     Raises:
         ConfigError: it does not; names the key.

@@ -99,17 +99,17 @@ class Profile(Checked, frozen=True):
 
     @property
     def conditions(self) -> list[Condition]:
-        """The conditions that label this robot's steps: outcomes."""
+        """Return the conditions that label this robot's steps: outcomes."""
         return self._of("outcome", self.shipped_conditions)
 
     @property
     def exposures(self) -> list[Condition]:
-        """The situations that are listed beside them."""
+        """Return the situations that are listed beside them."""
         return self._of("exposure", self.shipped_exposures)
 
     @property
     def constants(self) -> dict[str, float]:
-        """What the SQL of its conditions may name beside the columns of steps."""
+        """Return the names that the SQL of its conditions may use beside the columns of steps."""
         return self.noise.constants | self.task.condition_limits
 
     def _of(self, kind: Kind, names: Sequence[str]) -> list[Condition]:
@@ -120,7 +120,7 @@ class Profile(Checked, frozen=True):
 
     @property
     def definitions(self) -> list[Condition]:
-        """Both, conditions first."""
+        """Return both, conditions first."""
         return [*self.conditions, *self.exposures]
 
     @property
@@ -129,7 +129,7 @@ class Profile(Checked, frozen=True):
 
     @property
     def hash(self) -> str:
-        """12 hex digits of everything in the profile that rows depend on.
+        """Return 12 hex digits of everything in the profile that rows depend on.
 
         That leaves out conditions, which can be changed without the recordings (labels depend on
         `labels_version`), their [noise], whose drive it is, and what only the twin needs of it.
@@ -163,13 +163,15 @@ class Profile(Checked, frozen=True):
 
     @property
     def transform_topics(self) -> tuple[str, ...]:
-        """The topics of the transforms that `[frames]` asks for."""
+        """Return the topics of the transforms that `[frames]` needs."""
         return (self.frames.topic, self.frames.static_topic) if self.frames else ()
 
     @property
     def sources(self) -> dict[str, Input]:
-        """The inputs, and as `command_sources.NAME` those of commands, none of which is needed; nor
-        are goal and plan where the task has none."""
+        """Return the inputs, and the sources of commands as `command_sources.NAME`.
+
+        Sources are optional, as are goal and plan if the task has no goal.
+        """
         optional = {
             name: msgspec.structs.replace(source, optional=True)
             for name, source in self.inputs.items()
@@ -185,7 +187,7 @@ class Profile(Checked, frozen=True):
 
     @property
     def topics(self) -> list[str]:
-        """Every topic that the profile names."""
+        """Return every topic that the profile names."""
         named = [source.topic for source in self.sources.values()]
         named += [signal.topic for signal in self.signals.values()]
         named += [camera.topic for camera in self.cameras.values()]
@@ -193,7 +195,7 @@ class Profile(Checked, frozen=True):
 
     @property
     def fallbacks(self) -> dict[str, str]:
-        """Inputs the profile leaves out -> what is used instead of each."""
+        """Return what is used instead of each input that the profile leaves out."""
         given = dict(self.inputs.items())
         fallbacks = {name: how for name, how in FALLBACKS.items() if name not in given}
         if is_motion(self.inputs.command.type):
@@ -221,11 +223,11 @@ class Profile(Checked, frozen=True):
 
     @property
     def goal_source(self) -> GoalSource | None:
-        """Where the goals of its rows come from; None: they have none."""
+        """Return where the goals of its rows come from; None if they have none."""
         return self.goal.source if self.task.goal == "route" else None
 
     def zone_of(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> list[str]:
-        """The name of the first zone that holds each point (N,), or `elsewhere`."""
+        """Return the name of the first zone that holds each point (N,), or `elsewhere`."""
         x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
         index = np.full(x.shape, len(self.zones), np.intp)
         for position in reversed(range(len(self.zones))):
@@ -235,13 +237,13 @@ class Profile(Checked, frozen=True):
 
 
 def shipped_profiles() -> list[str]:
-    """The names of the profiles that come with Restock."""
+    """Return the names of the profiles that come with Restock."""
     folder = files("restock.ingest.profile") / "profiles"
     return sorted(e.name.removesuffix(".toml") for e in folder.iterdir() if e.name[-5:] == ".toml")
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
-    """A shipped profile by its name, or one of yours by its path.
+    """Load a shipped profile by its name, or one of yours by its path.
 
     Raises:
         ConfigError: no such profile, or its TOML says something Restock cannot use; names the
@@ -267,7 +269,10 @@ def load_profile(name_or_path: str | Path) -> Profile:
 
 
 def parse_profile(text: str, *, where: str, folder: Path | None = None) -> Profile:
-    """A profile from its TOML text; `where` names it in errors, `.sql` files lie in `folder`."""
+    """Parse a profile from its TOML text.
+
+    `where` names it in errors, `.sql` files lie in `folder`.
+    """
     return _typed(parse_toml(text, where=where), where=where, folder=folder)
 
 
@@ -288,7 +293,7 @@ def _typed(document: dict[str, Any], *, where: str, folder: Path | None) -> Prof
 
 
 def without_lidar(profile: Profile) -> Profile:
-    """The same of a robot without a lidar: no scan, and no sectors in its observation."""
+    """Return the profile of the same robot without a lidar: without scans and sectors."""
     return msgspec.structs.replace(
         profile,
         inputs=msgspec.structs.replace(profile.inputs, **dict.fromkeys(SCANS)),
@@ -297,7 +302,7 @@ def without_lidar(profile: Profile) -> Profile:
 
 
 def profile_toml(profile: Profile) -> str:
-    """The profile as TOML, every default written out; `read_profile_toml` gives an equal one."""
+    """Write the profile as TOML with every default; `read_profile_toml` gives an equal one."""
     values = _given(msgspec.to_builtins(profile))
     plain, tables = [], []
     for name, value in values.items():
@@ -312,7 +317,7 @@ def profile_toml(profile: Profile) -> str:
 
 
 def read_profile_toml(text: str, *, where: str) -> Profile:
-    """A profile from such a text; `where` names it in errors.
+    """Read a profile from such a text; `where` names it in errors.
 
     Raises:
         ConfigError: as `parse_profile`, also where the text names a file.
@@ -321,7 +326,7 @@ def read_profile_toml(text: str, *, where: str) -> Profile:
 
 
 def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profile:
-    """The same profile with other conditions; those that come with Restock go by their names."""
+    """Return the profile with other conditions; those that come with Restock go by their names."""
     known = shipped(profile.constants) | shipped(profile.constants, "exposure")
     named = [c for c in conditions if known.get(c.name) == c]
     return msgspec.structs.replace(
@@ -333,7 +338,7 @@ def with_conditions(profile: Profile, conditions: Sequence[Condition]) -> Profil
 
 
 def _given(value: Any) -> Any:
-    """Plain values without what is None: TOML has no word for it, and it is always the default."""
+    """Return plain values without None, which TOML lacks and which is always the default."""
     if isinstance(value, dict):
         return {key: _given(item) for key, item in value.items() if item is not None}
     return [_given(item) for item in value] if isinstance(value, list | tuple) else value
@@ -358,7 +363,7 @@ class NotLive:
 
 
 def not_live(profile: Profile) -> list[NotLive]:
-    """What such a profile takes that is not there on a running robot; none: it can be followed."""
+    """List what a profile takes that a running robot lacks; empty if it can be followed live."""
     found = []
     pose = profile.inputs.pose
     if profile.frames is not None:

@@ -28,7 +28,7 @@ REMEDY = "docs/robot.md says what the model must contain, and has an example"
 
 
 def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """A profile's TOML with the text of `[robot] mjcf = "my_robot.xml"` in place of its name.
+    """Replace the name in `[robot] mjcf = "my_robot.xml"` of a profile's TOML by the file's text.
 
     The name must stay in the profile's folder: profiles are passed between strangers.
 
@@ -72,7 +72,7 @@ def with_robot_file(document: dict[str, Any], folder: Path | None, where: str) -
 
 
 def mjcf_problem(text: str) -> str | None:
-    """Why this text cannot be a robot's model; None: by its form it can."""
+    """Say why this text cannot be a robot's model; None if its form allows it."""
     if len(text) > MAX_BYTES:
         return f"is longer than {MAX_BYTES:,} characters"
     if not _is_text(text):

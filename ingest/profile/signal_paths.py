@@ -39,14 +39,14 @@ class PathProblem(Exception):
 
 
 def element_of(path: str) -> tuple[str, int | None]:
-    """The list of which a path takes one element, and its place; None: it takes the whole field."""
+    """Split a path of one element into the list and its index; None for the whole field."""
     match = _ELEMENT.fullmatch(path)
     return (match[1], int(match[2])) if match else (path, None)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which elements of a repeated field a path means; `which` None is all of them."""
+    """The elements of a repeated field that a path means; `which` None is all of them."""
 
     which: int | slice | str | None
     key: str | None = None  # the field of the element that must say `which`
@@ -66,7 +66,7 @@ class Step:
 
 @dataclass(frozen=True)
 class PathValues:
-    """What a path found in N messages: V values, in the order of their messages."""
+    """The values (V,) that a path found in N messages, in the messages' order."""
 
     message: Rows  # (V,)
     values: NDArray[Any]  # (V,)
@@ -99,11 +99,11 @@ class SignalPath:
 
     @property
     def lists(self) -> int:
-        """How many of its steps mean several elements: with one or more it gives a list."""
+        """Count the steps that mean several elements: with one or more, the path gives a list."""
         return sum(step.choice is not None and step.choice.many for step in self.steps)
 
     def leaf(self, upto: int | None = None, *more: str) -> str:
-        """The field path to read for it (or for a field beside its step `upto`)."""
+        """Return the field path to read for it (or for a field beside its step `upto`)."""
         steps = self.steps[:upto]
         last = upto is None and not more
         names = [
@@ -113,7 +113,7 @@ class SignalPath:
         return ".".join([*names, *more])
 
     def beside(self) -> dict[int, str]:
-        """Place of a step -> the field that its choice looks at."""
+        """Return the field that each step's choice looks at, by the step's index."""
         names = {}
         for place, step in enumerate(self.steps):
             if step.choice is not None and isinstance(step.choice.which, str):
@@ -124,12 +124,12 @@ class SignalPath:
         return names
 
     def wanted(self, *ends: str) -> list[str]:
-        """Every field path to read; `ends` are fields of the message at the path's end."""
+        """Return every field path to read; `ends` are fields of the message at the path's end."""
         values = [f"{self.leaf(len(self.steps))}.{end}" for end in ends] or [self.leaf()]
         return [*values, *self.beside().values()]
 
     def check(self, leaves: Sequence[Leaf], *ends: str) -> list[str]:
-        """The kinds (`float64`, `string`, …) that it finds in messages with these fields.
+        """Return the kinds (`float64`, `string`, …) that it finds in messages with these fields.
 
         Raises:
             PathProblem: there is no such field, or it repeats where the path says nothing.
@@ -163,7 +163,7 @@ class SignalPath:
         return [kinds[path] for path in self.wanted(*ends)[: max(len(ends), 1)]]
 
     def find(self, columns: Mapping[str, FieldColumn], end: str | None = None) -> PathValues:
-        """The values it means in these columns (those of `wanted`)."""
+        """Return the values that it means in these columns (those of `wanted`)."""
         names = self.beside()
         path = self.leaf() if end is None else f"{self.leaf(len(self.steps))}.{end}"
         column, beside = columns[path], {place: columns[name] for place, name in names.items()}
@@ -214,7 +214,7 @@ def pressed_in(columns: Mapping[str, FieldColumn], text: str, count: int) -> NDA
 
 
 def _choice(text: str) -> Choice:
-    """What stands between brackets."""
+    """Parse the text between brackets."""
     text = text.strip()
     if not text:
         return Choice(None)
@@ -232,7 +232,10 @@ def _choice(text: str) -> Choice:
 
 
 def _open(column: FieldColumn) -> tuple[Rows, Rows, FieldColumn]:
-    """A column of repeated fields as its elements: their parents, places in them, and values."""
+    """Flatten a column of repeated fields.
+
+    Returns the parents of its elements, their indices, and values.
+    """
     if isinstance(column, Ragged):
         parent = np.repeat(np.arange(len(column)), column.lengths)
         return parent, np.arange(len(parent)) - column.offsets[:-1][parent], column.values
@@ -244,7 +247,7 @@ def _open(column: FieldColumn) -> tuple[Rows, Rows, FieldColumn]:
 def _chosen(
     choice: Choice, parent: Rows, position: Rows, beside: FieldColumn | None, parents: int
 ) -> Rows:
-    """Which of these elements are meant, in their order."""
+    """Return the rows of the chosen elements, in their order."""
     which = choice.which
     if which is None:
         return np.arange(len(parent))
@@ -283,7 +286,7 @@ def _says(values: NDArray[Any], text: str) -> NDArray[np.bool_]:
 
 
 def _first(rows: Rows, parent: Rows) -> Rows:
-    """Of these elements the first of each parent."""
+    """Return the first element of each parent."""
     return rows[np.unique(parent[rows], return_index=True)[1]]
 
 
@@ -292,7 +295,7 @@ def _bare(path: str) -> str:
 
 
 def offer(path: str, paths: list[str]) -> str:
-    """That a path is not there, and what is."""
+    """Say that a path is not there, and offer those that are."""
     bare = {_bare(known): known for known in paths}
     ends = {known.split(".")[-1]: known for known in paths}
     near = [bare[name] for name in get_close_matches(_bare(path), bare, n=3)]

@@ -54,8 +54,10 @@ class Motion(Checked, frozen=True):
 
 
 class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has what is given
-    """A named rectangle of the map: `box_m = [x0, y0, x1, y1]`, turned about its middle by
-    `yaw_rad`, counter-clockwise."""
+    """A named rectangle of the map.
+
+    `box_m = [x0, y0, x1, y1]` is turned about its middle by `yaw_rad`, counter-clockwise.
+    """
 
     name: str
     box_m: tuple[float, float, float, float]
@@ -67,7 +69,7 @@ class Zone(Checked, frozen=True, omit_defaults=True):  # a profile's hash has wh
             raise ValueError(f"box_m must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1: {self}")
 
     def holds(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which points (N,) lie in it, its edges included."""
+        """Return which points (N,) lie in it, its edges included."""
         x0, y0, x1, y1 = self.box_m
         if self.yaw_rad:
             middle_x, middle_y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -87,7 +89,7 @@ class Camera(Checked, frozen=True):
 
 
 def camera_name_problem(name: str) -> str | None:
-    """Why a camera may not have this name, or None."""
+    """Say why a camera may not have this name; None if it may."""
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name):
         return "a name consists of lower-case letters, digits and _, and begins with a letter"
     return None

@@ -49,7 +49,7 @@ class TagRules(Checked, frozen=True):
         return [self.from_path] if isinstance(self.from_path, str) else self.from_path
 
     def of_path(self, path: Path, given: Collection[str]) -> dict[str, dict[str, str]]:
-        """What the path says, by the pattern that says so; nothing without a pattern.
+        """Return the tags of a path, by the pattern that gives them; empty without a pattern.
 
         Raises:
             RecordingError: no pattern matches, and `given` leaves open what they would say.
@@ -76,7 +76,7 @@ class TagRules(Checked, frozen=True):
     def of_metadata(
         self, said: Sequence[Said], given: Collection[str], where: str
     ) -> tuple[dict[str, dict[str, str]], list[str]]:
-        """What a recording says of itself, by where it does, and what there is to say of the rest.
+        """Return the tags in a recording's metadata, by their source, and notes on the rest.
 
         Raises:
             RecordingError: it contradicts itself about a tag that is not `given`.
@@ -113,7 +113,7 @@ class TagRules(Checked, frozen=True):
         ]
 
     def _names(self, record: str, key: str) -> list[str]:
-        """The tags that an entry of the metadata is."""
+        """Return the tags that an entry of the metadata gives."""
         wanted = (key, f"{record}.{key}")
         requested = [name for name, source in self.from_metadata.items() if source in wanted]
         return requested or [key] * (key not in self.from_metadata)
@@ -134,7 +134,7 @@ def resolve_tags(
     given: Mapping[str, str],
     before: Mapping[str, str],
 ) -> Told:
-    """The tags of one recording.
+    """Return the tags of one recording.
 
     Args:
         rules: of its profile.
@@ -174,7 +174,7 @@ def _contradiction(
 
 @cache
 def path_pattern(pattern: str) -> re.Pattern[str]:
-    """The regular expression of absolute paths that a `from_path` stands for.
+    """Compile a `from_path` into a regular expression of absolute paths.
 
     Raises:
         ValueError: the pattern cannot be read; says why.
@@ -202,7 +202,7 @@ def path_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def _parts(pattern: str) -> Iterator[str]:
-    """A pattern between its slashes; those in braces are of a regular expression."""
+    """Split a pattern at its slashes, except those of regular expressions in braces."""
     depth, part = 0, ""
     for letter in pattern:
         depth += (letter == "{") - (letter == "}")
@@ -217,7 +217,7 @@ def _parts(pattern: str) -> Iterator[str]:
 
 
 def _of_part(part: str, pattern: str) -> str:
-    """The regular expression of one part of a path."""
+    """Return the regular expression of one part of a path."""
     text, rest = "", part
     while rest:
         if rest.startswith("{"):
@@ -238,7 +238,7 @@ def _of_part(part: str, pattern: str) -> str:
 
 
 def _closing(text: str) -> int:
-    """Where the brace that a text begins with is closed."""
+    """Return the index of the brace that closes the one a text begins with."""
     depth = 0
     for place, letter in enumerate(text):
         depth += (letter == "{") - (letter == "}")

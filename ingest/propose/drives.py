@@ -60,19 +60,19 @@ class Drives:
 
     @property
     def unread(self) -> list[Path]:
-        """Those of the first kind that the proposal does not read."""
+        """Return the recordings of the first kind that the proposal does not read."""
         return [self.paths[one] for one in self.kinds[0] if one not in self.read]
 
     @property
     def others(self) -> list[tuple[Path, RobotTraits]]:
-        """Those of other kinds, and what they say of their robot."""
+        """Return the recordings of other kinds, with the traits of their robots."""
         return [
             (self.paths[one], self.traits[one]) for kind in self.kinds[1:] for one in sorted(kind)
         ]
 
     @property
     def robots(self) -> list[RobotKind]:
-        """Every kind with all its recordings, where there are several."""
+        """Return every kind with all its recordings, if there are several."""
         return [
             RobotKind(str(self.traits[kind[0]]), [str(self.paths[one]) for one in kind])
             for kind in self.kinds
@@ -83,8 +83,9 @@ class Drives:
 def drives_by_kind(
     paths: Sequence[Path], traits: Sequence[RobotTraits], *, most: int = MAX_DRIVES
 ) -> Drives:
-    """The kinds of these recordings, and of the one with most drives that have a command at most so
-    many to read: the largest, those with a command first.
+    """Sort recordings into kinds, and choose what to read of the kind with most drives.
+
+    It reads at most `most` drives, those with a command and the largest first.
 
     Raises:
         RecordingError: there is no recording.
@@ -108,7 +109,7 @@ def propose_for_drives(
     odometry_as_command: bool = False,
     hindsight_goals: bool = False,
 ) -> Proposal:
-    """One profile for all of these recordings, as `propose_profile` makes it for one.
+    """Propose one profile for all of these recordings, as `propose_profile` does for one.
 
     Args:
         recordings: drives of one kind of robot; of several kinds those of the first are taken that
@@ -187,7 +188,7 @@ def _bytes(path: Path) -> int:
 
 
 def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
-    """What one drive says, with what is the robot's from all of them."""
+    """Return the evidence of one drive, with what belongs to the robot from all of them."""
     driven = [one for one in drives if one.commands.topic == base.commands.topic]
     described = max(drives, key=lambda one: len(one.robot.values))
     clocks = [one.clock for one in driven]
@@ -228,7 +229,7 @@ def pooled(base: Evidence, drives: Sequence[Evidence]) -> Evidence:
 
 
 def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
-    """The fastest of the commands of all drives."""
+    """Return the fastest of the commands of all drives."""
     driven = [one for one in drives if one.commands.count]
     if not driven:
         return base
@@ -248,7 +249,7 @@ def _commands(base: Commands, drives: Sequence[Evidence]) -> Commands:
 
 
 def _hold(drives: Sequence[CommandHold]) -> CommandHold:
-    """The longest that any drive shows; a command to stop holds where all say so."""
+    """Return the longest hold that any drive shows; a command to stop holds if all say so."""
     reported = [one for one in drives if one.comments]
     if not reported:
         return CommandHold()
@@ -257,7 +258,7 @@ def _hold(drives: Sequence[CommandHold]) -> CommandHold:
 
 
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
-    """A drive of each clock and source of poses that is proposed, the fullest first.
+    """Return a drive of each proposed clock and source of poses, the fullest first.
 
     Where one drive was told what to do far more often than another, a tick a command would be
     another time in each: then there is a tick every period, the middle one of the drives.
@@ -290,14 +291,14 @@ def _on_map(one: Evidence) -> bool:
 
 
 def _fullness(one: Evidence) -> tuple[int, int, float]:
-    """How many of the inputs that decide it has, how many of all, and for how long it drove."""
+    """Count the deciding inputs that it has and all its inputs, with how long it drove."""
     located = bool(one.roles["pose"]) or one.poses_from_frames
     deciding = sum((bool(one.roles["command"]), located, bool(one.roles["wheels"])))
     return deciding, sum(map(bool, one.roles.values())), one.driven_s
 
 
 def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives) -> list[str]:
-    """What comes of each drive, and which were not read, as comments."""
+    """Say as comments what comes of each drive, and which were not read."""
     rows = f"by what they say: {sum(trial.transitions for trial in trials):,} transitions."
     of, unread = len(drives.kinds[0]), drives.unread
     number = f"the {len(evidence)} largest of {of:,} drives" if unread else f"{of:,} drives"
@@ -315,18 +316,18 @@ def _lines(evidence: Sequence[Evidence], trials: Sequence[Trial], drives: Drives
 
 
 def names_of(paths: Sequence[Path]) -> str:
-    """The first of these recordings by name, and how many more there are."""
+    """Name the first of these recordings, and say how many more there are."""
     more = f" and {len(paths) - MAX_NAMED:,} more" if len(paths) > MAX_NAMED else ""
     return ", ".join(map(_name, paths[:MAX_NAMED])) + more
 
 
 def _name(path: Path) -> str:
-    """Two parts of its path: bags of several robots often have the same names."""
+    """Return two parts of a path, as bags of several robots often have the same names."""
     return "/".join(path.parts[-2:])
 
 
 def _in_another(missing: Sequence[str], drives: Sequence[Evidence]) -> list[str]:
-    """Of what the profile's own drive lacks, which other one has it, without the rest."""
+    """Say which other drive has what the profile's own drive lacks."""
     found = []
     for role, lacks in (("pose", "command"), ("command", "pose")):
         for one in drives if role in missing else ():

@@ -44,7 +44,7 @@ ON_WHEELS = "Restock is for wheeled robots: give a recording of one, with its ve
 
 @dataclass(frozen=True)
 class Lidar:
-    """What scans say of the lidar that made them."""
+    """A lidar, as its scans describe it."""
 
     frame: str
     beams: int
@@ -72,7 +72,7 @@ class Lidar:
 
 @dataclass(frozen=True)
 class RobotTraits:
-    """What one recording says of its robot; None and "" where it says nothing."""
+    """The traits of a robot in one recording; None and "" if it does not show them."""
 
     command: str  # type of the topic that drives it
     frames: str  # of its odometry: "odom -> base_link"
@@ -83,7 +83,7 @@ class RobotTraits:
     topics: frozenset[tuple[str, str]]  # all of them
 
     def fits(self, other: RobotTraits) -> bool:
-        """Whether both may be one kind of robot, and something tells that they are."""
+        """Return whether both may be one kind of robot, and something shows that they are."""
         for mine, its in (
             (self.command, other.command),
             (self.frames, other.frames),
@@ -112,7 +112,7 @@ class RobotTraits:
 
 
 def robot_traits(recording: Recording) -> RobotTraits:
-    """What a recording says of its robot; reads a few scans and poses of it."""
+    """Read the traits of a recording's robot, from a few of its scans and poses."""
     topics = usable_topics(recording)
     roles = {
         role: topics_for(recording, topics, KINDS[role]) for role in ("command", "pose", "wheels")
@@ -139,7 +139,7 @@ def robot_traits(recording: Recording) -> RobotTraits:
 
 
 def robot_kinds(traits: Sequence[RobotTraits]) -> list[list[int]]:
-    """The recordings of each kind, by their place in `traits`; every one is in exactly one kind.
+    """Group the recordings by kind, as indices of `traits`; each is in exactly one kind.
 
     Kinds are in the order of their first recording.
     """
@@ -186,7 +186,9 @@ __all__ = ["RobotTraits", "robot_kinds", "robot_traits"]
 def no_wheeled_robot(
     recording: Recording, command: Sequence[tuple[TopicInfo, Kind]], *, located: bool
 ) -> str | None:
-    """What a recording is taken for that is of no robot on wheels, and what to do; else None.
+    """Say what a recording is taken for that is not of a robot on wheels, and what to do.
+
+    Else None.
 
     `command` are the topics that may drive it, `located` whether anything says where it is.
     """
@@ -225,7 +227,7 @@ def no_wheeled_robot(
 
 
 def _rises_m(recording: Recording) -> float:
-    """How far the poses of a recording go up and down; 0 where there are none."""
+    """Return how far the poses of a recording go up and down; 0 if there are none."""
     rises = [0.0]
     for topic, kind in topics_for(recording, usable_topics(recording), KINDS["pose"]):
         path = kind.fields.get("x_m", "").removesuffix("x") + "z"
@@ -237,7 +239,7 @@ def _rises_m(recording: Recording) -> float:
 
 
 def _lifted(recording: Recording, command: Sequence[tuple[TopicInfo, Kind]]) -> bool:
-    """Whether the command that drives asks for speed upward."""
+    """Return whether the driving command asks for speed upward."""
     if not command:
         return False
     topic, kind = command[0]

@@ -36,7 +36,7 @@ from restock.toml import toml_value
 
 
 def node_lines(seen: Evidence, lines: Sequence[str]) -> list[str]:
-    """The tables for those of the node's topics that were recorded, besides the proposal's own.
+    """Write the tables for the node's recorded topics that the proposal does not have yet.
 
     Args:
         seen: with the node's topics.
@@ -70,7 +70,7 @@ def node_lines(seen: Evidence, lines: Sequence[str]) -> list[str]:
 
 
 def _given(table: msgspec.Struct) -> list[str]:
-    """The keys of a table that are not at their defaults."""
+    """Write the keys of a table that are not at their defaults."""
     values = msgspec.to_builtins(table)
     return [
         f"{one.name} = {toml_value(values[one.encode_name])}"
@@ -84,7 +84,7 @@ BY_HAND = {"command": ("speed_mps", "yaw_rate_radps"), "pose": ("x_m", "y_m", "y
 
 
 def in_one_recording(robots: Sequence[str]) -> str:
-    """Whose profile it is, where a recording is of several robots."""
+    """Say whose profile it is, if a recording is of several robots."""
     others = ", ".join(robots[1:6]) + (", …" if len(robots) > 6 else "")
     return (
         f"of the robot {robots[0]}, one of {len(robots)} in the recording: `restock profile new "
@@ -96,7 +96,7 @@ def in_one_recording(robots: Sequence[str]) -> str:
 def profile_lines(
     seen: Evidence, name: str, problems: list[str], trial: Trial | None = None
 ) -> list[str]:
-    """The TOML of a profile; with what a `trial` of it made of the recording."""
+    """Write the TOML of a profile, with what a `trial` of it made of the recording."""
     recording, seconds = seen.recording, seen.recorded_s
     trial = trial or Trial()
     robots = robots_in(recording)
@@ -155,18 +155,18 @@ def _origin_lines(seen: Evidence) -> list[str]:
 
 
 def _conditions(seen: Evidence) -> list[str]:
-    """The shipped conditions that this robot's signals can show."""
+    """Return the shipped conditions that this robot's signals can show."""
     slip = ["wheel_slip"] if _shows_slip(seen) else []
     return ["recovery", "near_collision", *slip, "blocked_aisle"]
 
 
 def _shows_slip(seen: Evidence) -> bool:
-    """Whether anything beside its wheels says how the robot moved."""
+    """Return whether anything beside its wheels shows how the robot moved."""
     return bool(seen.roles["wheels"]) and seen.motion is None and not _slip_lines(seen)
 
 
 def _slip_lines(seen: Evidence) -> list[str]:
-    """Why odometry alone shows no slip."""
+    """Say why odometry alone shows no slip."""
     pose, wheels = (seen.roles[role][:1] for role in ("pose", "wheels"))
     same = pose and wheels and pose[0][0].name == wheels[0][0].name and not seen.poses_from_frames
     if not same or seen.roles["imu"]:
@@ -178,7 +178,7 @@ def _slip_lines(seen: Evidence) -> list[str]:
 
 
 def _unknown_lines(seen: Evidence) -> list[str]:
-    """Which of them nothing tells of a robot without a lidar."""
+    """Name the conditions that are unknown for a robot without a lidar."""
     if seen.roles["scan"]:
         return []
     known = shipped()
@@ -192,7 +192,7 @@ def _unknown_lines(seen: Evidence) -> list[str]:
 
 
 def _exposures(seen: Evidence) -> list[str]:
-    """The shipped exposures that this robot's signals can show."""
+    """Return the shipped exposures that this robot's signals can show."""
     slip = ["slippery_floor"] if _shows_slip(seen) else []
     return slip + (["closing_traffic", "plan_blocked"] if seen.roles["scan"] else [])
 
@@ -213,7 +213,7 @@ _ENDING = [
 
 
 def _trial_lines(trial: Trial) -> list[str]:
-    """What the profile makes of the recording it is proposed from."""
+    """Say what the profile makes of the recording it is proposed from."""
     if not trial.ticks:
         return []
     most = [f"{reason} {count:,}" for reason, count in list(trial.dropped.items())[:3]]
@@ -226,7 +226,7 @@ def _trial_lines(trial: Trial) -> list[str]:
 
 
 def _topic_lines(seen: Evidence) -> list[str]:
-    """Every topic with its rate and what it is taken for, as a comment."""
+    """List every topic with its rate and its use, as a comment."""
     recording, seconds = seen.recording, seen.recorded_s
     taken: dict[str, list[str]] = {name: ["Restock's node"] for name in seen.node_topics}
     for role, found in seen.roles.items():
@@ -256,20 +256,20 @@ def steered_by(seen: Evidence) -> str:
 
 
 def _robot_lines(seen: Evidence) -> list[str]:
-    """What the twin builds; the actions are within its limits."""
+    """Write what the twin builds; the actions are within its limits."""
     robot = seen.robot.limited(*seen.commands.reached)
     fastest = np.abs(actions_of(seen.commands, robot)).max(axis=0).tolist()
     return robot.lines(*fastest, outline_guessed=not seen.footprint.measured)
 
 
 def _fixes(seen: Evidence) -> tuple[TopicInfo, Kind] | None:
-    """The topic of the fixes that its pose is from, or None."""
+    """Return the topic of the fixes that its pose is from, or None."""
     pose = seen.roles["pose"][:1]
     return pose[0] if pose and pose[0][1].by_fix else None
 
 
 def _noise_lines(seen: Evidence, trial: Trial) -> list[str]:
-    """How noisy its poses are, where that is more than a profile has otherwise."""
+    """Write how noisy its poses are, if that is more than a profile's default."""
     if (fixes := _fixes(seen)) is None:
         noise_m = trial.pose_noise_m
         if noise_m is None or noise_m <= Noise().localiser_m or not _shows_slip(seen):
@@ -303,7 +303,7 @@ def _clock_lines(clock: ClockChoice) -> list[str]:
 
 
 def _max_age_s(topic: TopicInfo, seconds: float) -> float | None:
-    """Four periods of a topic, or None (latched) for one with few messages."""
+    """Return four periods of a topic; None (latched) if it has few messages."""
     rate = topic.expected / seconds if seconds > 0 else 0.0
     if topic.expected < 3 or rate < 0.05:
         return None
@@ -403,7 +403,7 @@ def _input_lines(
 
 
 def _lidar_lines(footprint: Footprint) -> list[str]:
-    """Where a lidar is that is beside the middle."""
+    """Write the place of a lidar that is beside the middle."""
     x, y, yaw = footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0
     return [
         f"lidar_at_m = [{round(x, 3) + 0.0:g}, {round(y, 3) + 0.0:g}]  # ahead, to the left",

@@ -81,7 +81,7 @@ def propose_profile(
     odometry_as_command: bool = False,
     hindsight_goals: bool = False,
 ) -> Proposal:
-    """A profile for recordings like this one.
+    """Propose a profile for recordings like this one.
 
     Args:
         recording: what it is proposed from, and tried on.
@@ -104,7 +104,7 @@ def propose_profile(
 
 
 def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Proposal:
-    """A profile from what was gathered, tried on the recording that it was gathered from.
+    """Propose a profile from gathered evidence, tried on the recording that it is from.
 
     With `goal_decided` its goal is not left out where this recording alone has few in hindsight.
     """
@@ -175,7 +175,7 @@ def propose_from(seen: Evidence, name: str, *, goal_decided: bool = False) -> Pr
 
 
 def _seldom_poses(seen: Evidence) -> list[Advice]:
-    """Where the localiser speaks seldom, and transforms lead to the map all the time."""
+    """Advise on poses that come seldom while transforms lead to the map all the time."""
     if not seen.roles["pose"] or seen.poses_from_frames or seen.frames is None:
         return []
     topic = seen.roles["pose"][0][0].name
@@ -192,7 +192,7 @@ def _seldom_poses(seen: Evidence) -> list[Advice]:
 
 
 def _odd_commands(seen: Evidence) -> list[Advice]:
-    """Where commands ask for what no action has, or for nothing at all."""
+    """Advise on commands that no action has, or that ask for nothing at all."""
     if not seen.roles["command"]:
         return []
     topic, kind = seen.roles["command"][0]
@@ -224,8 +224,11 @@ def _without_odd(seen: Evidence, name: str, trial: Trial) -> tuple[Evidence, Tri
 def _by_rate(
     recording: Recording, seen: Evidence, name: str, trial: Trial
 ) -> tuple[Evidence, Trial]:
-    """A tick every period instead of one a command, where that makes rows of much more time, or
-    where commands come too unevenly for the twin to follow."""
+    """Take a tick every period instead of one a command, if that pays.
+
+    It does if it makes rows of much more time, or if commands come too unevenly for the twin to
+    follow.
+    """
     clock = seen.clock
     if clock.steps != "command":
         return seen, trial
@@ -255,7 +258,7 @@ def _by_rate(
 
 
 def tried(recording: Recording, toml: str) -> Trial:
-    """What the profile of this TOML makes of the recording."""
+    """Try the profile of this TOML on the recording."""
     try:
         profile = as_recorded(parse_profile(toml, where="the proposal"), recording.topics)
         return try_profile(profile, read_topics(recording, profile))

@@ -29,7 +29,7 @@ MIN_TIGHT_M = 0.05  # a lidar's noise hides what is less
 
 
 def task_lines(seen: Evidence, trial: Trial) -> list[str]:
-    """The [task] table and those in it, with comments at what is a guess."""
+    """Write the [task] table and those in it, with comments at guesses."""
     roles, commands = seen.roles, seen.commands
     kind = "speeds" if commands.measured else "commands"
     held_back = [
@@ -59,7 +59,7 @@ def task_lines(seen: Evidence, trial: Trial) -> list[str]:
 
 
 def _time_limit_lines(seen: Evidence, speed_mps: float) -> list[str]:
-    """The time limit of a robot that is too slow for the one that a task has otherwise."""
+    """Write the time limit of a robot that is too slow for the default one."""
     if seen.goal.source is None or speed_mps <= 0.0:
         return []
     steps = 10 * math.ceil(ROUTE_M / (speed_mps * seen.clock.period_s) / 10)
@@ -72,7 +72,10 @@ def _time_limit_lines(seen: Evidence, speed_mps: float) -> list[str]:
 
 
 def actions_of(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
-    """Speeds (m/s) and yaw rates (rad/s) by the fastest that were commanded; the first is stop."""
+    """Return speeds (m/s) and yaw rates (rad/s) up to the fastest that were commanded.
+
+    The first action is stop.
+    """
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
     if robot.values.get("drive") == "ackermann":
         return _steered_actions(commands, robot)
@@ -85,7 +88,10 @@ def actions_of(commands: Commands, robot: RobotProposal) -> list[tuple[float, fl
 
 
 def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[float, float]]:
-    """Of a robot that steers: no turn on the spot, nor one tighter than its steering allows."""
+    """Return actions that a robot that steers can drive.
+
+    None turns on the spot, or tighter than its steering allows.
+    """
     speed, turn = commands.speed_mps, commands.yaw_rate_radps
     known = {key: robot.values[key] for key in ("max_steering_rad",) if key in robot.values}
     wheelbase_m = robot.values.get("wheelbase_m", commands.wheelbase_m)
@@ -100,7 +106,7 @@ def _steered_actions(commands: Commands, robot: RobotProposal) -> list[tuple[flo
 
 
 def _bump_lines(recording: Recording, roles: Roles) -> list[str]:
-    """A bumper stops the robot, unless it is pressed so often that it hardly is one.
+    """Let a bumper stop the robot, unless it is pressed too often to be one.
 
     Without one nothing changes in logs; in the twin, which knows every contact, a robot would else
     press on against a wall to the end of its time.
@@ -162,7 +168,7 @@ def lidar_guess(footprint: Footprint) -> str:
 
 
 def _reward_lines(width_m: float) -> list[str]:
-    """How near is near for a robot that is narrower than the one that the default suits."""
+    """Write how near is near, for a robot narrower than the one that suits the default."""
     near_m = round(max(TIGHT_PER_WIDTH * width_m, MIN_TIGHT_M), 3)
     if near_m >= Rewards().tight_clearance_m:
         return []

@@ -39,7 +39,7 @@ UNEVEN = 4.0  # times the time that can be followed: worth a tick a period
 
 @dataclass(frozen=True)
 class Advice:
-    """What a choice costs, and what to try."""
+    """The cost of a choice, and what to try."""
 
     key: str  # of the profile, as `inputs.command.max_age_s`
     text: str
@@ -50,7 +50,7 @@ class Advice:
 
 @dataclass(frozen=True)
 class Trial:
-    """What a profile makes of a recording."""
+    """The outcome of a profile on a recording."""
 
     ticks: int = 0
     transitions: int = 0
@@ -64,7 +64,7 @@ class Trial:
     pose_noise_m: float | None = None  # by how much poses differ from wheels in a control period
 
     def comments(self, *keys: str) -> list[str]:
-        """What it says of these keys of the profile, as comments of its TOML."""
+        """Write what it says of these keys of the profile, as comments of its TOML."""
         return [f"# {each.text}." for each in self.advice if each.key in keys]
 
 
@@ -107,8 +107,11 @@ def try_profile(profile: Profile, topics: Mapping[str, TopicColumns]) -> Trial:
 
 
 def _pose_noise_m(steps: Steps, task: Task) -> float | None:
-    """The noise of poses over a control period, for limits of slip well above how far they and the
-    wheels differ, over the steps of a window, at nine in ten of the ticks at which either moved."""
+    """Return the noise of poses over a control period; None if the robot hardly moved.
+
+    Limits of slip follow from it. They are well above how far poses and wheels differ over the
+    steps of a window, at nine in ten of the ticks at which either moved.
+    """
     limits = task.condition_limits
     window = int(in_steps(SLIP_OVER, limits)) + 1
     wheels_mps, poses_mps = (steps.signals[f"{name}_speed_mps"] for name in ("wheel", "localised"))
@@ -125,8 +128,11 @@ def _pose_noise_m(steps: Steps, task: Task) -> float | None:
 
 
 def _even_s(stamp_ns: Ints, period_s: float) -> float:
-    """Of an episode's ticks (N,), the time in stretches of some 3 s with each tick where it is due,
-    within a quarter of a period: as the twin's fit and gap take them."""
+    """Return the time of an episode's ticks (N,) in even stretches of some 3 s.
+
+    In these each tick is within a quarter of a period of when it is due, as the twin's fit and gap
+    take them.
+    """
     ticks, even_s, at = max(round(EVEN_S / period_s), 1), 0.0, 0
     off_s = (stamp_ns - stamp_ns[0]) / NS - np.arange(len(stamp_ns)) * period_s
     while at + ticks < len(off_s):
@@ -147,7 +153,7 @@ class _Advisor:
         self.cuts = Counter(episode.ended_by for episode in episodes.episodes)
 
     def ages(self) -> list[Advice]:
-        """Of each input that is often stale: how old it is, and what another age gives."""
+        """Say how old each input is that is often stale, and what another age gives."""
         found = []
         for reason, count in sorted(self.dropped.items(), key=lambda item: -item[1]):
             name, _, what = reason.partition(": ")
@@ -175,7 +181,10 @@ class _Advisor:
         return found
 
     def limit(self) -> list[Advice]:
-        """Whether logged missions take longer than the time limit: cut there, they have failed."""
+        """Say whether logged missions take longer than the time limit.
+
+        Cut there, they have failed.
+        """
         task, cut = self.profile.task, self.cuts["time limit"]
         if task.goal != "route" or self.profile.goal.source != "logged" or not cut:
             return []
@@ -194,7 +203,7 @@ class _Advisor:
         return []
 
     def outline(self) -> list[Advice]:
-        """Whether the lidar sees things inside the robot's outline, or all but touching it."""
+        """Say whether the lidar sees things inside the robot's outline, or almost touching it."""
         scan = self.profile.inputs.scan
         if scan is None or scan.topic not in self.topics:
             return []

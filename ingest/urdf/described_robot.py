@@ -68,7 +68,7 @@ class _Wheel:
 
 
 def read_urdf(path: Path) -> str:
-    """The text of a URDF file.
+    """Read the text of a URDF file.
 
     Raises:
         ConfigError: it cannot be read, is too long, or is no text.
@@ -92,7 +92,7 @@ def read_urdf(path: Path) -> str:
 def described_robot(
     description: Description, middle_x_m: float, scan_frame: str = ""
 ) -> DescribedRobot:
-    """The robot of a description whose outline's middle is `middle_x_m` ahead of its base."""
+    """Describe the robot of a URDF whose outline's middle is `middle_x_m` ahead of its base."""
     places = description.places()
     wheels = _wheels(description, places)
     driven = _driven(wheels)
@@ -178,7 +178,7 @@ def _wheels(description: Description, places: dict[str, Place]) -> list[_Wheel]:
 
 
 def _ground(description: Description, places: dict[str, Place]) -> float | None:
-    """How high the floor is: by name, else what the lowest shape stands on."""
+    """Return the height of the floor: by name, else what the lowest shape stands on."""
     for name, place in places.items():
         if name.split("/")[-1] == "base_footprint":
             return float(place.at_m[2])
@@ -188,7 +188,7 @@ def _ground(description: Description, places: dict[str, Place]) -> float | None:
 
 
 def _endless(joint: Joint) -> bool:
-    """Whether it turns without end, or as good as that."""
+    """Return whether it turns without end, or as good as that."""
     if joint.kind == "continuous":
         return True
     limit = joint.element.find("limit")
@@ -198,7 +198,7 @@ def _endless(joint: Joint) -> bool:
 
 
 def _axis(joint: Joint, place: Place) -> F64:
-    """The direction (3,) of a joint's axis in the base's frame, or zeros."""
+    """Return the direction (3,) of a joint's axis in the base's frame, or zeros."""
     axis = joint.element.find("axis")
     text = "1 0 0" if axis is None else axis.get("xyz", "1 0 0")
     direction = np.array([number(part) for part in text.split()[:3]])
@@ -218,7 +218,7 @@ def _radius(link: ET.Element | None) -> float:
 
 
 def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
-    """Those that drive: large ones that do not swivel, on both sides."""
+    """Return the wheels that drive: large ones that do not swivel, on both sides."""
     able = [
         wheel
         for wheel in wheels
@@ -235,7 +235,7 @@ def _driven(wheels: list[_Wheel]) -> list[_Wheel]:
 
 
 def _axles(driven: list[_Wheel], radius: float) -> list[float]:
-    """How far ahead each axle is."""
+    """Return how far ahead each axle is."""
     axles: list[list[float]] = []
     for x in sorted(wheel.x_m for wheel in driven):
         if axles and x - axles[-1][-1] < radius / 2:
@@ -275,7 +275,7 @@ def _arms(description: Description) -> list[str]:
 def _casters(
     boxes: dict[str, tuple[F64, F64]], rolling: set[str], floor: float, axle_x: float
 ) -> list[list[float]]:
-    """x ahead of the axle and y of what else stands on the floor."""
+    """Return x ahead of the axle and y of what else stands on the floor."""
     found = []
     for name, (low, high) in boxes.items():
         small = float(max(high[0] - low[0], high[1] - low[1])) < 0.15
@@ -286,7 +286,7 @@ def _casters(
 
 
 def _stands(casters: list[list[float]], axle_x_m: float, height_m: float) -> bool:
-    """Whether the middle is between what it stands on, with room for speeding up and braking."""
+    """Return whether the middle is between its supports, with room for speeding up and braking."""
     room = 0.02 + 0.1 * height_m
     ahead = [0.0, *(x for x, _ in casters)]
     return min(ahead) + room < -axle_x_m < max(ahead) - room
@@ -320,7 +320,7 @@ def _meshes(description: Description, boxes: dict[str, tuple[F64, F64]]) -> int:
 
 
 def _no_wheels(description: Description, places: dict[str, Place], wheels: list[_Wheel]) -> str:
-    """One sentence: why it does not roll, and what it looks like."""
+    """Say in one sentence why it does not roll, and what it looks like."""
     kinds = Counter(joint.kind for joint in description.joints)
     has = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common()) or "none"
     if wheels:
@@ -348,7 +348,7 @@ def _no_wheels(description: Description, places: dict[str, Place], wheels: list[
 
 
 def _rounded(value: Any) -> Any:
-    """Four digits after the point; None for what is no number that a robot has."""
+    """Round to four digits after the point; None for a number that no robot has."""
     if isinstance(value, list):
         return [[round(number, 4) for number in pair] for pair in value]
     if isinstance(value, float):

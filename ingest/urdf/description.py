@@ -48,7 +48,7 @@ class Description:
     root: ET.Element
 
     def places(self, kinds: Collection[str] = ANY) -> dict[str, Place]:
-        """Where every link is that joints of these kinds lead to from the base, all at zero."""
+        """Return where links are that joints of these kinds connect to the base, all at zero."""
         children: dict[str, list[Joint]] = {}
         for joint in self.joints:
             if joint.kind in kinds:
@@ -66,7 +66,7 @@ class Description:
 
 
 def read_description(text: str) -> Description | str:
-    """A description, or why it cannot be used."""
+    """Read a description, or say why it cannot be used."""
     if len(text) > LONGEST:
         return f"{len(text):,} characters are too many for a robot's description"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -101,21 +101,21 @@ def read_description(text: str) -> Description | str:
 
 
 def _of_xacro(element: ET.Element) -> bool:
-    """Whether it is still to be expanded by xacro."""
+    """Return whether it is still to be expanded by xacro."""
     values = element.attrib.values()
     in_namespace = element.tag.startswith("{") and "xacro" in element.tag.split("}")[0]
     return in_namespace or any("${" in value or "$(" in value for value in values)
 
 
 def _moving(root: str, links: dict[str, ET.Element], joints: list[Joint]) -> str:
-    """The root, or the robot that moves in it where it is a world: without a part of its own."""
+    """Return the root, or the robot that moves in it if it is a world without parts of its own."""
     under = [joint for joint in joints if joint.parent == root]
     free = len(under) == 1 and under[0].kind in ("floating", "planar")
     return under[0].child if free and not len(links[root]) and under[0].child in links else root
 
 
 def _no_base(roots: list[str]) -> str:
-    """Why no link can be taken for the base."""
+    """Say why no link can be taken for the base."""
     why = "every link hangs on another"
     if roots:
         more = f" and {len(roots) - 4:,} more" if len(roots) > 4 else ""
@@ -128,7 +128,7 @@ def _no_base(roots: list[str]) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a link is in the base's frame."""
+    """The place of a link in the base's frame."""
 
     rotation: F64  # (3, 3)
     at_m: F64  # (3,)
@@ -141,7 +141,7 @@ class Place:
 
 
 def extent(link: ET.Element, place: Place) -> tuple[F64, F64] | None:
-    """The lowest and highest corner of a link's collision shapes, else of those one sees."""
+    """Return the lowest and highest corner of a link's collision shapes, else visible ones."""
     for kind in ("collision", "visual"):
         boxes = [
             box
@@ -181,13 +181,16 @@ def _rotation(rpy: F64) -> F64:
 
 
 def three(text: str | None) -> F64:
-    """Three numbers of a description, 0 where it has fewer."""
+    """Return three numbers of a description, 0 for those it lacks."""
     numbers = [number(part) for part in itertools.islice((text or "").split(), 3)]
     return np.array([*numbers, *[0.0] * (3 - len(numbers))])
 
 
 def lengths(text: str | None, count: int) -> F64:
-    """So many numbers (count,) of 0 or more; all NaN where the text does not have just these."""
+    """Return so many numbers (count,) of 0 or more.
+
+    All NaN if the text does not have just these.
+    """
     parts = (text or "").split(maxsplit=count)
     found = np.array([number(part) for part in parts[:count]])
     sound = len(parts) == count and bool((found >= 0).all())
@@ -195,7 +198,7 @@ def lengths(text: str | None, count: int) -> F64:
 
 
 def number(text: Any) -> float:
-    """A number of a description; NaN, which no outline survives, for what is none."""
+    """Read a number of a description; NaN, which no outline survives, if it is none."""
     try:
         return float(text) if abs(float(text)) < 1e6 else float("nan")
     except (TypeError, ValueError):

@@ -62,12 +62,12 @@ class Candidate:
     saw: str = ""  # what was seen, for a comment
 
     def signal(self) -> CustomSignal:
-        """The signal that its table declares."""
+        """Return the signal that its table declares."""
         lines = "\n".join(self.toml(None)[1:])
         return msgspec.convert(tomllib.loads(lines), CustomSignal)
 
     def toml(self, max_age_s: float | None) -> list[str]:
-        """Its table, as lines."""
+        """Write its table, as lines."""
         unit = self.unit or "1"
         lines = [
             f"[signals.{self.name}]" + (f"  # {self.saw}" if self.saw else ""),
@@ -84,7 +84,7 @@ class Candidate:
 def candidates(
     recording: Recording, *, without: Collection[str] = (), used: Collection[tuple[str, str]] = ()
 ) -> list[Candidate]:
-    """What might become custom signals, topic by topic; every one can be read, and changes.
+    """List what might become custom signals, by topic: what can be read, and changes.
 
     `without` are topics to leave out, `used` fields (topic, path).
     """
@@ -104,7 +104,7 @@ def candidates(
 
 
 def _changing(recording: Recording, topic: TopicInfo, possible: list[Candidate]) -> list[Candidate]:
-    """Of these the ones that say more than one thing in the recording."""
+    """Keep the candidates that take more than one value in the recording."""
     if not possible:
         return []
     signals = {str(index): one.signal() for index, one in enumerate(possible)}
@@ -157,7 +157,7 @@ def _one(topic: TopicInfo, path: str, more: str = "", saw: str = "", ending: str
 
 
 def _named(recording: Recording, topic: TopicInfo, paths: list[str]) -> Iterator[Candidate]:
-    """Lists whose elements a sibling `name[]` names: the joints of a JointState."""
+    """Yield lists whose elements a sibling `name[]` names: the joints of a JointState."""
     columns = recording.read({topic.name: ["name", *paths]})[topic.name]
     names = columns.fields["name"]
     assert isinstance(names, Ragged)
@@ -174,7 +174,7 @@ def _named(recording: Recording, topic: TopicInfo, paths: list[str]) -> Iterator
 
 
 def _diagnostics(recording: Recording, topic: TopicInfo) -> Iterator[Candidate]:
-    """Values of diagnostics that are numbers, by the name of their status and their key."""
+    """Yield numbers in diagnostics, by the name of their status and their key."""
     status, key, value = "status[].name", "status[].values[].key", "status[].values[].value"
     columns = recording.read({topic.name: [status, key, value]})[topic.name].fields
     names, keys, values = columns[status], columns[key], columns[value]
@@ -201,7 +201,7 @@ def _diagnostics(recording: Recording, topic: TopicInfo) -> Iterator[Candidate]:
 
 
 def _text(recording: Recording, topic: TopicInfo, path: str) -> Iterator[Candidate]:
-    """A text that takes few values, as numbers."""
+    """Yield a text that takes few values, as numbers."""
     columns: TopicColumns = recording.read({topic.name: [path]})[topic.name]
     texts = sorted({str(text) for text in np.asarray(columns.fields[path])})
     if 1 < len(texts) <= MAX_WORDS and all(len(text) <= 40 for text in texts):
@@ -236,7 +236,7 @@ class CameraTopic:
     usable: bool
 
     def lines(self) -> list[str]:
-        """Its table in comments, or why there is none."""
+        """Write its table in comments, or say why there is none."""
         if not self.usable:
             return [f"# {self.topic.name}: no frame that can be kept: {self.frame}"]
         rate = "" if self.rate_hz is None else f"{self.rate_hz:.1f} Hz, "
@@ -253,7 +253,7 @@ class CameraTopic:
 
 
 def camera_topics(recording: Recording, seconds: float) -> list[CameraTopic]:
-    """The topics of images that ingest can keep, by name; only the first frames are read."""
+    """List the topics of images that ingest can keep, by name; only first frames are read."""
     found: list[CameraTopic] = []
     for topic in sorted(recording.topics.values(), key=lambda topic: topic.name):
         if topic.type not in TYPES or topic.skipped or not topic.expected:
@@ -266,7 +266,7 @@ def camera_topics(recording: Recording, seconds: float) -> list[CameraTopic]:
 
 
 def camera_lines(cameras: list[CameraTopic]) -> list[str]:
-    """Their tables in comments, and what to do with them."""
+    """Write the tables of the cameras in comments, and say what to do with them."""
     if not cameras:
         return []
     lines = [
@@ -281,7 +281,10 @@ def camera_lines(cameras: list[CameraTopic]) -> list[str]:
 
 
 def _first_frame(recording: Recording, topic: TopicInfo) -> tuple[str, int, bool]:
-    """What the first whole frame of the first messages is, its bytes, and whether there is one."""
+    """Describe the first whole frame among the first messages.
+
+    Format, bytes, whether there is one.
+    """
     problem = "none of its messages could be read"
     for _, fields in recording.batches(topic.name, image_fields(topic.type)):
         payloads = image_bytes(fields)
@@ -299,7 +302,7 @@ def _first_frame(recording: Recording, topic: TopicInfo) -> tuple[str, int, bool
 
 
 def _name(topic: str, taken: set[str]) -> str:
-    """What of a topic's name says which camera it is, as a name that a profile may have."""
+    """Make a camera's name, as a profile may have it, of its topic's name."""
     parts = [re.sub(r"[^a-z0-9_]+", "_", part.lower()).strip("_") for part in topic.split("/")]
     said = [part for part in parts if part and not _SAYS_NOTHING.fullmatch(part)]
     name = "_".join(said)[:56] or "camera"

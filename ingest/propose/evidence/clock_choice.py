@@ -30,7 +30,7 @@ MAX_OFF_CLOCK = 0.05  # of a topic's messages
 
 @dataclass(frozen=True)
 class Gaps:
-    """What lies between the commands of a recording, in log time."""
+    """The times between the commands of a recording, in log time."""
 
     count: int = 0  # of commands
     period_s: float | None = None  # the median gap
@@ -67,7 +67,7 @@ class ClockChoice:
 
     @classmethod
     def of(cls, gaps: Gaps, alignment: str, pace: float = 1.0) -> ClockChoice:
-        """What gaps in log time mean on an alignment clock that runs at this pace."""
+        """Choose a clock by gaps in log time, on an alignment clock that runs at this pace."""
         middle = None if gaps.period_s is None else gaps.period_s * pace
         steady = middle is not None and STEADY_S[0] <= middle <= STEADY_S[1]
         # Commands on every key press, or in bursts, say nothing of how often to decide.
@@ -90,12 +90,12 @@ class ClockChoice:
         )
 
     def at_a_rate(self) -> ClockChoice:
-        """A tick every period instead of one a command."""
+        """Return the choice with a tick every period instead of one a command."""
         return replace(self, steps="rate", max_gap_s=max(0.5, _up(2.5 * self.period_s)))
 
 
 def drivable(period_s: float) -> float:
-    """The nearest control period that the twin can drive, which is not every hundredth.
+    """Return the nearest control period that the twin can drive: it cannot drive every hundredth.
 
     It drives a period in equal parts of a tenth at most, each some hundredths.
     """
@@ -111,14 +111,14 @@ def drivable(period_s: float) -> float:
 
 
 def _up(seconds: float) -> float:
-    """Rounded up to a tenth of a second."""
+    """Round up to a tenth of a second."""
     return float(np.ceil(round(seconds * 10, 6)) / 10)
 
 
 def choose_clock(
     recording: Recording, used: Sequence[str], latched: frozenset[str], gaps: Gaps, *, stamped: bool
 ) -> ClockChoice:
-    """The clock that works for the topics `used`; `stamped` where sensors carry header stamps.
+    """Choose the clock that works for the topics `used`; `stamped` if sensors carry header stamps.
 
     `latched` topics may have been published before the recording began.
     """
@@ -145,7 +145,7 @@ def choose_clock(
 
 
 def by_log_time(stamped: ClockChoice, gaps: Gaps, why: str) -> ClockChoice:
-    """Log time, where header stamps do not work; with what was seen of them."""
+    """Choose log time because header stamps do not work, with what was seen of them."""
     comments = (*stamped.comments, f"Log time, as header stamps do not work: {why}.")
     return replace(ClockChoice.of(gaps, "log_time"), comments=comments)
 
@@ -153,7 +153,7 @@ def by_log_time(stamped: ClockChoice, gaps: Gaps, why: str) -> ClockChoice:
 def _by_stamp(
     columns: dict[str, TopicColumns], latched: frozenset[str], gaps: Gaps
 ) -> tuple[ClockChoice, str]:
-    """The choice on header stamps, and why that does not work, or ""."""
+    """Choose a clock on header stamps; and say why that does not work, else ""."""
     choice = ClockChoice.of(gaps, STAMP)
     for _ in range(3):  # the period is known when the pace is, and the tolerance when the period is
         try:
@@ -170,7 +170,7 @@ def _by_stamp(
 
 
 def _left_out(columns: dict[str, TopicColumns], report: ClockReport) -> str:
-    """What alignment leaves out, where that is much of a topic."""
+    """Say what alignment leaves out, if that is much of a topic."""
     lost = [
         f"{count:,} of {len(columns[topic]):,} of {topic} are off the clock"
         for topic, count in report.off_clock.items()

@@ -52,7 +52,7 @@ class CommandChoice:
     why: str = "the driver, if no topic tells"
 
     def toml(self, wheelbase_m: float) -> list[str]:
-        """The tables; a source that steers does so about the command's wheelbase."""
+        """Write the tables; a source that steers does so about the command's wheelbase."""
         steered = f"wheelbase_m = {round(wheelbase_m, 4):g}  # as of the command"
         return [steered if line == _STEERED else line for line in self.lines]
 
@@ -64,7 +64,7 @@ class _Told:
     values: F64  # (N, 2) speed and turn
 
     def passed_on(self, output: _Told) -> int:
-        """How many changes of `output` are to what this topic said last."""
+        """Count the changes of `output` to what this topic said last."""
         changed = np.flatnonzero((np.diff(output.values, axis=0) != 0).any(axis=1)) + 1
         at = np.searchsorted(self.log_time_ns, output.log_time_ns[changed], "right") - 1
         age_s = (output.log_time_ns[changed] - self.log_time_ns[np.maximum(at, 0)]) * 1e-9
@@ -77,7 +77,10 @@ class _Told:
 
 
 def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[Fit], CommandChoice]:
-    """The topics that may drive, what comes last first; and the sources of the first's commands."""
+    """Sort the topics that may drive, and find the sources of the first's commands.
+
+    What comes last in a chain of multiplexers is first.
+    """
     if not fitting:
         return [], CommandChoice()
     reported = [one for one in (_read(recording, fit) for fit in fitting) if len(one.values)]
@@ -111,7 +114,7 @@ def _read(recording: Recording, fit: Fit) -> _Told:
 
 
 def _age_s(one: _Told) -> float:
-    """Four periods of it."""
+    """Return four periods of a topic."""
     gaps = np.diff(one.log_time_ns) * 1e-9
     return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
@@ -123,7 +126,7 @@ def _feeds(one: _Told, output: _Told, share: float) -> bool:
 
 
 def _policy(topic: str) -> str:
-    """Who drives by a topic of this name."""
+    """Guess who drives by a topic of this name."""
     name = topic.lower()
     if any(word in name for word in BY_HAND):
         return "teleop"
@@ -163,7 +166,7 @@ HELD_BACK = 0.67  # of what was commanded: a robot that stays below has reached 
 
 @dataclass(frozen=True)
 class CommandHold:
-    """What a recording shows of how long its robot goes on with a command; in log time."""
+    """Evidence of how long a robot goes on with a command, in log time."""
 
     age_s: float | None = None  # None: nothing is known
     stops_hold: bool = False  # a command to stop holds until the next
@@ -173,7 +176,10 @@ class CommandHold:
 def command_hold(
     time_s: F64, speed_mps: F64, yaw_rate_radps: F64, poses: PoseSeries
 ) -> CommandHold:
-    """What the gaps between commands (N,) show; `poses` are on the same clock, from the same 0."""
+    """Read the hold from the gaps between commands (N,).
+
+    `poses` are on the same clock, from the same 0.
+    """
     at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     if not len(time_s) or len(at) < 2:
         return CommandHold()
@@ -212,7 +218,7 @@ def _last_moving(
     turn: float,
     within: float,
 ) -> float | None:
-    """Until when in a gap the robot did a good part of what the command says; None: never."""
+    """Return until when in a gap the robot did a good part of its command; None if it never did."""
     checked = np.arange(min(begin + within, end), end + 1e-9, within / 4)
     checked = np.append(checked, end)
     since = np.maximum(checked - within, begin)
@@ -250,7 +256,9 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
 
 
 def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
-    """What was measured (K,) where the fastest commands had settled, positive along the command.
+    """Return the measured speeds (K,) once the fastest commands had settled.
+
+    They are positive along the command.
 
     Args:
         told_s, told: time and value of the commands (N,), in order.
@@ -274,7 +282,7 @@ def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest
 
 
 def limit_of(settled: F64, fastest: float) -> float | None:
-    """The limit that settled speeds (K,) show; None where the robot does about what it is told.
+    """Return the limit that settled speeds (K,) show; None if the robot does about what it is told.
 
     Ahead and about share the wheels, so that the quickest tenth is taken, where the other motion
     asked least of them.
@@ -292,7 +300,7 @@ SLIGHT = 0.05  # of the largest speed of commands: noise, or what was rounded
 
 @dataclass(frozen=True)
 class Commands:
-    """What the commands of a recording say about the robot."""
+    """The speeds, yaw rates and kind of a recording's commands."""
 
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
@@ -307,7 +315,7 @@ class Commands:
     reached: tuple[float | None, float | None] = (None, None)  # m/s, rad/s: at most, if below
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> Commands:
-        """The same for a robot that stays below these commands; None: it does what they say."""
+        """Limit the commands to what the robot reached; None: it reaches what they say."""
         most = speed_mps or self.speed_mps
         return replace(
             self,
@@ -318,7 +326,7 @@ class Commands:
         )
 
     def fastest(self, speed_mps: F64, yaw_rate_radps: F64) -> Commands:
-        """The fastest of these (N,) that is commanded now and then; an outlier is no action."""
+        """Set the fastest of these (N,) that is commanded now and then; an outlier is no action."""
         if not len(speed_mps):
             return self
         fast, sharp = (float(np.percentile(np.abs(c), MOSTLY)) for c in (speed_mps, yaw_rate_radps))
@@ -333,8 +341,10 @@ class Commands:
 
 
 def _reverse_speeds(back_mps: F64, most_mps: float) -> tuple[float, ...]:
-    """The fastest of these speeds in reverse (N,) that is commanded now and then, at most
-    `most_mps`; half of it, too, where others are so slow that they would be far off that one."""
+    """Return the fastest reverse speed that is commanded now and then, at most `most_mps`.
+
+    Half of it is another one, if other commands are so slow that they would be far off.
+    """
     if not len(back_mps):
         return ()
     slow, fast = (min(float(np.percentile(back_mps, p)), most_mps) for p in (RARELY, MOSTLY))
@@ -377,8 +387,11 @@ def commanded(
     *,
     angles: bool = False,
 ) -> tuple[TopicColumns, Ints, F64, F64]:
-    """The commands of a topic; of those that are numbers log time (N,), m/s (N,), rad/s (N,), or
-    of steering angles, with `angles`, rad."""
+    """Read the commands of a topic.
+
+    Returns them, with log time (N,), m/s (N,) and rad/s (N,), without those that are not finite.
+    With `angles`, steering angles stay in rad.
+    """
     topic, kind = fit
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
@@ -390,9 +403,11 @@ def commanded(
 
 
 def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[int, int]:
-    """Of the Twists of a topic that ask for motion, how many ask for some that no wheels make: up
-    and down, roll or pitch; and how many there are. (0, 0) of other types, and of odometry, which
-    was measured on floors that are not even."""
+    """Count the Twists that ask for motion no wheels make, and all that ask for motion.
+
+    No wheels go up and down, roll or pitch. Other types give (0, 0), and so does odometry, which
+    is measured on uneven floors.
+    """
     topic, kind = fit
     message = kind.fields["speed_mps"].removesuffix("linear.x")
     leaves = [f"{message}{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
@@ -408,7 +423,7 @@ def off_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> tuple[in
 
 
 def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
-    """Whether most commands of a topic are for an arm or a drone."""
+    """Return whether most commands of a topic are for an arm or a drone."""
     off, requested = off_the_floor(recording, fit)
     return 2 * off > requested
 
@@ -416,7 +431,7 @@ def leaves_the_floor(recording: Recording, fit: tuple[TopicInfo, Kind]) -> bool:
 def settled_at_most(
     recording: Recording, roles: Roles, commands: Commands, times: Ints, speed: F64, turn: F64
 ) -> tuple[F64, F64]:
-    """What odometry measured, in m/s (K,) and rad/s (L,), once the fastest commands had settled."""
+    """Return what odometry measured once the fastest commands had settled: (K,) m/s, (L,) rad/s."""
     nothing = np.zeros(0), np.zeros(0)
     if not roles["wheels"] or commands.measured or not len(times):
         return nothing
@@ -439,7 +454,10 @@ def settled_at_most(
 def how_it_turned(
     recording: Recording, roles: Roles, poses: PoseSeries | None
 ) -> tuple[DriveEvidence, float | None]:
-    """How the robot turned under its Twists; and the sharpest of commands that are angles."""
+    """Return how the robot turned under its Twists.
+
+    Also return the sharpest of commands that are steering angles.
+    """
     if not roles["command"]:
         return DriveEvidence(), None
     topic, kind = roles["command"][0]
@@ -456,8 +474,10 @@ def how_it_turned(
 def wheelbase_of(
     recording: Recording, roles: Roles, poses: PoseSeries | None, robot: RobotProposal
 ) -> RobotProposal:
-    """The robot with the wheelbase by which steering angles explain how it turned, where nothing
-    describes it and they do."""
+    """Add the wheelbase by which steering angles explain how the robot turned.
+
+    The robot is as given if they do not explain it, or a description has its wheelbase.
+    """
     angled = bool(roles["command"]) and "steering_rad" in roles["command"][0][1].fields
     if robot.described or not angled or poses is None or len(poses) < 2:
         return robot
@@ -469,8 +489,10 @@ def wheelbase_of(
 def _since(
     recording: Recording, roles: Roles, poses: PoseSeries, *, angles: bool = False
 ) -> tuple[F64, F64, F64, PoseSeries]:
-    """The commands in order, in seconds (N,), m/s and rad/s, and the poses: both since the first
-    pose. With `angles` the steering angles themselves, in rad."""
+    """Read the commands in order (N,), and the poses, in seconds since the first pose.
+
+    Commands are m/s and rad/s; with `angles`, steering angles stay in rad.
+    """
     _, times, speed, turn = commanded(recording, roles["command"][0], None, angles=angles)
     order, zero = np.argsort(times, kind="stable"), poses.stamp_ns[0]
     since = PoseSeries(poses.stamp_ns - zero, poses.x_m, poses.y_m, poses.yaw_rad)

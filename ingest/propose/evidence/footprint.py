@@ -61,7 +61,7 @@ class Footprint:
 
     @property
     def lidar_aside(self) -> bool:
-        """Whether the lidar is so far beside the middle that its input must say where it is."""
+        """Return whether the lidar is so far beside the middle that its input gives its place."""
         return abs(self.lidar_y_m) > MIN_ASIDE_M
 
     @property
@@ -76,7 +76,7 @@ GUESS = Footprint(
 
 
 def parse_footprint(text: str) -> Footprint:
-    """`LxW` in metres, as in `0.6x0.5`.
+    """Parse `LxW` in metres, as in `0.6x0.5`.
 
     Raises:
         ConfigError: it is not that.
@@ -97,8 +97,9 @@ def parse_footprint(text: str) -> Footprint:
 
 
 def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint | None, list[str]]:
-    """The footprint that the recording holds of its robot, or None; and what was found and is of
-    no use.
+    """Return the footprint that the recording holds of its robot, or None.
+
+    Also return notes on descriptions of no use.
 
     Of several robots in the recording, the one to propose for.
     """
@@ -116,7 +117,7 @@ def footprint_of(recording: Recording, scan_frame: str = "") -> tuple[Footprint 
 
 
 def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
-    """The topics of the robot's descriptions, and the last text of each.
+    """Yield the topics of the robot's descriptions, and the last text of each.
 
     Of several robots in the recording, those of the one to propose for, then those of none in
     particular.
@@ -131,7 +132,7 @@ def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
 
 
 def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
-    """The outline that a robot's description has, or why there is none."""
+    """Return the outline that a robot's description has, or why there is none."""
     description = read_description(text)
     if isinstance(description, str):
         return description
@@ -160,7 +161,10 @@ def of_urdf(text: str, scan_frame: str = "", *, source: str) -> Footprint | str:
 
 
 def outline(description: Description) -> tuple[F64, F64, int] | None:
-    """The lowest and highest corner of what moves with the base, and of how many links; or None."""
+    """Return the lowest and highest corner of what moves with the base, and its number of links.
+
+    None if there is none.
+    """
     links, places = description.links, description.places(OUTLINE)
     boxes = {name: extent(links[name], place) for name, place in places.items() if name in links}
     known = {name: box for name, box in boxes.items() if box is not None}
@@ -172,8 +176,10 @@ def outline(description: Description) -> tuple[F64, F64, int] | None:
 
 
 def _lidar(places: dict[str, Place], frame: str) -> tuple[tuple[float, float], float, bool] | None:
-    """How far ahead of the base and to its left the lidar is, turned how, and whether it is upside
-    down; None where that is not known."""
+    """Return the lidar's place (m ahead and to the left), its yaw, and whether it is upside down.
+
+    None if a description does not place it.
+    """
     frame = frame.strip("/")
     near = [n for n in places if n == frame or n.split("/")[-1] == frame.split("/")[-1]]
     if not frame or not near:
@@ -198,18 +204,21 @@ _LIMITS = ("range_min", "range_max")
 
 @dataclass(frozen=True)
 class ScannedOutline:
-    """What the scans say of the outline."""
+    """The bounds that scans put on the outline."""
 
     nearest_m: float  # that anything but the robot's own parts came to the lidar; inf: nothing did
     own_m: F64  # (P, 2) the robot's own parts, in the lidar's frame
 
     @property
     def own_range_m(self) -> float:
-        """How far the farthest of its own parts is; 0 where it sees none."""
+        """Return how far the farthest of its own parts is; 0 if it sees none."""
         return float(np.hypot(*self.own_m.T).max(initial=0.0))
 
     def footprint(self, guess: Footprint) -> Footprint | None:
-        """The outline by these scans, where they say more than the guess that there is without."""
+        """Return the outline by these scans.
+
+        None if they say no more than the guess without them.
+        """
         half_m = max(self.nearest_m / (1 + 2 * TIGHT_PER_WIDTH), min(MIN_M, self.nearest_m))
         own = 2 * np.abs(self.own_m).max(axis=0, initial=0.0)
         length, width = (
@@ -233,7 +242,10 @@ class ScannedOutline:
 def scanned_outline(
     recording: Recording, fit: tuple[TopicInfo, Kind], poses: PoseSeries | None
 ) -> ScannedOutline | None:
-    """What a topic's scans say; None where it has too few. Without poses no own parts are found."""
+    """Bound the outline by a topic's scans.
+
+    None if it has too few. Without poses no own parts are found.
+    """
     topic, source = fit[0].name, Input(fit[0].name, fit[0].type, fit[1].fields)
     leaves = recording.leaves(topic)
     paths = [*source.fields.values(), *(path for path in _LIMITS if path in leaves)]
@@ -255,7 +267,7 @@ def scanned_outline(
 
 
 def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
-    """The bearings (BINS,) at which the range stays, whichever way the robot faces."""
+    """Return the bearings (BINS,) at which the range stays, whichever way the robot faces."""
     facing = np.floor(yaw_rad / FACING_RAD).astype(np.int64)
     ways, counts = np.unique(facing, return_counts=True)
     ways = ways[counts >= MIN_A_FACING]
@@ -269,7 +281,10 @@ def _own(nearest: NDArray[np.float32], yaw_rad: F64) -> Bools:
 
 
 def _nearest(source: Input, fields: Fields) -> dict[str, FieldColumn]:
-    """The nearest valid return of each scan in each bin of bearings (N, BINS); inf without one."""
+    """Return the nearest valid return of each scan in each bin of bearings (N, BINS).
+
+    A bin without a return is inf.
+    """
     ranges = fields[source.fields["ranges_m"]]
     count = len(ranges)
     low, high = (

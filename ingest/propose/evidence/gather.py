@@ -97,12 +97,15 @@ class GoalChoice:
 
     @classmethod
     def of(cls, *, logged: bool, hindsight_wanted: bool = False) -> GoalChoice:
-        """Where goals and plans were not recorded, they come in hindsight."""
+        """Take goals in hindsight if goals and plans were not recorded."""
         return cls("logged" if logged else "hindsight", hindsight_wanted=hindsight_wanted)
 
     def tried(self, transitions: int, dropped: Mapping[str, int]) -> GoalChoice:
-        """The choice after a trial: no goal where hindsight finds none for most of the drive, or,
-        where it is wanted, for all but a few rows."""
+        """Return the choice after a trial.
+
+        There is no goal if hindsight finds none for most of the drive or, if hindsight is wanted,
+        for all but a few rows.
+        """
         without = sum(count for why, count in dropped.items() if why.startswith(NO_MISSION))
         enough = self.hindsight_wanted and transitions >= MIN_ROWS
         if self.source != "hindsight" or without <= transitions or enough:
@@ -112,7 +115,7 @@ class GoalChoice:
         )
 
     def task_lines(self, length_m: float) -> list[str]:
-        """What [task] says of it, for a robot of this length."""
+        """Write the goal's keys of [task], for a robot of this length."""
         if self.source is None:
             why = f"; {self.why}" if self.why else ""
             progress = "progress is forward displacement"
@@ -124,11 +127,11 @@ class GoalChoice:
         return lines
 
     def fallback(self, role: str) -> str:
-        """What there is instead of `goal` or `plan`."""
+        """Say what is used instead of `goal` or `plan`."""
         return HINDSIGHT[role] if self.source == "hindsight" else "progress without a goal"
 
     def table_lines(self) -> list[str]:
-        """The [goal] of the profile, where it needs one."""
+        """Write the [goal] of the profile, if it needs one."""
         if self.source != "hindsight":
             return []
         return [
@@ -145,7 +148,7 @@ MILLIMETRES_UP_TO_M = 1e4  # in float32
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a recording says of its robot."""
+    """The evidence of a recording on its robot."""
 
     recording: Recording
     roles: Roles
@@ -181,7 +184,7 @@ def gather(
     odometry_as_command: bool,
     hindsight_goals: bool = False,
 ) -> Evidence:
-    """What a recording says of its robot."""
+    """Gather what a recording says of its robot."""
     topics, others = usable_topics(recording), other_robots_topics(recording)
 
     def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
@@ -292,8 +295,10 @@ def gather(
 
 
 def _origin_m(poses: PoseSeries) -> tuple[int, int] | None:
-    """Return the middle of poses that are so far from 0 that a store, in float32, would round them
-    to more than a millimetre; None if they are nearer."""
+    """Return the middle of poses that are far from 0; None if they are near.
+
+    A store keeps positions in float32, which would round far ones to more than a millimetre.
+    """
     x, y = (float(np.median(column)) if len(poses) else 0.0 for column in (poses.x_m, poses.y_m))
     return (round(x), round(y)) if max(abs(x), abs(y)) > MILLIMETRES_UP_TO_M else None
 
@@ -301,8 +306,10 @@ def _origin_m(poses: PoseSeries) -> tuple[int, int] | None:
 def _measured(
     recording: Recording, fits: list[tuple[TopicInfo, Kind]], key: str
 ) -> tuple[list[tuple[TopicInfo, Kind]], str]:
-    """Return the topics for an input without those before the first that measures `key`, and what
-    those say instead."""
+    """Drop the topics of an input before the first that measures `key`.
+
+    Also return what the dropped ones say instead.
+    """
     reasons: list[str] = []
     for place, (topic, kind) in enumerate(fits):
         leaves = set(recording.leaves(topic.name))
@@ -323,8 +330,10 @@ def _measured(
 
 
 def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
-    """Leave out the topic that an input was to come from, and say `why` in the profile: the next
-    one takes its place, or for wheels the poses. Returns None if there are too few poses."""
+    """Leave out the first topic of an input, and say `why` in the profile.
+
+    The next one takes its place, or for wheels the poses. Returns None if there are too few poses.
+    """
     roles = {**seen.roles, role: seen.roles[role][1:]}
     reasons = "; ".join(filter(None, [seen.unmeasured.get(role, ""), why]))
     seen = replace(seen, roles=roles, unmeasured={**seen.unmeasured, role: reasons})
@@ -339,7 +348,7 @@ def without_first(seen: Evidence, role: str, why: str) -> Evidence | None:
 
 
 def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
-    """Of each topic that fills an input, how far apart its messages mostly are (s, log time)."""
+    """Return the usual time between two messages of each topic in use (s, log time)."""
     names = {fitting[0][0].name for fitting in roles.values() if fitting}
     found = {}
     for name, columns in recording.read({name: [] for name in sorted(names)}).items():
@@ -351,7 +360,7 @@ def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
 
 
 def _seldomest(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
-    """The time between two messages of pose or wheels, whichever come less often."""
+    """Return the time between two messages of pose or wheels, whichever come less often."""
     names = [
         fitting[0][0].name for role in ("pose", "wheels") for fitting in [roles[role]] if fitting
     ]
@@ -362,7 +371,7 @@ def _seldomest(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) 
 
 
 def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
-    """Whether the sensors carry header stamps."""
+    """Return whether the sensors carry header stamps."""
     sensors = [
         fitting[0][0] for role, fitting in roles.items() if fitting and role in (*REQUIRED, "scan")
     ]
@@ -371,7 +380,7 @@ def _stamped(recording: Recording, roles: Roles, commands: Commands) -> bool:
 
 
 def _recorded_s(recording: Recording, roles: Roles) -> float:
-    """How long there are messages of what fills an input most often: recordings may pause."""
+    """Return for how long the busiest input has messages, as recordings may pause."""
     span = recording.span_ns
     whole = (span[1] - span[0]) * 1e-9 if span else 0.0
     filling = [fitting[0][0] for fitting in roles.values() if fitting]
@@ -386,7 +395,7 @@ def _recorded_s(recording: Recording, roles: Roles) -> float:
 
 
 def _driven_s(recording: Recording, gaps: Gaps) -> float:
-    """How long the robot drove: recordings may pause between drives."""
+    """Return how long the robot drove, as recordings may pause between drives."""
     span = recording.span_ns
     whole = (span[1] - span[0]) * 1e-9 if span else 0.0
     if gaps.period_s is None:

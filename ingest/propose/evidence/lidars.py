@@ -47,14 +47,14 @@ class View:
 
 @dataclass(frozen=True)
 class SeenScans:
-    """What a topic's scans say of the lidar that made them."""
+    """The frame and angles of a topic's scans."""
 
     frame: str = ""  # that the first one is in; "": it does not say
     angles: tuple[float, float, float] | None = None  # first, last, step (rad), of the last one
     origin: Place = (0.0, 0.0, 0.0)  # of the last one's lidar in its frame
 
     def seen_from(self, x_m: float, y_m: float, yaw_rad: float, *, upside_down: bool) -> Place:
-        """Where the lidar is, and its zero, if its frame is here."""
+        """Return the lidar's place and the direction of its zero, for a frame that is here."""
         ahead, left, turn = self.origin
         left, turn = (-left, -turn) if upside_down else (left, turn)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -62,7 +62,7 @@ class SeenScans:
         return *at_m, math.remainder(yaw_rad + turn, _TURN) if turn else yaw_rad
 
     def view(self, *, upside_down: bool = False) -> View | None:
-        """What the last scan covers; None where it does not say, or not sanely."""
+        """Return what the last scan covers; None if it does not say, or not sanely."""
         if self.angles is None:
             return None
         sign = -1 if upside_down else 1
@@ -77,7 +77,7 @@ class SeenScans:
 
 
 def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
-    """The footprint, whose lidar is where its frame is, with the lidar where scans say it is."""
+    """Move the lidar of a footprint from its frame to where its scans say it is."""
     if scans.origin == (0.0, 0.0, 0.0):
         return footprint
     frame = (footprint.lidar_x_m or 0.0, footprint.lidar_y_m, footprint.lidar_yaw_rad or 0.0)
@@ -100,7 +100,7 @@ def moved_in_frame(footprint: Footprint, scans: SeenScans) -> Footprint:
 
 
 def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> dict[str, SeenScans]:
-    """topic -> what its scans say of their lidar: of all topics in one pass."""
+    """Read the frame and angles of each topic's scans, of all topics in one pass."""
     wanted, counted = dict[str, list[str]](), dict[str, Reduction]()
     for topic, kind in fits:
         leaves = set(recording.leaves(topic.name))
@@ -118,7 +118,7 @@ def scans_of(recording: Recording, fits: Sequence[tuple[TopicInfo, Kind]]) -> di
 
 
 def _angles(kind: Kind) -> list[str]:
-    """Where scans say the angles of their first and last beam, and if they do, the step."""
+    """Return the paths of a scan's first and last angle and, if it has one, of the step."""
     fields = kind.fields
     step = [fields["angle_increment_rad"]] if "angle_increment_rad" in fields else []
     return [fields["angle_min_rad"], fields.get("angle_max_rad", "angle_max"), *step]
@@ -131,7 +131,7 @@ def _beam_counts(fields: Fields) -> dict[str, FieldColumn]:
 
 
 def _origin(kind: Kind, fields: Collection[str]) -> list[str]:
-    """Where scans say where in their frame the lidar is, if they do."""
+    """Return the paths of the lidar's pose in the frame of its scans, if they have one."""
     paths = [f"{kind.origin}.position.{axis}" for axis in "xy"]
     paths += [f"{kind.origin}.orientation.{axis}" for axis in "xyzw"]
     return paths if set(paths) <= set(fields) else []
@@ -158,7 +158,7 @@ def _seen(fields: Mapping[str, FieldColumn], kind: Kind) -> SeenScans:
 
 @dataclass(frozen=True)
 class LidarPlace:
-    """Where a lidar is in a robot's base frame, by transforms."""
+    """The place of a lidar in a robot's base frame, by transforms."""
 
     base: str
     x_m: float  # ahead
@@ -168,8 +168,10 @@ class LidarPlace:
 
 
 def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPlace | None:
-    """Where the lidar is, by the last of the recording's transforms; None where they do not say,
-    or not sanely."""
+    """Place the lidar by the last of the recording's transforms.
+
+    None if they do not, or not sanely.
+    """
     if not scan_frame:
         return None
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
@@ -193,7 +195,7 @@ def lidar_place(recording: Recording, edges: Edges, scan_frame: str) -> LidarPla
 
 
 def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
-    """The footprint with the lidar's place by transforms, the base frame taken for its middle.
+    """Add the lidar's place by transforms to the footprint, with the base frame as its middle.
 
     An outline that is guessed is made as large as to hold it. Of one that is measured, a lidar
     outside says that the base frame is not its middle: then only how it is turned is known.
@@ -212,7 +214,7 @@ def with_lidar(footprint: Footprint, place: LidarPlace | None) -> Footprint:
 
 
 def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None) -> list[str]:
-    """The nearest and the farthest range of use, as a task has them."""
+    """Write the nearest and the farthest range of use, as keys of [task]."""
     low, high, why = _range_m(recording, topic, outline)
     return [
         f"range_min_m = {low:g}{why}",
@@ -223,9 +225,10 @@ def range_lines(recording: Recording, topic: str, outline: ScannedOutline | None
 def _range_m(
     recording: Recording, topic: str, outline: ScannedOutline | None
 ) -> tuple[float, float, str]:
-    """The nearest and the farthest, at most 4 m, and why where the lidar says less.
+    """Return the nearest and the farthest range of use, at most 4 m, and a comment.
 
-    Of a lidar that gives 0 where nothing comes back, 0 is no range; nor is one of its own parts.
+    The comment says why the lidar's own limits are not used. Of a lidar that gives 0 where nothing
+    comes back, 0 is no range; nor is one of its own parts.
     """
     if not set(_LIMITS) <= set(recording.leaves(topic)):
         return 0.05, 4.0, ""

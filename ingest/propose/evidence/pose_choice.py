@@ -42,11 +42,11 @@ class FrameGuess:
 
     @property
     def frames(self) -> Frames:
-        """The `[frames]` of a profile."""
+        """Return the `[frames]` of a profile."""
         return Frames(self.fixed, self.base, topic=self.topic, static_topic=self.static_topic)
 
     def lines(self, *, used: bool) -> list[str]:
-        """The `[frames]` of a profile, commented out where it is not `used`."""
+        """Write the `[frames]` of a profile, commented out if it is not `used`."""
         mark = "" if used else "# "
         why = f"instead of inputs.pose, from {self.topic}"
         if used:
@@ -63,9 +63,11 @@ class FrameGuess:
 
 
 def transform_topics(recording: Recording) -> tuple[str, str]:
-    """The topics of the moving and the static transforms of the robot to propose for: of its own
-    namespace, else `/tf` and `/tf_static`, else of the only namespace that has any, else the only
-    topic of Foxglove's."""
+    """Return the topics of the robot's moving and static transforms.
+
+    They are of its own namespace, else `/tf` and `/tf_static`, else of the only namespace that has
+    any, else the only topic of Foxglove's.
+    """
     names = Frames().topic, Frames().static_topic
     held = {
         end: [name.removesuffix(end) for name in recording.topics if name.endswith(end)]
@@ -84,7 +86,7 @@ def transform_topics(recording: Recording) -> tuple[str, str]:
 
 
 def transform_edges(recording: Recording) -> Edges:
-    """The transforms of `transform_topics`; none where it has no such topics."""
+    """Read the transforms of `transform_topics`; empty if it has no such topics."""
     topic, static_topic = transform_topics(recording)
     wanted = {
         name: fields
@@ -96,8 +98,10 @@ def transform_edges(recording: Recording) -> Edges:
 
 
 def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
-    """The map's and the robot's frame, by its transforms (`transform_edges`); None where they join
-    no such two."""
+    """Guess the map's and the robot's frame from transforms (`transform_edges`).
+
+    None if they join no such two.
+    """
     frames = {frame for child, up in edges.parents.items() for frame in (child, *up)}
     others = {robot.rpartition("/")[2] for robot in robots_in(recording)[1:]}
     frames = {frame for frame in frames if frame.split("/")[0] not in others}
@@ -111,12 +115,12 @@ def transform_frames(recording: Recording, edges: Edges) -> FrameGuess | None:
 
 
 def named_frames(words: tuple[str, ...], frames: set[str]) -> list[str]:
-    """The frames of these names, a robot's prefix before them or not; best first."""
+    """Return the frames of these names, with a robot's prefix or without; best first."""
     return [name for word in words for name in sorted(frames) if name.split("/")[-1] == word]
 
 
 def _chain(base: str, fixed: str, edges: Edges) -> list[str]:
-    """The frames from the fixed one down to the base."""
+    """Return the frames from the fixed one down to the base."""
     way = [base]
     while way[-1] != fixed:
         ups = [up for up in edges.parents[way[-1]] if fixed in upward(up, edges.parents)]
@@ -152,7 +156,7 @@ class MotionChoice:
 
 
 def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> MotionChoice:
-    """How speeds are to come from the recording's poses, which are from this `source`."""
+    """Choose how speeds follow from the recording's poses, which are from this `source`."""
     gaps = np.diff(poses.stamp_ns) * 1e-9
     period, usual = (float(np.percentile(gaps, p)) if len(gaps) else 0.0 for p in (50, 90))
     least = (MIN_POSES - 1) * usual * 1.1
@@ -185,8 +189,10 @@ def choose_motion(recording: Recording, poses: PoseSeries, source: str) -> Motio
 def pose_series(
     recording: Recording, roles: Roles, frames: FrameGuess | None, edges: Edges
 ) -> tuple[PoseSeries, str]:
-    """Every pose at its log time, and where it is from in words: by `frames` of the transforms
-    `edges`, else of the topic for it."""
+    """Return every pose at its log time, and its source in words.
+
+    `frames` of the transforms `edges`, else the topic for poses.
+    """
     if frames is not None:
         usual = frames.frames
         edges = edges.only({usual.base, usual.fixed})
@@ -212,12 +218,15 @@ def pose_series(
 
 
 def fixes_in(recording: Recording, topic: str, fields: Mapping[str, str]) -> Fixes:
-    """The satellite fixes that a topic has in these fields."""
+    """Read the satellite fixes in these fields of a topic."""
     return fixes_of(recording.read({topic: list(fields.values())})[topic], fields)
 
 
 def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> list[str]:
-    """Where the frame of a satellite receiver's fixes begins, and over what its yaw is told."""
+    """Write the keys of a satellite receiver's fixes.
+
+    Origin, accuracy, distance that gives the yaw.
+    """
     fixes = fixes_in(recording, topic, fields)
     origin, usual = fixes.origin_deg(), _usual_std_m(fixes)
     how = "without a stated accuracy" if usual is None else f"of {usual:.2g} m, mostly"
@@ -234,7 +243,7 @@ def fix_lines(recording: Recording, topic: str, fields: Mapping[str, str]) -> li
 def fix_noise_lines(
     recording: Recording, topic: str, fields: Mapping[str, str], driven_m: float
 ) -> list[str]:
-    """What is a jump, and what slip, of fixes between which `driven_m` are driven."""
+    """Write the limits of jump and slip for fixes between which `driven_m` are driven."""
     usual = _usual_std_m(fixes_in(recording, topic, fields)) or 1.0
     return [
         "[episodes]",
@@ -247,14 +256,14 @@ def fix_noise_lines(
 
 
 def _usual_std_m(fixes: Fixes) -> float | None:
-    """The median that they give; None where they do not say."""
+    """Return the median standard deviation of fixes; None if they give none."""
     std_m = fixes.std_m()
     reported = std_m[np.isfinite(std_m)]
     return float(np.median(reported)) if len(reported) else None
 
 
 def _changes(poses: PoseSeries) -> PoseSeries:
-    """Those that differ from the one before, if there are enough of them to tell noise by."""
+    """Keep the poses that differ from the one before, if enough of them show the noise."""
     columns = (poses.x_m, poses.y_m, poses.yaw_rad)
     new = np.concatenate([[True], np.any([np.diff(column) != 0 for column in columns], axis=0)])
     if new.sum() < MIN_CHANGES:
@@ -263,7 +272,7 @@ def _changes(poses: PoseSeries) -> PoseSeries:
 
 
 def _scatter(values: F64) -> float:
-    """The standard deviation of white noise on a smooth curve, outliers aside."""
+    """Return the standard deviation of white noise on a smooth curve, outliers aside."""
     third = np.diff(values, n=3)
     return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20)) if len(third) else 0.0
 

@@ -49,7 +49,7 @@ UNEXPLAINED = 0.5  # of the squared yaw rates, at most
 
 @dataclass(frozen=True)
 class DriveEvidence:
-    """What drives show of whether their robot steers as a car; `joined` over several drives."""
+    """Evidence in drives that their robot steers as a car; `joined` over several drives."""
 
     driven_m: float = 0.0
     pivoted_rad: float = 0.0  # in turns on the spot
@@ -61,14 +61,14 @@ class DriveEvidence:
 
     @property
     def pivots(self) -> bool:
-        """It turns on the spot."""
+        """Return whether it turns on the spot."""
         turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.asked_rad)
         half = self.asked_rad >= MIN_HALF_RAD and self.followed_rad >= self.asked_rad / 2
         return turned or half
 
     @property
     def steers(self) -> bool:
-        """Told to turn on the spot it did not, though it can move."""
+        """Return whether it did not turn on the spot when told to, though it can move."""
         reported = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         drove = self.driven_m >= MIN_DRIVEN_M
         followed = self.followed_rad >= FOLLOWS * self.asked_rad
@@ -76,7 +76,7 @@ class DriveEvidence:
 
     @property
     def why(self) -> str:
-        """What it showed, as the rest of a sentence about the robot."""
+        """Say what it showed, as the rest of a sentence about the robot."""
         if self.pivots:
             turned = max(self.pivoted_rad, self.followed_rad)
             return f"it turned on the spot, by {turned:.1f} rad in all"
@@ -93,7 +93,7 @@ class DriveEvidence:
 
     @staticmethod
     def joined(drives: Sequence[DriveEvidence]) -> DriveEvidence:
-        """The evidence of several drives of one robot together."""
+        """Join the evidence of several drives of one robot."""
 
         circles = [one.tightest_m for one in drives if one.tightest_m is not None]
         return DriveEvidence(
@@ -108,7 +108,7 @@ class DriveEvidence:
 
 
 def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries) -> DriveEvidence:
-    """What one drive shows of whether its robot steers as a car.
+    """Read from one drive whether its robot steers as a car.
 
     Args:
         told_s, told_mps, told_radps: of the commands (N,), in order, on the clock of `poses`.
@@ -147,8 +147,10 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
 
 
 def _looks(stamp_ns: Ints) -> Ints:
-    """Moments TICK_NS apart from the first pose to the last, but those long after one: a single
-    message that is logged at the wrong time may lie years before the others."""
+    """Return moments TICK_NS apart from the first pose to the last, near poses only.
+
+    One message that is logged at the wrong time may lie years before the others.
+    """
     gaps = np.flatnonzero(np.diff(stamp_ns) > UNKNOWN_NS)
     begins = np.concatenate([stamp_ns[:1], stamp_ns[gaps + 1]]) - stamp_ns[0]
     ends = np.concatenate([stamp_ns[gaps] + UNKNOWN_NS, stamp_ns[-1:]]) - stamp_ns[0]
@@ -159,7 +161,7 @@ def _looks(stamp_ns: Ints) -> Ints:
 
 
 def _spells_of(flags: Bools, least: int) -> Bools:
-    """Only those (T,) of at least so many one after another."""
+    """Keep the flags (T,) in runs of at least this length."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     kept = np.zeros_like(flags)
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
@@ -170,7 +172,7 @@ def _spells_of(flags: Bools, least: int) -> Bools:
 def _on_the_spot(
     told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries, sharp: float
 ) -> tuple[float, int, float]:
-    """How far it was told to turn on the spot (rad), in how many spells, and how far it did."""
+    """Return how far (rad) and how often it was told to turn on the spot, and how far it did."""
     at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     heading = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
     side = np.sign(told_radps) * (
@@ -193,11 +195,13 @@ def _on_the_spot(
 def shown_wheelbase_m(
     told_s: F64, told_rad: F64, poses: PoseSeries, steering_rad: float | None
 ) -> float | None:
-    """Return the wheelbase by which steering angles (N,) explain how the robot turned; None if they
-    do not.
+    """Fit the wheelbase by which steering angles (N,) explain how the robot turned.
+
+    None if they do not explain it.
 
     Args:
         told_s, told_rad: time and angle of the commands, in order, on the clock of `poses`.
+        poses: of the robot, from the same 0.
         steering_rad: the largest angle; None: the usual one.
     """
     most = steering_rad or USUAL_STEERING_RAD
@@ -243,18 +247,18 @@ class RobotProposal:
 
     @property
     def described(self) -> bool:
-        """Whether a description says how it drives."""
+        """Return whether a description says how it drives."""
         return "drive" in self.values and self.origin.get("drive") != "logs"
 
     @property
     def guessed_steering(self) -> bool:
-        """Whether it is taken for one that steers by how it drove alone."""
+        """Return whether it is taken for a car by how it drove alone."""
         return self.values.get("drive") == "ackermann" and not self.described
 
     def driven(
         self, shown: DriveEvidence, length_m: float, *, told_rad: float | None = None
     ) -> RobotProposal:
-        """With the drive that its logs show, where no description says one.
+        """Add the drive that its logs show, if no description gives one.
 
         Args:
             shown: how it turned.
@@ -285,26 +289,26 @@ class RobotProposal:
         return replace(self, values=values, origin=origin, rolls=True, drive_why=why)
 
     def with_wheelbase(self, wheelbase_m: float) -> RobotProposal:
-        """With the wheelbase that its logs show."""
+        """Add the wheelbase that its logs show."""
         values = self.values | {"wheelbase_m": round(wheelbase_m, 3)}
         return replace(self, values=values, origin=self.origin | {"wheelbase_m": "logs"})
 
     @property
     def wheelbase_from(self) -> str:
-        """What its wheelbase is from; "": a guess."""
+        """Say where its wheelbase is from; "" if it is a guess."""
         if self.described:
             return "of [robot]"
         return BY_TURNS if self.origin.get("wheelbase_m") == "logs" else ""
 
     def limited(self, speed_mps: float | None, yaw_rate_radps: float | None) -> RobotProposal:
-        """With the limits that its logs show, in place of what a description says."""
+        """Replace the limits of a description by those that its logs show."""
         logged = {"max_speed_mps": speed_mps, "max_yaw_rate_radps": yaw_rate_radps}
         found = {key: value for key, value in logged.items() if value is not None}
         origin = self.origin | dict.fromkeys(found, "logs")
         return replace(self, values=self.values | found, origin=origin)
 
     def lines(self, speed_mps: float, yaw_rate_radps: float, *, outline_guessed: bool) -> list[str]:
-        """The TOML; a limit below what was commanded (m/s, rad/s) is none, and said."""
+        """Write the TOML, without limits below what was commanded (m/s, rad/s), which are noted."""
         if not self.rolls:
             return [*(f"# [robot]  # {note}" for note in self.notes), ""]
         values, notes = dict(self.values), list(self.notes)
@@ -339,7 +343,7 @@ class RobotProposal:
 
 
 def check_urdf(path: Path) -> Description:
-    """What a URDF file of a robot on wheels describes.
+    """Read the description of a robot on wheels from a URDF file.
 
     Raises:
         ConfigError: it cannot be read, is no URDF, or has no wheels.
@@ -354,7 +358,7 @@ def check_urdf(path: Path) -> Description:
 
 
 def urdf_footprint(path: Path, scan_frame: str) -> Footprint | None:
-    """The outline that a URDF file has; None where its shapes are meshes.
+    """Return the outline in a URDF file; None if its shapes are meshes.
 
     Raises:
         ConfigError: it cannot be read, is no URDF, or has no wheels.
@@ -425,7 +429,7 @@ def propose_robot(
 
 
 def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Those that a robot can have; the others are noted."""
+    """Keep the values that a robot can have, and note the others."""
     kept = {}
     for key, value in values.items():
         try:
@@ -440,7 +444,7 @@ def _sound(values: dict[str, Any], notes: list[str]) -> dict[str, Any]:
 
 
 def _beams(view: View, notes: list[str]) -> dict[str, Any]:
-    """The beams and the field of view of the twin's lidar."""
+    """Return the beams and the field of view of the twin's lidar."""
     every = -(-view.beams // MAX_BEAMS)
     if every > 1:
         notes.append(f"the twin has every {every}. of the lidar's {view.beams} beams")

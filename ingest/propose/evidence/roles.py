@@ -41,7 +41,7 @@ class Kind:
 
     @property
     def by_fix(self) -> bool:
-        """Whether it is a position by latitude and longitude."""
+        """Return whether it is a position by latitude and longitude."""
         return "latitude_deg" in self.fields
 
 
@@ -248,8 +248,10 @@ Roles = dict[str, list[tuple[TopicInfo, Kind]]]  # input -> …, best first
 
 
 def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
-    """The topics that can be decoded and have messages, without those of Restock's node, and of
-    other robots."""
+    """Return the topics that can be decoded and have messages.
+
+    Topics of Restock's node and of other robots are left out.
+    """
     others = other_robots_topics(recording)
     return {
         name: topic
@@ -260,7 +262,7 @@ def usable_topics(recording: Recording) -> dict[str, TopicInfo]:
 
 @dataclass
 class _Namespace:
-    """What a namespace holds of what robots have."""
+    """The topics of a namespace, by what robots have."""
 
     kinds: set[str] = field(default_factory=set)
     shared: set[str] = field(default_factory=set)  # of topics that one beside it has by that name
@@ -268,8 +270,9 @@ class _Namespace:
 
 
 def robots_in(recording: Recording) -> list[str]:
-    """The namespaces of a recording's robots, where it has several; first the one to propose for:
-    the chosen one, or one with a command, and topics of most kinds.
+    """Return the namespaces of a recording's robots, if it has several.
+
+    The one to propose for is first: the chosen one, or one with a command and topics of most kinds.
 
     Robots' namespaces lie side by side, and topics of two kinds at least have the same name in
     more than one of them: `/front/scan` and `/rear/scan`, or two sources of `cmd_vel`, are of one
@@ -339,14 +342,16 @@ def _namespaces(recording: Recording) -> dict[str, _Namespace]:
 
 
 def other_robots_topics(recording: Recording) -> set[str]:
-    """The topics of a recording's other robots than the one to propose for."""
+    """Return the topics of the other robots in a recording."""
     others = tuple(f"{robot}/" for robot in robots_in(recording)[1:])
     return {name for name in recording.topics if name.startswith(others)}
 
 
 def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[tuple[str, T]]:
-    """What was found at these topics or nodes without what is of other robots than the one to
-    propose for, and what is of no robot in particular last. Of one robot, as it is found."""
+    """Drop what was found at other robots' topics or nodes, and put the unnamed last.
+
+    With one robot, everything stays as found.
+    """
     robots = [f"{robot}/" for robot in robots_in(recording)]
     if not robots:
         return found
@@ -355,7 +360,7 @@ def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[
 
 
 def shared(recording: Recording, place: str) -> str:
-    """What is to be said of a topic's or node's word on the robot to propose for; "": nothing."""
+    """Warn that a topic or node may not be of this robot; "" if it is."""
     robots = robots_in(recording)[:1]
     if not robots or place.startswith(f"{robots[0]}/"):
         return ""
@@ -363,7 +368,7 @@ def shared(recording: Recording, place: str) -> str:
 
 
 def node_topics(recording: Recording) -> dict[str, str]:
-    """The topics of Restock's node that can be decoded and have messages: name -> type."""
+    """Return the topics of Restock's node that can be decoded and have messages: name -> type."""
     return {name: topic.type for name, topic in _readable(recording) if name in NODE_TOPICS}
 
 
@@ -374,9 +379,12 @@ def _readable(recording: Recording) -> Iterator[tuple[str, TopicInfo]]:
 
 
 def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
-    """Whether a topic's messages are of this type. JSON and protobuf have ROS's types, too, in
-    namespaces of any name (`ros.geometry_msgs.Twist`, `Twist`): of these, by the fields as well; so
-    of bumpers, whose packages no distribution has."""
+    """Return whether a topic's messages are of this type.
+
+    JSON and protobuf have ROS's types in namespaces of any name (`ros.geometry_msgs.Twist`,
+    `Twist`), so their fields are checked as well. So are those of bumpers, whose packages no
+    distribution has.
+    """
     other = topic.encoding in _OTHER_ENCODINGS
     of_ros = "/" in kind.type and last_part(topic.type) == last_part(kind.type)
     if topic.type != kind.type and not (other and of_ros):
@@ -390,7 +398,7 @@ def _is_of(recording: Recording, topic: TopicInfo, kind: Kind) -> bool:
 def topics_for(
     recording: Recording, topics: dict[str, TopicInfo], kinds: tuple[Kind, ...]
 ) -> list[tuple[TopicInfo, Kind]]:
-    """The topics that may fill an input, best first: by kind, by name, by messages."""
+    """Sort the topics that may fill an input, best first: by kind, by name, by messages."""
     fitting = []
     for rank, kind in enumerate(kinds):
         for topic in topics.values():
@@ -420,7 +428,7 @@ def clouds_alone(recording: Recording, roles: Roles) -> str:
 
 
 def several_commands(recording: Recording) -> list[str]:
-    """All topics that may be what drives the robot, best first, where there are several."""
+    """Return all topics that may drive the robot, best first, if there are several."""
     topics = usable_topics(recording)
     fitting = topics_for(recording, topics, KINDS["command"])
     proposed = {topic.name for topic, _ in topics_for(recording, topics, KINDS["nav_command"])}
