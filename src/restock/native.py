@@ -1,4 +1,4 @@
-"""Whether this installation has what `restock/compiled/` is, and whether it is used.
+"""The compiled code of `restock/compiled/`: whether it is installed, and whether it is used.
 
 It is built where a compiler is, and serves x86-64 processors with AVX2: the update of a plain
 network, the gather of a batch and the record of its rows, draws by priority, the twin's lidar, and

@@ -1,4 +1,4 @@
-"""What goes wrong that no part of Restock foresaw, as a message and exit 2, without a traceback.
+"""Unforeseen errors as a message and exit code 2, without a traceback.
 
 Files are damaged, disks are full and folders are missing in more ways than any reader names. One
 place turns what libraries raise into what, where and what to do. `RESTOCK_TRACEBACK=1` prints the

@@ -26,7 +26,7 @@ SHOWN = 5  # rows of a finding in a summary
 
 
 class Part(NamedTuple):
-    """One of the things that were looked at."""
+    """The findings of one part of a check: the audits, the difference or the regression."""
 
     name: str
     findings: list[Finding]

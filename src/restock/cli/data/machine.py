@@ -1,4 +1,4 @@
-"""What `restock info` says of this machine, and of a store: for a bug report."""
+"""The checks of this machine, and of a store, that `restock info` prints for bug reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run is about to do, or has not done, in words: `restock train` says it."""
+"""Sentences of `restock train` about a run: what it will do, or has not done."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `restock eval` prints: of what was driven, for `--on-logs` and for `--baseline`."""
+"""Tables of `restock eval`: of driven episodes, of `--on-logs` and of `--baseline`."""
 
 from __future__ import annotations
 

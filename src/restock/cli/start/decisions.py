@@ -1,4 +1,4 @@
-"""What `restock start` decides between its stages, from what they printed."""
+"""Decisions of `restock start` between its stages, from what these printed."""
 
 from __future__ import annotations
 

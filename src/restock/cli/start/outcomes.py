@@ -1,4 +1,4 @@
-"""What came of a stage in a line or two, from the document that its verb prints with --json."""
+"""Results of stages in a line or two, from the documents that their verbs print."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the demo tells around its stages: what one is about to see, and what came of it.
+"""The story that the demo tells around its stages: what to expect, and the results.
 
 All of it is read from what the stages wrote: the panel, the runs' tables, the store's rows and the
 recording's messages.

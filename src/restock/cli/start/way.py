@@ -53,10 +53,10 @@ class Stopped(Exception):
 
 
 class Way:
-    """From recordings to a report, one stage after the other.
+    """The stages from recordings to a report, run one after the other.
 
-    `to` is what the stages share; it changes as the way goes on. `first` is one of the recordings:
-    that of a plan, which reads none.
+    `to` is what the stages share; it changes as stages end. `first` is one of the recordings, which
+    a plan names without reading it.
     """
 
     def __init__(self, requested: StartCommand, work: Work, first: str | None = None) -> None:

@@ -31,7 +31,7 @@ Dispatch = Callable[[list[str]], int]
 
 @dataclass
 class Ended:
-    """How a stage ended, now or in an earlier call."""
+    """The result of a stage, of this call or of an earlier one."""
 
     name: str
     command: str

@@ -75,5 +75,5 @@ def signed_size(row: dict[str, Any]) -> float:
 
 
 def value_text(value: float | None) -> str:
-    """Three digits; nothing where there is no value."""
+    """Format three digits; nothing if there is no value."""
     return "" if value is None else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""What to log next, on a store's page: the plan of `restock coverage gaps`, and each gap."""
+"""The section on what to log next: the plan of `restock coverage gaps`, and each gap."""
 
 from __future__ import annotations
 

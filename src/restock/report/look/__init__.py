@@ -1,1 +1,1 @@
-"""What every page shares: its blocks, its charts in light and dark, and the one template."""
+"""The parts that all pages share: blocks, charts in light and dark, and the template."""

@@ -1,4 +1,4 @@
-"""What a report knows: the rows behind every figure, read from a run, its panel and its store."""
+"""The facts of a report: rows behind every figure, read from run, panel and store."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a run's page says first: what changed against the baseline, where, how surely, at what cost.
+"""The first sentences of a run's page: what changed against the baseline, and how surely.
 
-Never a bare average: differences are paired by episode, by condition, with their intervals.
+There is no bare average: differences are paired by episode, by condition, with their intervals.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a page says of a run without a twin, judged by logs that it did not learn from."""
+"""The page of a run without a twin, judged by logs that it did not learn from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the critic was fed: quotas of the batch, the rows that filled them, and their weights."""
+"""The section on the feed: quotas of the batch, rows that filled them, and weights."""
 
 from __future__ import annotations
 
