@@ -75,7 +75,7 @@ def expect(name: str, given: object, kind: type | tuple[type, ...], remedy: str)
     """Refuse an argument of another kind, such as the name of what is to be given itself.
 
     Raises:
-        ArgumentError: it is none of `kind`.
+        ArgumentError: it is not of `kind`.
     """
     if not isinstance(given, kind):
         kinds = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))

@@ -143,7 +143,7 @@ def expect_file_place(path: Path | None, option: str, *, run: Path | None = None
     """Refuse, before the work, a place where an option's file cannot be or would be lost.
 
     Args:
-        run: what the file is about, where that is a run: it may lie in the run's folder.
+        run: the run that the file is about; the file may lie in its folder.
 
     Raises:
         ConfigError: it is a folder, or lies within a panel, a store or another run.
@@ -165,7 +165,7 @@ def expect_place(path: Path, error: type[RestockError] = RestockError) -> None:
 
     Raises:
         RestockError: (of the kind `error`) a file or a folder without permission is in the way; or
-            it lies within a panel, a store or a run, and goes where that is replaced or removed.
+            it lies within a panel, a store or a run, and would be lost with it.
     """
     absolute = path.absolute()
     parent = next(folder for folder in absolute.parents if folder.exists())

@@ -37,7 +37,7 @@ class Stateful:
         """Restore everything that `state_dict` saved; raise `mismatch` for another's state.
 
         Raises:
-            RunError: no mapping, or one without one of these names: another version saved it.
+            RunError: it is not a mapping, or lacks one of these names: another version saved it.
         """
         self.expect_state(state, ())
         for name in self.SAME:

@@ -239,7 +239,7 @@ def nothing_varies(values: NDArray[Any]) -> bool:
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p values for their number, in their order (Holm 1979).
 
-    Of those below alpha, the probability that any is by chance is at most alpha.
+    The probability that any of those below alpha is by chance is at most alpha.
     """
     p = np.asarray(p_values, np.float64)
     order = np.argsort(p, kind="stable")
@@ -272,7 +272,7 @@ def for_few_clusters(
 ) -> ConfidenceInterval:
     """Return the percentile interval of a bootstrap over C clusters, widened for small C.
 
-    That interval is too narrow where C is small: a draw's variance is (C - 1) / C of the true one,
+    That interval is too narrow for small C: a draw's variance is (C - 1) / C of the true one,
     and the spread is itself estimated. So its ends are moved away from the value, by Student's t
     with C - 1 degrees of freedom over the normal's quantile, times sqrt(C / (C - 1)).
     """

@@ -35,11 +35,11 @@ def prepared(command: type[Any], *, explained: bool = False) -> type[Any]:
     """Return the dataclass with types for which tyro's help is plain and its parsing quick.
 
     Args:
-        explained: its help is about to be printed: also read what each option says.
+        explained: also read the text of each option, because help is about to be printed.
 
-    `X | None` becomes `Optional[X]`, whose values tyro checks itself: for `X | None` it imports
-    typeguard, and with that asyncio. An option that may be left out shows what it takes, not
-    `{None}|STR`, and no default where that says nothing.
+    `X | None` becomes `Optional[X]`, whose values tyro checks itself; for `X | None` it imports
+    typeguard, and with that asyncio. An optional option shows what it takes, not `{None}|STR`, and
+    shows no default that says nothing.
     """
     if command not in _PREPARED:
         _PREPARED.append(command)

@@ -212,7 +212,7 @@ def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
 def _fitted(least: list[int], width: int) -> tuple[int, list[int] | list[None]]:
     """Return how far apart the columns of a terminal's table stand, and their least widths.
 
-    If words do not fit even side by side, rich cuts them where it must.
+    If words do not fit even then, rich cuts them as it must.
     """
     for apart in range(GAP, 0, -1):
         if sum(least) + apart * (len(least) - 1) + 2 <= width:

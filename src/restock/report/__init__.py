@@ -31,7 +31,7 @@ def build_report(
 ) -> Path:
     """Write the report of a run directory; returns its path.
 
-    Each figure is written into the folder `figures`, too, as SVG and PNG, where one is named.
+    If a folder `figures` is named, each figure is also written there, as SVG and PNG.
 
     Raises:
         RunError: no run there, or one with nothing to report on yet.
@@ -45,7 +45,7 @@ def write_gap_page(
 ) -> Path:
     """Write the page of a measured gap (`restock twin gap --out FOLDER`); returns its path.
 
-    Each figure is written into the folder `figures`, too, where one is named.
+    If a folder `figures` is named, each figure is also written there.
 
     Raises:
         RunError: there is none in `folder`.

@@ -35,8 +35,8 @@ class Part(NamedTuple):
 def of_difference(document: dict[str, Any], *, old: str) -> list[Finding]:
     """Return the difference of two stores (`StoreDifference.document`) as findings.
 
-    What the old store had and the new one lacks is a failure; changed definitions and labels are a
-    warning, for they may be meant; what came is for information.
+    What the new store lost is a failure. Changed definitions and labels are a warning, because they
+    may be intended. New recordings are for information.
     """
     recordings, episodes = document["recordings"], document["episodes"]
     gone = [row for row in recordings if row["change"] == "out"]

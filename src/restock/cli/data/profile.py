@@ -35,7 +35,7 @@ class ProfileCommand:
     clocks, frames and commanded speeds, with a comment at each guess. Fields that might become
     custom columns are listed, commented out. The profile is printed, or written to --out. For
     several recordings, or a folder of them, it proposes one profile for all recordings of one kind
-    of robot, and lists the others. Of more than 12 recordings of that kind it reads the 12 largest,
+    of robot, and lists the others. If there are more than 12 of that kind, it reads the 12 largest
     and lists those that it did not read.
 
     `restock profile check PROFILE RECORDING` shows which inputs would be used, which are missing

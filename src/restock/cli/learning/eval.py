@@ -19,8 +19,8 @@ _DRIVES = (
 class EvalCommand:
     """Evaluate a run's policy on fixed episodes, beside scripted policies and a random one.
 
-    It is the best by the evaluations in training. Of a run that was interrupted before it evaluated
-    what it learned in the twin, it is the latest. The output names its step.
+    It is the best by the evaluations in training. If a run was interrupted before it evaluated what
+    it learned in the twin, it is the latest. The output names its step.
 
     Every policy drives the same seeded episodes of every condition for which the floors have room,
     without a perturbation and under each one. Prints success, return, bumps per kilometre, the

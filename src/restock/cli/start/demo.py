@@ -205,7 +205,7 @@ def run_demo(
 def _beside(stage: Stage, say: Callable[[str], None]) -> Iterator[Callable[[], int]]:
     """Run a stage's other command in a process of its own; yields what waits for its exit code.
 
-    What it says is shown where it fails. It does not outlive the block.
+    Its output is shown if it fails. It does not outlive the block.
     """
     if not stage.beside:
         yield lambda: int(ExitCode.OK)

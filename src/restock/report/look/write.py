@@ -26,7 +26,7 @@ def write_page(content: dict[str, Any], out: Path | str, figures: Path | str | N
 
     Args:
         content: what the template asks for: kicker, title, headline, lead, cards, sections,
-            footer, and a verdict where there is one.
+            footer, and a verdict if there is one.
     """
     out, folder = Path(out), files("restock.report.look")
     environment = jinja2.Environment(
