@@ -82,7 +82,7 @@ def carrying(folder: Path, text: str) -> Panel:
     return Panel(panel.path, header, panel.rows)
 
 
-def test_store_panel_and_run_carry_the_profile_with_the_text_of_its_files(folder: Path) -> None:
+def test_store_panel_and_run_carry_the_profile_text(folder: Path) -> None:
     with Store(folder / "store") as store:
         rows = store.sql("SELECT profile_toml, profile_hash FROM recordings").fetchall()
     carried = read_profile_toml(rows[0][0], where="test")
@@ -118,12 +118,12 @@ def test_a_trace_reads_the_messages_by_the_carried_profile(
     assert traced["notes"] == []
 
 
-def test_another_task_is_refused_though_the_panel_carries_its_own(folder: Path) -> None:
+def test_another_task_than_the_panels_is_refused(folder: Path) -> None:
     with pytest.raises(PanelError, match="leave out `profile` in the config"):
         prepare_new(folder / "other", folder / "panel", None, [*TINY, "profile=warehouse_amr"])
 
 
-def test_mix_says_which_of_two_profiles_of_a_task_the_panel_carries(
+def test_mix_says_which_of_two_profiles_a_panel_carries(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, recording in (("first", TUESDAY), ("second", MONDAY)):

@@ -77,7 +77,7 @@ def test_a_missing_checkpoint_says_so(tmp_path: Path) -> None:
     assert "remove it, and train again" in str(raised.value)
 
 
-def test_a_checkpoint_of_an_earlier_version_is_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_checkpoint_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "latest.safetensors"
     save_file({}, path, metadata={"format": "restock-checkpoint/1", "state": "{}"})
     with pytest.raises(RunError, match=r"by an earlier Restock .*\n.*train again with"):

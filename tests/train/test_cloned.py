@@ -121,7 +121,7 @@ def test_a_clone_that_learnt_nothing_is_called_poor(tmp_path: Path) -> None:
     assert "the quality of the clone is not known" in reported.text
 
 
-def test_eval_drives_the_clone_beside_the_agent_and_compares_with_it(
+def test_eval_drives_and_compares_the_clone(
     panel: Panel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = kept_run(tmp_path / "run", panel=panel)

@@ -54,7 +54,7 @@ def rows_of_episodes() -> tuple[Coded, Coded, np.ndarray, np.ndarray]:
     return coded(drivers), coded(episodes), np.float32(reward), np.float32(discount)
 
 
-def test_successes_are_whole_episodes_that_reached_their_goal_without_the_teacher() -> None:
+def test_successes_are_whole_episodes_without_the_teacher() -> None:
     policy, episode, reward, discount = rows_of_episodes()
     found = of_successes(policy, episode, reward, discount, ["operator"])
     assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "another's"}
@@ -71,7 +71,7 @@ def test_rows_of_no_known_episode_are_nobodys_success() -> None:
     assert not found.any()
 
 
-def test_who_is_asked_in_the_twin_learns_online_from_the_teachers_rows_alone(
+def test_queried_teacher_learns_online_from_its_rows_alone(
     tmp_path: Path,
 ) -> None:
     """Every other episode is the planner's own way to the end of the corridor."""

@@ -75,9 +75,7 @@ def test_a_setting_of_the_default_target_needs_no_rule(tmp_path: Path) -> None:
         (["target.rule=hard", "target.tau=0.1"], '`target.tau` is a setting of target.rule = "po'),
     ],
 )
-def test_a_setting_of_the_other_target_rule_says_which_rule_has_it(
-    overrides: list[str], said: str
-) -> None:
+def test_setting_of_the_other_target_rule_names_the_rule(overrides: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         load_config(None, overrides)
 
@@ -124,7 +122,7 @@ def test_the_option_that_is_wrong_is_named_as_it_was_given(
         ("teacher.source=no_such_module:foo", r"no_such_module:foo cannot be imported"),
     ],
 )
-def test_what_a_run_could_not_do_is_refused_before_its_folder_is_made(
+def test_impossible_run_is_refused_before_its_folder_is_made(
     tmp_path: Path, override: str, message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
@@ -145,7 +143,7 @@ def test_a_run_that_cannot_be_opened_leaves_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_key_of_an_earlier_version_is_refused_with_its_new_name(tmp_path: Path) -> None:
+def test_removed_key_is_refused_with_its_row_in_renamed(tmp_path: Path) -> None:
     old = tmp_path / "old.toml"
     old.write_text("[guard]\nmargin = 0.3\n")
     for path, overrides in ((old, []), (None, ["guard.margin=0.3"])):

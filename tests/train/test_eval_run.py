@@ -164,7 +164,7 @@ def test_what_an_earlier_restock_evaluated_is_still_shown(tmp_path: Path) -> Non
     assert "floors not named, policy not named, seeds 3 to 3" in said
 
 
-def test_the_references_drive_the_same_missions_and_time_lost_is_against_the_planner(
+def test_references_drive_the_same_missions(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = kept_run(tmp_path / "a")
@@ -213,7 +213,7 @@ def test_episodes_that_chose_the_policy_flatter_it(tmp_path: Path) -> None:
     assert "among those by which the run's policy was chosen (90000 to 90009)" in said
 
 
-def test_a_limiter_in_front_is_driven_beside_and_its_interventions_are_counted(
+def test_limiter_interventions_are_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, limits = kept_run(tmp_path / "a"), tmp_path / "limits.toml"

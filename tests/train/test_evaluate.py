@@ -83,7 +83,7 @@ def test_a_contact_that_lasts_is_one_bump() -> None:
     assert result.time_s == pytest.approx(TASK.time_limit_steps * 0.2)
 
 
-def test_score_weighs_conditions_the_same_and_breaks_ties_by_return() -> None:
+def test_score_weighs_conditions_equally_then_return() -> None:
     def result(condition: str, success: bool, value: float) -> EpisodeResult:
         return EpisodeResult(condition, "none", 0, success, 0, 1.0, value, 0.0, 0.0, None)
 

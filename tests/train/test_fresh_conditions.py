@@ -34,7 +34,7 @@ def rows(run: Session, query: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_only_rows_of_episodes_that_never_ended_have_no_condition(live: Session) -> None:
+def test_only_rows_of_unended_episodes_have_no_condition(live: Session) -> None:
     (whole,) = rows(
         live,
         "SELECT count(*) AS fresh, count(*) FILTER (condition IS NULL) AS unknown,"
@@ -147,7 +147,7 @@ def test_actions_are_counted_with_what_the_policy_wants(live: Session) -> None:
     assert shares["off"] < 1e-9
 
 
-def test_what_waits_is_written_when_a_run_is_interrupted_and_taken_back(
+def test_waiting_rows_are_written_on_interrupt_and_taken_back(
     live: Session, tmp_path: Path
 ) -> None:
     calls = iter(range(200))

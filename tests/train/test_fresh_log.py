@@ -132,7 +132,7 @@ def test_a_flushed_run_is_a_recording_like_any_other(
     assert (np.diff(stamps) > 0).all()
 
 
-def test_returns_of_a_truncated_episode_of_the_twin_bootstrap_at_its_last_step(
+def test_truncated_episodes_bootstrap_at_their_last_step(
     tmp_path: Path,
 ) -> None:
     """The ring's rows of three steps against the single steps that the twin returned."""
@@ -249,7 +249,7 @@ def test_a_panel_can_be_mixed_from_it(collecting: Collecting, tmp_path: Path) ->
     assert panel.task == collecting.profile.task
 
 
-def test_the_ends_of_episodes_are_kept_for_labels_that_look_ahead(
+def test_ends_of_episodes_are_kept_for_labels_that_look_ahead(
     collecting: Collecting, tmp_path: Path
 ) -> None:
     writer = StoreWriter(tmp_path / "store")
@@ -341,7 +341,7 @@ def test_episodes_under_way_when_keeping_begins_are_left_out(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_train_flushes_to_a_store_and_flushing_again_changes_nothing(
+def test_flushing_to_a_store_twice_changes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ["env.num_envs=4", "evaluation.episodes=1", "network.hidden=[16]"]

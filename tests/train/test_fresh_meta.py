@@ -20,7 +20,7 @@ from restock.train.twin.physics.episode import EpisodeSpec
 CONDITIONS = load_profile("warehouse_amr").conditions
 
 
-def test_labels_from_infos_are_those_of_the_whole_episodes_signals() -> None:
+def test_labels_from_infos_equal_those_of_whole_episodes() -> None:
     made: Any = gymnasium.make("restock/Warehouse-v0").unwrapped
     kinds = ("blocked_aisle", "near_collision", "wheel_slip")
     made.vector.set_episodes([EpisodeSpec(kind, seed) for seed, kind in enumerate(kinds)])
@@ -66,7 +66,7 @@ def test_episodes_without_signals_are_counted_not_labelled() -> None:
     assert labels.unlabelled_episodes == 1
 
 
-def test_metadata_beside_a_buffer_is_what_a_ring_of_single_steps_keeps() -> None:
+def test_metadata_beside_a_buffer_equals_a_single_step_ring() -> None:
     """Both are fed the same steps of two environments, and overwritten twice over."""
     names = ("slip", "nominal")
     ring = FreshRing(12, 2, 1, discount=0.9, conditions=names)

@@ -67,7 +67,7 @@ def test_fresh_episodes_get_the_strata_that_logged_ones_get(text: str, tmp_path:
     assert same == len(TABLE)
 
 
-def test_an_episode_that_met_several_goes_to_the_stratum_with_the_fewest_rows() -> None:
+def test_episode_of_several_strata_goes_to_the_smallest() -> None:
     mixture = parse_mixture("[each_condition]\nshare = 'equal'\nunit = 'episode'\n")
     names = ["nominal", "recovery", "wheel_slip"]
     strata = FreshStrata(mixture, names, [c for c in CONDITIONS if c.name in names])
@@ -96,7 +96,7 @@ def test_every_step_is_in_a_stratum_whose_condition_holds(data: st.DataObject) -
             assert found.any() if of_episode else found[step]
 
 
-def test_a_stratum_that_fresh_rows_cannot_show_is_said_to_be_short(tmp_path: Path) -> None:
+def test_stratum_without_fresh_rows_is_reported_as_short(tmp_path: Path) -> None:
     text = (
         "unlisted = 'drop'\n[[strata]]\nname = 'nominal'\nshare = 0.5\n"
         "[[strata]]\nname = 'first'\nwhere = 'step_index < 2'\nshare = 0.5\n"

@@ -121,9 +121,7 @@ def test_draws_of_an_episode_by_stratum_and_condition(rows: int, seed: int) -> N
 
 @settings(max_examples=20)
 @given(st.integers(1, 80), st.integers(0, 99), st.booleans())
-def test_every_action_of_what_was_met_has_a_row_the_never_drawn_too(
-    rows: int, seed: int, greedy: bool
-) -> None:
+def test_every_action_has_a_row_even_if_never_drawn(rows: int, seed: int, greedy: bool) -> None:
     of = source(rows, seed, greedy=greedy)
     columns = interval_tables.actions(of, ACTIONS)
     cells = list(zip(columns["stratum"], columns["condition"], columns["name"], strict=True))

@@ -31,7 +31,7 @@ def interrupted(live: Session, stop: Callable[[], bool]) -> Session:
     return live
 
 
-def test_a_run_interrupted_before_it_evaluated_what_it_learned_has_its_latest_policy(
+def test_run_interrupted_before_evaluation_has_latest_policy(
     tmp_path: Path,
 ) -> None:
     """Its best was that of step 0, from the logs alone, and was said to be all that it learned."""
@@ -70,7 +70,7 @@ def test_a_run_interrupted_before_it_learned_in_the_twin(
     assert now.gradient_steps == live.learner.gradient_steps
 
 
-def test_an_evaluation_after_the_last_checkpoint_of_a_killed_run_counts(tmp_path: Path) -> None:
+def test_evaluation_after_the_last_checkpoint_counts(tmp_path: Path) -> None:
     settings = config(record={"checkpoint_every_env_steps": 700, "keep_checkpoints": 3})
     live = run_to_end(tmp_path / "a", settings)
     folder = live.run.latest.parent
@@ -136,7 +136,7 @@ def test_the_latest_policy_is_driven_and_named_until_another_is(
     assert "step 60" not in said
 
 
-def test_a_run_that_stopped_before_its_first_update_has_no_policy(tmp_path: Path) -> None:
+def test_run_stopped_before_its_first_update_has_no_policy(tmp_path: Path) -> None:
     changes: dict[str, Any] = {"schedule": {"warmup_env_steps": 400}}
     live = session(tmp_path / "a", config(**changes), logs=None)
     interrupted(live, lambda: live.progress.env_steps >= 100)

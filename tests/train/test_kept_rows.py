@@ -80,7 +80,7 @@ def test_compiled_code_keeps_what_numpy_does(
 
 
 @compiled
-def test_what_does_not_fit_is_refused_and_nothing_is_read_outside() -> None:
+def test_kept_rows_refuse_what_does_not_fit() -> None:
     rng = np.random.default_rng(0)
     ring = ring_of(rng)
 

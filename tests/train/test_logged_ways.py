@@ -93,7 +93,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Panel:
     return panel_of(write_store(folder / "store", tables, task=TASK), MIXTURE, folder / "panel")
 
 
-def test_held_out_ways_are_missions_and_what_the_floor_lacks_is_counted(panel: Panel) -> None:
+def test_held_out_ways_are_missions_and_others_are_counted(panel: Panel) -> None:
     made = logged_missions(panel, (FLOOR,), ("nominal", "wheel_slip"), every=True)
     assert made.logged == 36
     assert made.ways == 12
@@ -122,7 +122,7 @@ def test_start_says_why_no_route_of_the_logs_can_be_driven(panel: Panel) -> None
     assert "its recording is in another frame than the floor" in why
 
 
-def test_each_way_is_a_mission_of_the_floor_that_its_recordings_poses_lie_on(panel: Panel) -> None:
+def test_each_way_is_a_mission_of_its_recordings_floor(panel: Panel) -> None:
     away = replace(FLOOR, name="away", map_origin=(300.0, 300.0, 0.0))
     made = logged_missions(panel, (FLOOR, away), ("nominal",), every=True)
     assert made.ways == 24
@@ -161,9 +161,7 @@ def test_eval_drives_the_ways_of_the_logs(
 
 
 @pytest.mark.long
-def test_a_runs_own_evaluations_drive_them_where_the_config_says_so(
-    panel: Panel, tmp_path: Path
-) -> None:
+def test_a_runs_evaluations_drive_logged_ways_on_request(panel: Panel, tmp_path: Path) -> None:
     line = [*LOGGED_TRAINING, "--panel", str(panel.path)]
     line += ["--set", "env.num_envs=4", "--set", "schedule.offline_updates=2"]
     line += ["--set", "network.hidden=[8]", "--set", "replay.batch_size=16"]

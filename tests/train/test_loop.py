@@ -50,7 +50,7 @@ def test_the_corridor_is_solved_online_without_logs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_logs", [True, False])
-def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
+def test_run_out_of_time_still_makes_an_interval_of_updates(
     tmp_path: Path, with_logs: bool
 ) -> None:
     """There is a policy to keep and something to report, however slow the machine."""
@@ -64,7 +64,7 @@ def test_a_run_whose_time_is_up_at_once_makes_an_interval_of_updates(
     assert (live.progress.env_steps == 0) == with_logs
 
 
-def test_a_run_drives_for_half_of_its_time_however_long_the_logs_would_take(tmp_path: Path) -> None:
+def test_run_drives_for_half_of_its_time(tmp_path: Path) -> None:
     """Else a robot of few logs and a slow twin ends with a policy that never drove in it."""
     settings = config(schedule={"seconds": 1.0, "offline_updates": 10**6, "env_steps": 10**6})
     live = run_to_end(tmp_path / "a", settings)
@@ -214,7 +214,7 @@ def test_a_run_is_not_resumed_on_other_logged_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_a_run_is_neither_resumed_nor_evaluated_without_the_policy_that_it_kept(
+def test_run_without_its_kept_policy_is_refused(
     undisturbed: Session, tmp_path: Path, damage: str
 ) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
@@ -298,7 +298,7 @@ def test_the_critic_is_measured_on_steps_that_no_replay_has(undisturbed: Session
     assert mean[1] < mean[0]  # it learnt
 
 
-def test_an_evaluation_is_measured_alike_whatever_was_driven_before(tmp_path: Path) -> None:
+def test_evaluation_does_not_depend_on_what_drove_before(tmp_path: Path) -> None:
     live = session(tmp_path / "a", config())
     policy = GreedyPolicy(live.learner.policy_network)
     specs = fixed_episodes(["nominal", "wheel_slip"], 4, 7)  # 8 episodes in 3 corridors
@@ -388,7 +388,7 @@ def test_the_best_checkpoint_is_by_evaluation_not_the_last(undisturbed: Session)
     assert {row["episode_seed"] for row in rows} == {90_000, 90_001, 90_002}
 
 
-def test_warmup_collects_without_learning_and_a_run_of_nothing_else_says_so(
+def test_warmup_collects_without_learning(
     tmp_path: Path,
 ) -> None:
     settings = config(schedule={"env_steps": 400, "warmup_env_steps": 400})
@@ -414,7 +414,7 @@ def test_a_run_whose_updates_were_all_on_the_logs_says_so(tmp_path: Path) -> Non
     assert no_update(dataclasses.replace(outcome, env_steps=0), settings) is None
 
 
-def test_updates_in_the_twin_count_however_many_on_the_logs_were_asked_for(tmp_path: Path) -> None:
+def test_updates_in_the_twin_are_counted_apart(tmp_path: Path) -> None:
     settings = config(schedule={"env_steps": 600, "offline_updates": 10_000})
     live = session(tmp_path / "a", settings, logs=None)
     outcome = train(live)
@@ -423,9 +423,7 @@ def test_updates_in_the_twin_count_however_many_on_the_logs_were_asked_for(tmp_p
     assert no_update(outcome, settings) is None
 
 
-def test_a_run_whose_budget_is_used_up_says_so_when_it_is_resumed(
-    undisturbed: Session, tmp_path: Path
-) -> None:
+def test_resumed_run_says_that_its_budget_is_used_up(undisturbed: Session, tmp_path: Path) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
 
     def said(**schedule: Any) -> str:
@@ -466,9 +464,7 @@ def test_a_resume_that_has_nothing_to_do_changes_nothing_on_disk(tmp_path: Path)
     assert files() == before
 
 
-def test_a_resume_that_is_interrupted_at_once_keeps_the_earlier_checkpoints(
-    undisturbed: Session, tmp_path: Path
-) -> None:
+def test_interrupted_resume_keeps_earlier_checkpoints(undisturbed: Session, tmp_path: Path) -> None:
     path = Path(shutil.copytree(undisturbed.run.path, tmp_path / "run"))
     latest = path / "checkpoints" / undisturbed.run.latest.name
     kept = list(earlier(latest))
@@ -617,7 +613,7 @@ def test_a_run_with_every_term_resumes_bit_exactly(tmp_path: Path) -> None:
     assert_same_run(whole, second)
 
 
-def test_a_condition_that_cannot_run_is_refused_before_the_first_step(tmp_path: Path) -> None:
+def test_condition_that_cannot_run_is_refused_first(tmp_path: Path) -> None:
     broken = Condition("wet", "pre", "humidity > 3")
     with pytest.raises(ConfigError, match="condition 'wet'"):
         session(tmp_path / "a", config(), conditions=[broken])

@@ -23,7 +23,7 @@ def test_td_target_by_hand() -> None:
     assert target.tolist() == pytest.approx([4.6, 1.0])
 
 
-def test_double_dqn_selects_with_the_online_and_evaluates_with_the_target_network() -> None:
+def test_double_dqn_selects_online_and_evaluates_with_target() -> None:
     online = tensor([[9.0, 1.0]])  # prefers action 0
     slow = tensor([[2.0, 4.0]])  # values it 2, though its own best is worth 4
     reward, discount = tensor([1.0]), tensor([0.5])

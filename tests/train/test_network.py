@@ -24,7 +24,7 @@ def test_the_seed_decides_the_weights_whatever_the_global_state() -> None:
     assert not torch.equal(first["advantage.weight"], seeded(8).state_dict()["advantage.weight"])
 
 
-def test_layer_norm_makes_features_independent_of_the_scale_of_a_layers_output() -> None:
+def test_layer_norm_makes_features_independent_of_scale() -> None:
     network = seeded()
     observation = torch.randn(6, 5, generator=torch.Generator().manual_seed(0))
     before = network(observation)

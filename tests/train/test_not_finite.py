@@ -42,7 +42,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_changed_byte_of_the_panel_is_refused_before_anything_is_written(
+def test_changed_byte_of_the_panel_is_refused_first(
     panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -121,7 +121,7 @@ def test_a_fresh_row_is_named_by_its_episode_and_step(tmp_path: Path) -> None:
     assert named == {(int(ring.meta["episode"][5]), int(ring.meta["episode_step"][5]))}
 
 
-def test_a_network_that_is_not_finite_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
+def test_nonfinite_network_is_neither_recorded_nor_kept(tmp_path: Path) -> None:
     settings = config()
     live = session(tmp_path / "run", settings)
     seen: list[str] = []

@@ -121,7 +121,7 @@ def test_success_is_arriving_before_any_contact(tmp_path: Path) -> None:
     assert measured.rows.terminated.sum() == sum(ends)
 
 
-def test_a_held_out_end_of_an_episode_is_measured_from_its_own_start(tmp_path: Path) -> None:
+def test_held_out_end_is_measured_from_its_own_start(tmp_path: Path) -> None:
     """A contact before it left none of its rows, and the evaluation ended in an IndexError."""
     with Store(write_store(tmp_path / "store", [recording_transitions(1)])) as opened:
         found = opened.sql(
@@ -137,7 +137,7 @@ def test_a_held_out_end_of_an_episode_is_measured_from_its_own_start(tmp_path: P
     assert not steps.bumped_before[first].any()
 
 
-def test_weights_are_of_logged_probabilities_and_of_cloned_ones_where_there_are_none(
+def test_weights_use_logged_or_else_cloned_probabilities(
     panel: Panel,
 ) -> None:
     dataset = load_ope_dataset(panel, TASK)
@@ -168,7 +168,7 @@ def _known(steps: OpeSteps) -> OpeSteps:
     return replace(steps, probability=np.full(len(steps.rows), 0.3))
 
 
-def test_soft_greedy_is_a_distribution_with_its_probability_on_the_best() -> None:
+def test_soft_greedy_puts_its_probability_on_the_best() -> None:
     network = DQN(LossConfig()).make_network(NETWORK, 4, 3, torch.Generator().manual_seed(1))
     observation = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     probability = soft_greedy(network, observation, 0.3)

@@ -146,7 +146,7 @@ def test_weights_of_the_same_policy_are_all_one() -> None:
     assert EssGate().refusal(same) is None
 
 
-def test_the_gate_refuses_a_policy_far_away_and_says_how_far_they_agree() -> None:
+def test_gate_refuses_a_policy_far_from_the_logs() -> None:
     far = np.tile([0.97, 0.03], (STATES, 1))
     away = logged(60, 4, CHAIN.q(far), far)
     answers = {e.estimator: e for e in _estimates(away)}
@@ -167,7 +167,7 @@ def test_too_few_episodes_are_not_called_a_policy_that_disagrees() -> None:
     assert answers["fqe"] is None
 
 
-def test_a_deterministic_policy_that_no_episode_followed_is_refused_and_not_divided_by() -> None:
+def test_policy_that_no_episode_followed_is_refused() -> None:
     stay = np.tile([1.0, 0.0], (STATES, 1))
     away = logged(30, 5, NO_MODEL, stay)
     assert effective_episodes(away.ratio)[-1] == 0.0

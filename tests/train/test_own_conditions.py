@@ -62,7 +62,7 @@ def train(folder: Path, run: str, *more: str) -> int:
     return main(["train", *given, *profile, *settings, *more])
 
 
-def test_a_dry_run_says_which_conditions_its_twin_cannot_evaluate(
+def test_dry_run_names_conditions_the_twin_cannot_evaluate(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()

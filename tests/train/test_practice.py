@@ -142,7 +142,7 @@ def test_old_episodes_fade_by_their_half_life() -> None:
     assert found.failure_rate[0] == pytest.approx(0.5, abs=0.04)
 
 
-def test_shares_move_at_interval_ends_and_by_no_more_than_the_limit() -> None:
+def test_shares_move_at_interval_ends_within_the_limit() -> None:
     reported: list[list[float]] = []
     settings = PracticeConfig(rule="success", every_env_steps=100)
     found = Practice(settings, ARMS, reported.append)
@@ -211,7 +211,7 @@ def test_nothing_is_written_for_a_practice_that_cannot_be(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_twin_that_takes_no_shares_is_refused_but_for_the_natural_rule(tmp_path: Path) -> None:
+def test_twin_without_shares_allows_only_the_natural_rule(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="ToyTwin cannot be given shares"):
         session(tmp_path / "even", config(practice={"rule": "even"}))
 
@@ -272,7 +272,7 @@ def test_a_run_of_other_arms_is_not_resumed(tmp_path: Path) -> None:
 # -- the warehouse --------------------------------------------------------------------------------
 
 
-def test_the_warehouse_draws_missions_of_the_arms_that_are_asked_for() -> None:
+def test_warehouse_draws_missions_of_the_requested_arms() -> None:
     twin = WarehouseVectorEnv(2, seed=3)
     names = [arm.name for arm in twin.mission_arms(["block"])]
     assert names[2:4] == ["blocked_aisle (partial)", "blocked_aisle (full)"]
@@ -311,7 +311,7 @@ def test_an_order_is_an_arm_and_says_so() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path) -> None:
+def test_practice_repeats_from_an_earlier_checkpoint(tmp_path: Path) -> None:
     settings = [
         *("env.num_envs=4", "schedule.env_steps=1600", "schedule.warmup_env_steps=200"),
         *("replay.batch_size=16", "record.checkpoint_every_env_steps=800", "evaluation.episodes=1"),
@@ -333,7 +333,7 @@ def test_a_run_in_the_warehouse_goes_back_and_practises_as_it_did(tmp_path: Path
 # -- the gate -------------------------------------------------------------------------------------
 
 
-def test_runs_practised_differently_are_compared_as_practice_alone(tmp_path: Path, capsys) -> None:
+def test_different_practice_is_compared_as_practice_alone(tmp_path: Path, capsys) -> None:
     first = str(make_run(tmp_path / "a", document(0)))
     even = str(make_run(tmp_path / "b", document(1, config__practice__rule="even"), success=0.7))
     for treatment, code in (("algorithm", 1), ("mixture", 1), ("practice", 0)):

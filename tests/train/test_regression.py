@@ -81,9 +81,7 @@ def verdicts(rows: list[dict[str, object]], perturbation: str = "none") -> dict[
     return {r["condition"]: r["verdict"] for r in rows if r["perturbation"] == perturbation}
 
 
-def test_what_fell_is_worse_what_rose_is_better_and_the_rest_is_left_open(
-    baseline: Path, tmp_path: Path
-) -> None:
+def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path) -> None:
     other = evaluated(
         tmp_path / "b", {"nominal": 1.0, "wheel_slip": 0.2, "blocked_aisle": 0.9}, shuffle=3
     )

@@ -111,7 +111,7 @@ def test_a_row_with_a_missing_or_unknown_column_is_refused(tmp_path: Path) -> No
         run.append_columns("policies", {"rows": [1]})
 
 
-def test_a_run_is_named_by_its_path_or_its_text_and_an_unknown_table_is_refused(
+def test_run_is_named_by_path_or_text(
     tmp_path: Path,
 ) -> None:
     Run.create(str(tmp_path / "a"), {"seed": 1})

@@ -172,9 +172,7 @@ def test_a_panel_read_in_chunks_gives_the_rows_it_names(table: pa.Table, tmp_pat
         batches.draw_offline()
 
 
-def test_the_surplus_of_a_stratum_that_is_used_up_goes_to_the_others(
-    table: pa.Table, tmp_path: Path
-) -> None:
+def test_surplus_of_a_used_up_stratum_goes_to_the_others(table: pa.Table, tmp_path: Path) -> None:
     text = "max_replays_per_row = 20\n[[strata]]\nname = 'near_collision'\nshare = 0.5\n"
     built = panel(table, tmp_path / "p", text + "[each_condition]\n")
     draws = draws_of(built, PlannedDraws(online=10))  # it says it will draw next to nothing

@@ -92,7 +92,7 @@ def test_the_target_looks_among_the_plausible_alone() -> None:
     assert td_target(reward, discount, slow, plausible=plausible).tolist() == [1 + 0.5 * 4, 0.0]
 
 
-def test_imitation_is_cross_entropy_over_the_states_with_an_answer() -> None:
+def test_imitation_is_cross_entropy_over_answered_states() -> None:
     logits = of([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8], [0.2, 0.2, 0.6]])
     action = tensor([0, UNKNOWN, 2])
     expected = -(np.log(0.5) + np.log(0.6)) / 2
@@ -143,7 +143,7 @@ def test_the_network_is_filtered() -> None:
     assert one.greedy(observation.numpy()).tolist() == likeliest.tolist()
 
 
-def test_an_unlikely_action_is_chosen_neither_in_acting_nor_in_the_target() -> None:
+def test_unlikely_actions_are_neither_taken_nor_targeted() -> None:
     one = learner(teacher={"source": "logs", "learning_rate": 0.05, "hidden": (16,)})
     behaviour = one.behaviour
     assert behaviour is not None
@@ -258,7 +258,7 @@ def test_cloned_rows_are_drawn_by_the_shares_of_their_strata(tmp_path: Path) -> 
     live.close()
 
 
-def test_half_of_the_rows_are_drawn_mirrored_with_the_opposite_action(tmp_path: Path) -> None:
+def test_half_of_the_rows_are_mirrored_with_their_action(tmp_path: Path) -> None:
     task = load_profile("warehouse_amr").task
     ring = FreshRing(
         4,
@@ -304,7 +304,7 @@ def test_half_of_the_rows_are_drawn_mirrored_with_the_opposite_action(tmp_path: 
     assert np.array_equal(ring.rows[:, ring.columns["observation"]], observed)
 
 
-def test_rows_are_mirrored_where_the_operator_teaches_and_turns_have_their_opposite(
+def test_rows_are_mirrored_if_the_operator_teaches(
     tmp_path: Path,
 ) -> None:
     def mirror(*settings: str) -> bool | None:
@@ -485,7 +485,7 @@ def test_logs_without_a_row_to_clone_are_refused(
         session(tmp_path / "a", settings, **parts)
 
 
-def test_a_teacher_who_is_asked_may_lack_the_default_rows_and_no_others() -> None:
+def test_queried_teacher_may_lack_only_the_default_rows() -> None:
     named = TeacherConfig(source="operator", policies=("opertor",))
     with pytest.raises(ConfigError, match="clones the rows of opertor, but the logs have planner"):
         refuse_nothing_to_learn(named, ["planner"])
@@ -605,7 +605,7 @@ def test_off_policy_evaluation_is_of_the_filtered_policy(taught: Any) -> None:
     np.testing.assert_allclose(probability.sum(axis=1), 1, rtol=1e-6)
 
 
-def test_the_operator_teaches_in_the_warehouse_and_its_state_is_kept() -> None:
+def test_operator_teaches_in_the_warehouse_and_keeps_state() -> None:
     task = load_profile("warehouse_amr").task
     teacher = open_teacher(TeacherConfig(source="operator"), task, seed=0)
     assert teacher is not None

@@ -112,7 +112,7 @@ def test_training_ends_as_ever_where_a_tracker_fails(
     assert "wandb failed, training goes on" in capsys.readouterr().err
 
 
-def test_a_tracker_that_is_not_installed_is_refused_before_anything_is_written(
+def test_tracker_that_is_not_installed_is_refused_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     find = importlib.util.find_spec
@@ -129,7 +129,7 @@ def test_a_tracker_that_is_not_installed_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_mlflow_has_the_curves_the_config_and_what_the_run_was_fed(
+def test_mlflow_has_the_curves_config_and_panel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mlflow", reason="mlflow is not installed: restock[track]")
@@ -195,7 +195,7 @@ def _records(folder: Path) -> Iterator[Any]:
             yield record
 
 
-def test_wandb_has_the_curves_the_config_and_what_the_run_was_fed_offline(
+def test_wandb_has_the_curves_config_and_panel_offline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("wandb", reason="wandb is not installed: restock[track]")

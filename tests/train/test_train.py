@@ -112,7 +112,7 @@ def test_a_run_says_what_fills_its_quotas(panel: Path, tmp_path: Path) -> None:
     assert "in the twin" not in alone
 
 
-def test_a_quota_that_neither_logs_nor_twin_can_fill_is_named_before_the_first_step(
+def test_quota_that_nothing_can_fill_is_named_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     task = load_profile("warehouse_amr").task
@@ -200,9 +200,7 @@ def test_a_run_that_is_being_trained_is_not_resumed(
 
 @pytest.mark.long
 @pytest.mark.parametrize("ended_by", one_in(2, [signal.SIGINT, signal.SIGTERM]))
-def test_ctrl_c_or_a_kill_writes_a_checkpoint_and_says_how_to_go_on(
-    ended_by: signal.Signals, tmp_path: Path
-) -> None:
+def test_ctrl_c_or_a_kill_writes_a_checkpoint(ended_by: signal.Signals, tmp_path: Path) -> None:
     path = tmp_path / "a"
     command = [sys.executable, "-m", "restock", "train", "--out", str(path), *TINY]
     process = subprocess.Popen(
@@ -261,7 +259,7 @@ def test_a_run_killed_at_any_instant_goes_on_bit_exactly(tmp_path: Path, rows: i
 
 
 @pytest.mark.slow
-def test_what_a_run_measures_on_fresh_steps_does_not_depend_on_a_kill(tmp_path: Path) -> None:
+def test_measures_on_fresh_steps_do_not_depend_on_a_kill(tmp_path: Path) -> None:
     class Killed(Exception):
         pass
 
@@ -319,7 +317,7 @@ def test_eval_drives_everyone_through_the_same_episodes(
 
 
 @pytest.mark.long  # test_film and test_eval_run have the shorter ones
-def test_from_python_a_run_is_trained_and_evaluated_as_by_the_commands(
+def test_python_trains_and_evaluates_like_the_commands(
     trained: Path, panel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = [word for word in TINY if word != "--set"]

@@ -127,9 +127,7 @@ def test_a_run_in_blocks_repeats_itself_and_resumes(device: str, tmp_path: Path)
     assert_same_run(whole, resumed)
 
 
-def test_behaviour_and_critic_learn_online_after_the_critic_alone(
-    device: str, tmp_path: Path
-) -> None:
+def test_behaviour_and_critic_learn_after_the_critic_alone(device: str, tmp_path: Path) -> None:
     """Another graph than that of the offline updates, in the same run."""
     changes = {**WAYS["teacher"], "schedule": {"env_steps": 600, "offline_updates": 2 * LONGEST}}
     one = run_to_end(tmp_path / "one", config(**changes))
@@ -222,7 +220,7 @@ def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Pa
     live.close()
 
 
-def test_a_gpu_whose_memory_does_not_suffice_is_said_to_be_too_small() -> None:
+def test_gpu_with_too_little_memory_is_reported() -> None:
     full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 90.00 GiB.")
     error = as_restock_error(full, ["train", "--device", "cuda"])
     assert "GPU's memory does not suffice: CUDA out of memory" in error.what

@@ -114,7 +114,7 @@ def test_an_mcap_holds_the_recordings_own_messages_unchanged(event: Event, shown
     assert {"/map", "/tf_static", "/goal_pose", "/plan"} <= copied.keys()
 
 
-def test_a_scan_of_a_lidar_upside_down_is_shown_as_seen_from_above(event: Event) -> None:
+def test_scan_of_an_inverted_lidar_is_shown_from_above(event: Event) -> None:
     hanging = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
     at_ns = event.row["stamp_ns"]
     with open_recording(RECORDING) as recording:
