@@ -25,7 +25,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.decoding.columns import Ragged
 from restock.ingest.prepared import IngestResult, OnRepeat, Prepared, commit_all
 from restock.ingest.profile.profile import Profile, profile_toml, read_profile_toml
-from restock.ingest.profile.tag_rules import Told, resolve_tags
+from restock.ingest.profile.tag_rules import RecordingTags, resolve_tags
 from restock.ingest.steps.episodes import split, why_none
 from restock.ingest.steps.frames import FIELDS, frame_id_path, plain, transform_fields
 from restock.ingest.steps.needs import as_recorded, read_topics, renamed_inputs
@@ -204,7 +204,7 @@ class _Ingest:
         path: str,
         recording: Recording,
         profile: Profile,
-        reported: Told,
+        reported: RecordingTags,
         repeated: OnRepeat,
         before: Mapping[str, Any] | None,
     ) -> None:

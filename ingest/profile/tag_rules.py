@@ -120,7 +120,7 @@ class TagRules(Checked, frozen=True):
 
 
 @dataclass
-class Told:
+class RecordingTags:
     """Tags of a recording, and what there is to say of them."""
 
     tags: dict[str, str]
@@ -133,7 +133,7 @@ def resolve_tags(
     said: Sequence[Said],
     given: Mapping[str, str],
     before: Mapping[str, str],
-) -> Told:
+) -> RecordingTags:
     """Return the tags of one recording.
 
     Args:
@@ -159,7 +159,7 @@ def resolve_tags(
         notes.append(
             f"tags kept from the earlier ingest: {in_words(kept)} (--tag NAME= removes one)"
         )
-    return Told({name: value for name, value in (reported | kept).items() if value}, notes)
+    return RecordingTags({name: value for name, value in (reported | kept).items() if value}, notes)
 
 
 def _contradiction(

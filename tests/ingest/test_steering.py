@@ -105,7 +105,7 @@ def test_a_pose_that_is_years_before_the_others_changes_nothing() -> None:
 
 
 def test_drives_of_one_robot_are_judged_together() -> None:
-    one = DriveEvidence(driven_m=2.0, asked_rad=1.2, spells=1, tightest_m=0.5)
+    one = DriveEvidence(driven_m=2.0, requested_rad=1.2, spells=1, tightest_m=0.5)
     assert not one.steers
     assert DriveEvidence.joined([one, one]).steers
     assert DriveEvidence.joined([one, one]).tightest_m == 0.5
@@ -114,7 +114,7 @@ def test_drives_of_one_robot_are_judged_together() -> None:
 
 
 def test_a_robot_that_does_not_move_at_all_shows_nothing() -> None:
-    held_up = DriveEvidence(driven_m=0.0, asked_rad=9.0, spells=5)
+    held_up = DriveEvidence(driven_m=0.0, requested_rad=9.0, spells=5)
     assert not held_up.steers
     assert not held_up.pivots
 

@@ -58,12 +58,12 @@ class CommandChoice:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Source:
     fit: Fit
     log_time_ns: Ints  # (N,) ascending
     values: F64  # (N, 2) speed and turn
 
-    def passed_on(self, output: _Told) -> int:
+    def passed_on(self, output: _Source) -> int:
         """Count the changes of `output` to what this topic said last."""
         changed = np.flatnonzero((np.diff(output.values, axis=0) != 0).any(axis=1)) + 1
         at = np.searchsorted(self.log_time_ns, output.log_time_ns[changed], "right") - 1
@@ -93,7 +93,7 @@ def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[F
             break
         first = max(later, key=first.passed_on)
     chosen = [first.fit, *(fit for fit in fitting if fit is not first.fit)]
-    sources: dict[str, _Told] = {}
+    sources: dict[str, _Source] = {}
     inputs = [one for one in reported if one is not first and _feeds(one, first, MIN_SHARE)]
     for one in sorted(inputs, key=lambda one: -one.passed_on(first)):
         sources.setdefault(_policy(one.fit[0].name), one)
@@ -104,22 +104,22 @@ def choose_command(recording: Recording, fitting: Sequence[Fit]) -> tuple[list[F
     return chosen, CommandChoice(lines)
 
 
-def _read(recording: Recording, fit: Fit) -> _Told:
+def _read(recording: Recording, fit: Fit) -> _Source:
     topic, kind = fit
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     values = np.stack([np.asarray(columns.fields[path], np.float64) for path in paths], axis=1)
     order = np.argsort(columns.log_time_ns, kind="stable")
-    return _Told(fit, columns.log_time_ns[order], values[order])
+    return _Source(fit, columns.log_time_ns[order], values[order])
 
 
-def _age_s(one: _Told) -> float:
+def _age_s(one: _Source) -> float:
     """Return four periods of a topic."""
     gaps = np.diff(one.log_time_ns) * 1e-9
     return float(np.clip(round(4 * float(np.median(gaps)), 2), 0.2, 1.0)) if len(gaps) else 0.5
 
 
-def _feeds(one: _Told, output: _Told, share: float) -> bool:
+def _feeds(one: _Source, output: _Source, share: float) -> bool:
     passed = one.passed_on(output)
     enough = passed >= max(MIN_PASSED, share * output.changes)
     return enough and passed > output.passed_on(one)
@@ -136,7 +136,7 @@ def _policy(topic: str) -> str:
     return parts[-1][:64] if parts else name
 
 
-def _lines(name: str, one: _Told, output: _Told) -> list[str]:
+def _lines(name: str, one: _Source, output: _Source) -> list[str]:
     topic, kind = one.fit
     fields = ", ".join(f'{key} = "{path}"' for key, path in kind.fields.items())
     return [
@@ -255,13 +255,13 @@ def _judge(on: list[float], stopped: list[float], stood: int, went: int) -> Comm
     return CommandHold(age, holds, tuple(comments))
 
 
-def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
+def settled_speeds(command_s: F64, reported: F64, at_s: F64, measured: F64, fastest: float) -> F64:
     """Return the measured speeds (K,) once the fastest commands had settled.
 
     They are positive along the command.
 
     Args:
-        told_s, told: time and value of the commands (N,), in order.
+        command_s, reported: time and value of the commands (N,), in order.
         at_s, measured: of the odometry (M,), on the same clock.
         fastest: that was commanded now and then; above 0.
     """
@@ -272,11 +272,11 @@ def settled_speeds(told_s: F64, reported: F64, at_s: F64, measured: F64, fastest
     begins = np.append(
         True, (fast[1:] != fast[:-1]) | (np.sign(reported[1:]) != np.sign(reported[:-1]))
     )
-    since_s = told_s[np.maximum.accumulate(np.where(begins, np.arange(len(reported)), 0))]
-    index = np.searchsorted(told_s, at_s, "right") - 1
+    since_s = command_s[np.maximum.accumulate(np.where(begins, np.arange(len(reported)), 0))]
+    index = np.searchsorted(command_s, at_s, "right") - 1
     row = np.maximum(index, 0)
     settled = (index >= 0) & fast[row] & (at_s - since_s[row] >= SETTLED_S)
-    settled &= at_s - told_s[row] < SETTLED_S  # the command is no old one
+    settled &= at_s - command_s[row] < SETTLED_S  # the command is no old one
     along = (measured * np.sign(reported[row]))[settled]
     return np.asarray(along[np.isfinite(along)], np.float64)
 
@@ -439,12 +439,12 @@ def settled_at_most(
     paths = list(kind.fields.values())
     columns = recording.read({topic.name: paths})[topic.name]
     order = np.argsort(times, kind="stable")
-    told_s = np.asarray((times[order] - times[order[0]]) * 1e-9, np.float64)
+    command_s = np.asarray((times[order] - times[order[0]]) * 1e-9, np.float64)
     at_s = np.asarray((columns.log_time_ns - times[order[0]]) * 1e-9, np.float64)
     fastest = commands.speed_mps, commands.yaw_rate_radps
     found = [
         settled_speeds(
-            told_s, reported[order], at_s, np.asarray(columns.fields[path], np.float64), most
+            command_s, reported[order], at_s, np.asarray(columns.fields[path], np.float64), most
         )
         for reported, path, most in zip((speed, turn), paths, fastest, strict=True)
     ]
@@ -481,8 +481,10 @@ def wheelbase_of(
     angled = bool(roles["command"]) and "steering_rad" in roles["command"][0][1].fields
     if robot.described or not angled or poses is None or len(poses) < 2:
         return robot
-    told_s, _, told_rad, since = _since(recording, roles, poses, angles=True)
-    wheelbase_m = shown_wheelbase_m(told_s, told_rad, since, robot.values.get("max_steering_rad"))
+    command_s, _, command_rad, since = _since(recording, roles, poses, angles=True)
+    wheelbase_m = shown_wheelbase_m(
+        command_s, command_rad, since, robot.values.get("max_steering_rad")
+    )
     return robot if wheelbase_m is None else robot.with_wheelbase(wheelbase_m)
 
 

@@ -242,8 +242,8 @@ def gather(
         upside_down=footprint.upside_down,
         lidar_yaw_rad=(footprint.lidar_yaw_rad or 0.0) if footprint.lidar_aside else 0.0,
     )
-    turned, told_rad = how_it_turned(recording, roles, poses)
-    robot = robot.driven(turned, footprint.length_m, told_rad=told_rad)
+    turned, command_rad = how_it_turned(recording, roles, poses)
+    robot = robot.driven(turned, footprint.length_m, command_rad=command_rad)
     robot = wheelbase_of(recording, roles, poses, robot)
     wheelbase_m = robot.values.get("wheelbase_m")
     commands, gaps, hold = read_commands(recording, roles, poses, wheelbase_m)

@@ -53,7 +53,7 @@ class DriveEvidence:
 
     driven_m: float = 0.0
     pivoted_rad: float = 0.0  # in turns on the spot
-    asked_rad: float = 0.0  # by commands to turn on the spot
+    requested_rad: float = 0.0  # by commands to turn on the spot
     spells: int = 0  # of such commands
     followed_rad: float = 0.0  # of what they asked for
     curved_rad: float = 0.0  # turned while it drove
@@ -62,16 +62,16 @@ class DriveEvidence:
     @property
     def pivots(self) -> bool:
         """Return whether it turns on the spot."""
-        turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.asked_rad)
-        half = self.asked_rad >= MIN_HALF_RAD and self.followed_rad >= self.asked_rad / 2
+        turned = self.pivoted_rad >= max(MIN_PIVOT_RAD, FOLLOWS * self.requested_rad)
+        half = self.requested_rad >= MIN_HALF_RAD and self.followed_rad >= self.requested_rad / 2
         return turned or half
 
     @property
     def steers(self) -> bool:
         """Return whether it did not turn on the spot when told to, though it can move."""
-        reported = self.asked_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
+        reported = self.requested_rad >= MIN_ASKED_RAD and self.spells >= MIN_SPELLS
         drove = self.driven_m >= MIN_DRIVEN_M
-        followed = self.followed_rad >= FOLLOWS * self.asked_rad
+        followed = self.followed_rad >= FOLLOWS * self.requested_rad
         return reported and drove and not followed and not self.pivots
 
     @property
@@ -81,12 +81,12 @@ class DriveEvidence:
             turned = max(self.pivoted_rad, self.followed_rad)
             return f"it turned on the spot, by {turned:.1f} rad in all"
         requested = (
-            f"commanded to turn on the spot, by {self.asked_rad:.1f} rad in all, it turned by"
+            f"commanded to turn on the spot, by {self.requested_rad:.1f} rad in all, it turned by"
         )
         requested += f" {max(self.followed_rad, 0.0):.1f}"
         if self.steers:
             return f"{requested}, though it drove {self.driven_m:.1f} m"
-        if self.asked_rad:
+        if self.requested_rad:
             return f"{requested}: too little to tell"
         turns = f"{self.curved_rad:.1f} rad of turns in {self.driven_m:.1f} m"
         return f"in {turns} it never turned on the spot, and was never commanded to"
@@ -99,7 +99,7 @@ class DriveEvidence:
         return DriveEvidence(
             driven_m=sum(one.driven_m for one in drives),
             pivoted_rad=sum(one.pivoted_rad for one in drives),
-            asked_rad=sum(one.asked_rad for one in drives),
+            requested_rad=sum(one.requested_rad for one in drives),
             spells=sum(one.spells for one in drives),
             followed_rad=sum(one.followed_rad for one in drives),
             curved_rad=sum(one.curved_rad for one in drives),
@@ -107,14 +107,16 @@ class DriveEvidence:
         )
 
 
-def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries) -> DriveEvidence:
+def drive_evidence(
+    command_s: F64, command_mps: F64, command_radps: F64, poses: PoseSeries
+) -> DriveEvidence:
     """Read from one drive whether its robot steers as a car.
 
     Args:
-        told_s, told_mps, told_radps: of the commands (N,), in order, on the clock of `poses`.
+        command_s, command_mps, command_radps: the commands (N,), in order, on the clock of `poses`.
         poses: of the robot, from the same 0.
     """
-    if len(told_s) < 2 or len(poses) < 3:
+    if len(command_s) < 2 or len(poses) < 3:
         return DriveEvidence()
     changes = np.flatnonzero((np.diff(poses.x_m) != 0) | (np.diff(poses.yaw_rad) != 0))
     pace_s = float(np.median(np.diff(poses.stamp_ns[changes]))) * 1e-9 if len(changes) > 2 else 0.1
@@ -128,9 +130,9 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     way = np.hypot(speed, sideways)
     spot = (np.abs(turn) >= TURNS_RADPS) & (way <= SPOT_M * np.abs(turn))
     spot = _spells_of(spot, round(max(MIN_PIVOT_S, window_s) / tick_s))
-    sharp = float(np.percentile(np.abs(told_radps), 98))
-    fast = float(np.percentile(np.abs(told_mps), 98))
-    requested, spells, followed = _on_the_spot(told_s, told_mps, told_radps, poses, sharp)
+    sharp = float(np.percentile(np.abs(command_radps), 98))
+    fast = float(np.percentile(np.abs(command_mps), 98))
+    requested, spells, followed = _on_the_spot(command_s, command_mps, command_radps, poses, sharp)
     drives = (way >= max(0.05, 0.2 * fast)) & (np.abs(speed) >= 0.9 * way)
     moves = (way >= STANDS_MPS) & ~spot
     curves = drives & (np.abs(turn) >= TURNS_RADPS)
@@ -138,7 +140,7 @@ def drive_evidence(told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSerie
     return DriveEvidence(
         driven_m=float(way[moves].sum() * tick_s),
         pivoted_rad=float(np.abs(turn[spot]).sum() * tick_s),
-        asked_rad=requested,
+        requested_rad=requested,
         spells=spells,
         followed_rad=followed,
         curved_rad=float(np.abs(turn[curves]).sum() * tick_s),
@@ -170,37 +172,38 @@ def _spells_of(flags: Bools, least: int) -> Bools:
 
 
 def _on_the_spot(
-    told_s: F64, told_mps: F64, told_radps: F64, poses: PoseSeries, sharp: float
+    command_s: F64, command_mps: F64, command_radps: F64, poses: PoseSeries, sharp: float
 ) -> tuple[float, int, float]:
     """Return how far (rad) and how often it was told to turn on the spot, and how far it did."""
     at = np.asarray(poses.stamp_ns * 1e-9, np.float64)
     heading = np.concatenate([[0.0], np.cumsum(wrap_angle(np.diff(poses.yaw_rad)))])
-    side = np.sign(told_radps) * (
-        (np.abs(told_mps) <= STANDS_MPS) & (np.abs(told_radps) >= max(MUCH * sharp, TURNS_RADPS))
+    side = np.sign(command_radps) * (
+        (np.abs(command_mps) <= STANDS_MPS)
+        & (np.abs(command_radps) >= max(MUCH * sharp, TURNS_RADPS))
     )
-    hold = np.minimum(np.append(np.diff(told_s), SETTLED_S), SETTLED_S)
+    hold = np.minimum(np.append(np.diff(command_s), SETTLED_S), SETTLED_S)
     begins = np.flatnonzero(np.append(True, np.diff(side) != 0))
     requested, spells, followed = 0.0, 0, 0.0
     for first, behind in zip(begins, np.append(begins[1:], len(side)), strict=True):
-        begin, end = told_s[first], told_s[behind - 1] + hold[behind - 1]
+        begin, end = command_s[first], command_s[behind - 1] + hold[behind - 1]
         if not side[first] or begin < at[0] or end > at[-1]:
             continue
         turned = np.diff(np.interp([begin, end + ANSWERED_S], at, heading))[0] * side[first]
-        requested += float((np.abs(told_radps) * hold)[first:behind].sum())
+        requested += float((np.abs(command_radps) * hold)[first:behind].sum())
         followed += float(turned)
         spells += 1
     return requested, spells, followed
 
 
 def shown_wheelbase_m(
-    told_s: F64, told_rad: F64, poses: PoseSeries, steering_rad: float | None
+    command_s: F64, command_rad: F64, poses: PoseSeries, steering_rad: float | None
 ) -> float | None:
     """Fit the wheelbase by which steering angles (N,) explain how the robot turned.
 
     None if they do not explain it.
 
     Args:
-        told_s, told_rad: time and angle of the commands, in order, on the clock of `poses`.
+        command_s, command_rad: time and angle of the commands, in order, on the clock of `poses`.
         poses: of the robot, from the same 0.
         steering_rad: the largest angle; None: the usual one.
     """
@@ -211,15 +214,15 @@ def shown_wheelbase_m(
     middle_s = ticks * 1e-9 - window_s / 2
     best_m, least = None, UNEXPLAINED
     for delay_s in DELAYS_S:
-        index = np.searchsorted(told_s, middle_s - delay_s, "right") - 1
+        index = np.searchsorted(command_s, middle_s - delay_s, "right") - 1
         row = np.maximum(index, 0)
         used = (index >= 0) & (motion.problem == "") & (np.abs(motion.forward_mps) > 0.05)
-        used &= (middle_s - told_s[row] < SETTLED_S) & (np.abs(told_rad[row]) > 0.03)
+        used &= (middle_s - command_s[row] < SETTLED_S) & (np.abs(command_rad[row]) > 0.03)
         turned = motion.yaw_rate_radps[used]
         if used.sum() < MIN_TURNS or not turned.any():
             continue
         # The yaw rate times the wheelbase, by the angle.
-        by_angle = motion.forward_mps[used] * np.tan(np.clip(told_rad[row[used]], -most, most))
+        by_angle = motion.forward_mps[used] * np.tan(np.clip(command_rad[row[used]], -most, most))
         base_m = float((by_angle**2).sum() / (turned @ by_angle))
         if not WHEELBASES_M[0] <= base_m <= WHEELBASES_M[1]:
             continue
@@ -256,29 +259,29 @@ class RobotProposal:
         return self.values.get("drive") == "ackermann" and not self.described
 
     def driven(
-        self, shown: DriveEvidence, length_m: float, *, told_rad: float | None = None
+        self, shown: DriveEvidence, length_m: float, *, command_rad: float | None = None
     ) -> RobotProposal:
         """Add the drive that its logs show, if no description gives one.
 
         Args:
             shown: how it turned.
             length_m: of its outline, by which the wheelbase is guessed.
-            told_rad: the sharpest of its commands, where they are steering angles.
+            command_rad: the sharpest of its commands, where they are steering angles.
         """
         if self.described:
             return self
         values = {k: v for k, v in self.values.items() if k not in _OF_STEERING}
         origin = {key: said for key, said in self.origin.items() if key in values}
-        if told_rad is None and not shown.steers:
+        if command_rad is None and not shown.steers:
             said = shown.why if shown.pivots else f"A GUESS, as its logs do not tell: {shown.why}"
             return replace(self, values=values, origin=origin, drive_why=said)
         wheelbase_m = round(WHEELBASE_PART * length_m, 3)
         values |= {"drive": "ackermann", "wheelbase_m": wheelbase_m}
         origin |= {"drive": "logs", "wheelbase_m": "default"}
         sharpest = USUAL_STEERING_RAD
-        if told_rad is not None:
+        if command_rad is not None:
             why = "its commands are steering angles"
-            sharpest = max(sharpest, told_rad)
+            sharpest = max(sharpest, command_rad)
         else:
             why = f"CONFIRM THAT IT STEERS LIKE A CAR: {shown.why}"
             if shown.tightest_m is not None:
