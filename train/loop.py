@@ -73,10 +73,10 @@ def train(
     """Run a session to the end of its budget; one that is there already is left as it is.
 
     Args:
-        stop: asked between steps and while the policy is evaluated; True ends the run with a
+        stop: called between steps and while the policy is evaluated; True ends the run with a
             checkpoint. An evaluation under way is abandoned, and made by the run that goes on.
-        notify: told of every row of `progress`, every evaluation, a teacher without opinions, and
-            the notes of an off-policy evaluation on its logs.
+        notify: called with every row of `progress`, every evaluation, a teacher without opinions,
+            and the notes of an off-policy evaluation on its logs.
 
     Raises:
         TrainingInterrupted: `stop` said so.
@@ -125,7 +125,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
 
     if progress.driving_from_s is None:
         progress.driving_from_s = session.wall_s
-    _evaluate_if_due(session, notify, stop)  # where the run stopped while it did
+    _evaluate_if_due(session, notify, stop)  # if the run stopped during one
     while progress.env_steps < schedule.env_steps and time_left(session):
         _interrupt(session, stop)
         # 2. Warm-up: what came of the logs drives, and nothing is learnt from its rows yet.
@@ -165,7 +165,7 @@ def _train(session: Session, stop: Callable[[], bool], notify: Notify) -> TrainR
             session.interval.episodes += 1
             session.interval.successes += bool(episode.success)
             session.interval.returns += episode.undiscounted_return
-        # … and where an interval of practice ends, the twin's next missions get its shares.
+        # … and when an interval of practice ends, the twin's next missions get its shares.
         session.practice.note(ended)
         session.run.append("practice", session.practice.advance(session.steps))
 

@@ -107,7 +107,7 @@ class Prepared:
             try:
                 session = self._session(run, env, teacher, layouts, episodes)
             except BaseException:
-                if self.resumed is None:  # a run that never began is in nobody's way
+                if self.resumed is None:  # leave no folder of a run that never began
                     shutil.rmtree(self.path, ignore_errors=True)
                 raise
         except BaseException:
@@ -177,9 +177,9 @@ def train(
         config: a config, the path of its TOML file, or None for the defaults.
         panel: the folder of a panel; None: online only.
         settings: `key.path=value`, over the config.
-        teacher: who is asked in the twin, in place of what `teacher.source` names: an object with
+        teacher: queried in the twin, in place of what `teacher.source` names: an object with
             `act(env, observation)`, or a function like it, that gives actions (N,).
-        stop: asked between steps; True ends the run with a checkpoint.
+        stop: called between steps; True ends the run with a checkpoint.
         notify: called for every row of `progress` and every evaluation.
 
     Raises:
@@ -283,7 +283,7 @@ def prepare_resumed(
         )
     if config.teacher.mirror:
         mirrors(config.teacher, profile.task)
-    panel = run_panel(run.document)  # refused where it is gone, or another is there
+    panel = run_panel(run.document)  # refused if it is gone or has been replaced
     if panel is not None:
         panel = open_panel(panel.path, config, profile)
     if from_env_steps is not None:
@@ -301,7 +301,7 @@ def told_in_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
 
 
 def _never_driven(names: Sequence[str], config: TrainConfig) -> Bools:
-    """Return which strata (S,) are of kinds of missions that the twin is told not to drive."""
+    """Return which strata (S,) are of kinds of missions that the twin never drives."""
     env = config.env
     return np.array(
         [name in KINDS and not env.conditions.get(name) and env.missions is None for name in names]

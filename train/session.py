@@ -126,7 +126,7 @@ class Session(Stateful):
     practice: Practice
     imitation: Imitation | None  # what the behaviour network learns from
     lock: RunLock | None = None  # held while this process writes the run
-    blocks: UpdateBlocks | None = None  # makes updates, where the learner is not on the CPU
+    blocks: UpdateBlocks | None = None  # makes updates, if the learner is not on the CPU
     progress: Progress = field(default_factory=Progress)
     interval: Interval = field(default_factory=Interval)
     best: Score | None = None

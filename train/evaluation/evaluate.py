@@ -46,7 +46,7 @@ class EpisodeResult:
     perturbation_values: str = "{}"  # JSON: those that are not nominal
     layout: str = "default"
     distance_m: float | None = None  # driven, over ground
-    closest_person_m: float | None = None  # body edge to edge; None: nobody was about
+    closest_person_m: float | None = None  # body edge to edge; None: there was no person
     discounted_return: float | None = None  # None: no discount was named
     limited_s: float | None = None  # that a limiter held a command back; None: there was none
     stopped_s: float | None = None  # of that, to a stop
@@ -208,8 +208,8 @@ def _failure(terminated: bool, early: bool, still: bool) -> str:
 class Score:
     """What a greedy evaluation came to."""
 
-    success: dict[str, float]  # per condition; empty where the task has no goal
-    success_mean: float  # over conditions, each counting the same; 0 where there is no goal
+    success: dict[str, float]  # per condition; empty if the task has no goal
+    success_mean: float  # over conditions, each counting the same; 0 without a goal
     return_mean: float
 
     def beats(self, other: Score | None) -> bool:

@@ -80,7 +80,7 @@ class EvaluationBuffer:
         step: Step = collector.start(action, np.ones(len(action), np.float32))
         ended = collector.finish(env_steps=0, gradient_steps=0, acting_step=0)
         number = step[4]["episode_number"]
-        # Beyond the fixed episodes an environment drives on, and nobody asked for those.
+        # Environments drive on after their fixed episodes: those steps do not count.
         collector.forget([episode for episode in ended if number[episode.env] < 0])
         return step
 

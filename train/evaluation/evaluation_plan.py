@@ -53,7 +53,7 @@ class EvaluationPlan:
     run: Run
     config: TrainConfig
     policies: tuple[str, ...]
-    perturbations: dict[str, Perturbation | None]  # by the name or file that was asked for
+    perturbations: dict[str, Perturbation | None]  # by the requested name or file
     episodes: Mapping[str, int]  # by kind
     first_seed: int = FIRST_SEED
     num_envs: int = 32
@@ -66,7 +66,7 @@ class EvaluationPlan:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of episodes that were asked for and every floor has room for."""
+        """The requested kinds of episodes that every floor has room for."""
         fit = [kind for kind in KINDS if kind in self.episodes and kind not in self.left_out]
         if self.missions is not None:
             fit = [kind for kind in fit if kind in self.missions.specs]
@@ -196,7 +196,7 @@ def refuse_unknown(
 
 
 def episodes_of_kind(requested: int | str | Mapping[str, int]) -> dict[str, int]:
-    """Episodes by kind: so many of each, or those that are named, as text `kind=N,kind=N`.
+    """Episodes by kind: a number for all, or for each as the text `kind=N,kind=N`.
 
     Raises:
         ConfigError: no such kind, or not a number of at least 1.

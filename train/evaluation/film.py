@@ -53,7 +53,7 @@ class Scene:
 
     kind: str  # WORST or RESCUE
     row: dict[str, Any]  # the agent's, of RUN/eval/episodes.parquet
-    other: dict[str, Any] | None = None  # of a rescue: whoever failed where the agent arrived
+    other: dict[str, Any] | None = None  # of a rescue: who failed while the agent arrived
 
     @property
     def name(self) -> str:

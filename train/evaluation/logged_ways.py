@@ -207,7 +207,7 @@ def _in_frame(way: Way, floor: Warehouse) -> Way:
 
 
 def _undrivable(way: Way, floor: Warehouse, planner: Planner, radius_m: float) -> str | None:
-    """Why a way cannot be driven on a floor, None where it can."""
+    """Return why a way cannot be driven on a floor; None if it can."""
     x, y, _, goal_x, goal_y = way
     inside = all(
         0 <= px <= floor.width_m and 0 <= py <= floor.depth_m

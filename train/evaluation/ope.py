@@ -58,14 +58,14 @@ class OpeConfig(Checked, frozen=True):
     epsilon: Annotated[float, Meta(ge=0, le=1)] = 0.1  # of the greedy policy made soft
     horizon: Annotated[int, Meta(ge=1)] | None = None  # steps that are weighted; None: all
     ess_share: Annotated[float, Meta(ge=0, le=1)] = 0.2  # of the episodes, that weights must reach
-    ess_episodes: float = 5.0  # … and at least so many
+    ess_episodes: float = 5.0  # … and at least this many
     seed: int = 0
     model: FittedQConfig = FittedQConfig()
 
 
 @dataclass(frozen=True)
 class OpeResult:
-    """The rows of `off_policy`, and what is worth saying of the logs."""
+    """The rows of `off_policy`, and notes on the logs."""
 
     rows: list[dict[str, Any]]
     notes: tuple[str, ...]

@@ -26,7 +26,7 @@ from restock.train.twin.env.interface import Policy
 
 
 class GreedyPolicy:
-    """A Q network, always taking its best action, among the plausible where it is filtered."""
+    """A Q network that always takes its best action, or its best plausible one if filtered."""
 
     name = "agent"
 

@@ -28,7 +28,7 @@ from restock.train.run.run_tables import EVAL_EPISODES
 from restock.words import counted, quoted
 
 AGENT = "agent"
-FOLDER = Path("baselines")  # where names are looked up, in the working directory
+FOLDER = Path("baselines")  # in the working directory: names are looked up there
 EVERY = "all"
 Verdict = Literal["better", "worse", "no difference shown", "inconclusive", "refused"]
 MIN_EPISODES = 10  # of a row; fewer give no interval and no verdict
@@ -207,7 +207,7 @@ def _row(
 
 
 def _too_few(episodes: Sequence[int]) -> str | None:
-    """Why so many episodes of each condition are too few for an interval, or None."""
+    """Return why this many episodes of each condition are too few for an interval, or None."""
     total, least = sum(episodes), min(episodes)
     if total < MIN_EPISODES:
         return f"{counted(total, 'episode')}, at least {MIN_EPISODES} are needed"

@@ -46,7 +46,9 @@ from restock.train.run.run import Run
 
 UNLABELLED = "unlabelled"
 _NS_PER_DAY = 86_400e9
-_MAX_HELD = 1 << 21  # fresh rows; beyond, the oldest interval is written as it is
+_MAX_HELD = (
+    1 << 21
+)  # fresh rows; beyond that, the oldest interval is written without waiting for labels
 _MEANS = ("td_abs_mean", "q_mean", "q_abs_max", "reward_mean", "logs_share")
 
 
@@ -169,7 +171,7 @@ class FeedRecord(Stateful):
         return row_ids(self.logs, *(self._before if before else self._last))
 
     def flush(self, env_steps: int, gradient_steps: int, phase: str) -> dict[str, float | None]:
-        """Close an interval and write what is known of it; returns its means, for `progress`."""
+        """Close an interval, write its known rows, and return its means for `progress`."""
         clocks = {"env_steps": env_steps, "gradient_steps": gradient_steps}
         logged, fresh = self._logged.columns, self._fresh.columns
         drawn = len(self._logged) + len(self._fresh)

@@ -107,7 +107,7 @@ class Collector(Stateful):
         self.conditions = list(conditions)
         self._codes = {name: code for code, name in enumerate(ring.conditions)}
         self._executor = executor
-        self.teacher = teacher  # asked before each step, on the twin's thread
+        self.teacher = teacher  # queried before each step, on the twin's thread
         self._actions = np.asarray(task.actions, np.float64)
         count, length = env.num_envs, task.time_limit_steps + 1
         self._history: dict[str, NDArray[Any]] = {
@@ -196,7 +196,7 @@ class Collector(Stateful):
         """
         if self._sent is None:
             raise RuntimeError("finish() without start()")
-        # Before the result: where the teacher failed, no step was made, and none is under way.
+        # Before the result: if the teacher failed, no step was made, and none is under way.
         (action, probability), self._sent = self._sent, None
         future, self._future = self._future, None
         result, self._result = future.result() if future is not None else self._result, None

@@ -40,7 +40,7 @@ class Flushed:
     status: str  # written | unchanged
     episodes: int
     transitions: int
-    version: int | None  # of the store's transitions, where they were written
+    version: int | None  # of the store's transitions, if they were written
 
 
 def flush(run: Path, store: StoreWriter, profile: Profile, dropped_steps: int = 0) -> Flushed:

@@ -44,7 +44,7 @@ class FreshEpisode:
     reward: F32  # (T,)
     progress_m: F32  # (T,)
     truth: NDArray[np.str_]  # (T,) the true conditions
-    exposure: NDArray[np.str_]  # (T,) the true exposures; empty where the twin does not say
+    exposure: NDArray[np.str_]  # (T,) the true exposures; empty if the twin does not say
     signals: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # (T + 1,) each
     labels: Mapping[str, Bools] = field(default_factory=dict)  # (T + 1,) each
 

@@ -111,7 +111,7 @@ class Imitation(Stateful):
                     *(logs.behaviour_policy, logs.episode, logs.rows.numpy(), config.policies)
                 )
             self._offline = _Drawn.of(logs, every)
-            # A teacher who is asked says more of the agent's states than what others did.
+            # Answers in the agent's own states are worth more than what other drivers did.
             self._online = _Drawn.of(logs, by_teacher) if config.asks else self._offline
         if not len(self._offline.rows):
             names = None if logs is None else logs.behaviour_policy.names[:-1]  # the last: unknown

@@ -52,14 +52,14 @@ class Coded:
 
 @dataclass(frozen=True)
 class Logs:
-    """The logged rows that a run draws from, with what is to be recorded about them."""
+    """The logged rows that a run draws from, with the columns that are recorded about them."""
 
     rows: Tensor  # (n, W) float32
     strata: list[str]
     timings: list[str]  # pre | post, of each stratum
     stratum_rows: list[Ints]  # the rows of each stratum
     shares: NDArray[np.float64]  # (S,)
-    weights: F32 | None  # (n,) importance weights, or None where all are 1
+    weights: F32 | None  # (n,) importance weights, or None if all are 1
     as_of_ns: int  # calendar ages are against it
     transition_id: Ints  # (n,)
     stamp_ns: Ints  # (n,), when each was logged: measurement stamps may be a simulator's
@@ -69,7 +69,7 @@ class Logs:
     episode: Coded
 
     perturbation: Coded | None = None  # of the twin; null for hardware
-    panel: Panel | None = None  # where they are from
+    panel: Panel | None = None  # that they are from
     planned: PlannedDraws = _UNPLANNED  # what the run will draw
     huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
 

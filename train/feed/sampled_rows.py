@@ -31,7 +31,7 @@ LOGGED: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", **_BATCH}  # row: 
 GREEDY: dict[str, DTypeLike] = {"row": "i8", "stratum": "i8", "action": "i8"}  # audited, of logs
 FRESH: dict[str, DTypeLike] = {
     "condition": "i2",  # WAITING while its episode goes on
-    "stratum": "i2",  # of the mixture; as the condition where it has none
+    "stratum": "i2",  # of the mixture; without strata, the condition
     "episode": "i8",  # the ring's key
     "episode_step": "i4",
     "policy": "i2",

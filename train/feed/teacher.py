@@ -1,4 +1,4 @@
-"""Who is asked what it would do where the agent is: the twin's operator, or a teacher of yours."""
+"""The teacher that is queried in the agent's states: the twin's operator, or one of yours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Label = NDArray[np.int16]
 
 @runtime_checkable
 class Teacher(Protocol):
-    """Says what it would do in each of N environments; nobody has to do it.
+    """A driver that says what it would do in each of N environments, without driving them.
 
     It may look at the environment itself, beyond what the observation says. It is asked once a
     step, in order, and once before training begins; where it keeps `state_dict` and
@@ -37,7 +37,7 @@ class Teacher(Protocol):
     """
 
     def act(self, env: Any, observation: F32, /) -> Ints:
-        """Actions (N,) for observations (N, D); -1 where it has no opinion."""
+        """Return actions (N,) for observations (N, D); -1 if it has no opinion."""
         ...
 
 

@@ -27,7 +27,7 @@ from restock.train.feed.imitation import Imitation
 from restock.train.feed.logs import LogTerms
 
 LONGEST = 16  # updates of a block
-# A batch, its loss and its rows' action, reward and discount (B, 3), where they are at hand.
+# A batch, its loss and its rows' action, reward and discount (B, 3), if they are at hand.
 Made = tuple[ReplayBatch, Loss, Tensor | None]
 
 

@@ -24,9 +24,9 @@ class Critic:
     """Of T steps, by the last checkpoint of a run, or by the policy it kept where none is left."""
 
     run: str
-    weights: str  # what was asked, in words
+    weights: str  # which networks: a text for people
     gradient_steps: int
-    value: F64  # (T,) Q of the action that was taken; NaN where it is ruled out
+    value: F64  # (T,) Q of the action that was taken; NaN if it is not plausible
     best: F64  # (T,) the largest Q
     greedy: Ints  # (T,) the action of that
     td: F64  # (T,) Q(s, a) less the target, over one step

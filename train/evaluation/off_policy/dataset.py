@@ -37,7 +37,7 @@ class OpeSteps:
     rows: Transitions
     episode: Ints  # (N,) ascending, the place in `condition`
     condition: NDArray[np.str_]  # (E,) of each episode
-    probability: F64  # (N,) of the action, as logged; NaN where it is not
+    probability: F64  # (N,) of the action, as logged; NaN if it was not logged
     bumps: Bools  # (N,) a contact in [t, t + 1)
     bumped_before: Bools  # (N,) a contact in the episode up to t
 

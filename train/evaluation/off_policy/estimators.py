@@ -115,7 +115,7 @@ class EssGate:
         least, reach = self.measure(logged)
         if reach == logged.ratio.shape[1] and len(logged):
             return None
-        if len(logged) < self.episodes:  # refused even where policy and logs agree to the end
+        if len(logged) < self.episodes:  # refused even if policy and logs agree to the end
             noun = "episode" if len(logged) == 1 else "episodes"
             return f"{len(logged)} {noun}, and weights take at least {self.episodes:g}"
         return (
