@@ -2,9 +2,9 @@
 
 A network whose softmax is the probability of each action in the logs acts by these probabilities,
 as its drivers did, not by the likeliest. Its number of updates is that with the best likelihood on
-episodes set aside; how good a clone it is stands in `RUN/eval/clones.parquet`, by the rows that the
-panel holds out. Observations contain the last action, so that repeating it agrees often: what
-repeating alone would reach stands beside the agreement.
+held-out episodes; `RUN/eval/clones.parquet` says how good the clone is on the rows that the panel
+holds out. Observations contain the last action, so repeating it agrees often: the file also has the
+agreement of repeating alone.
 """
 
 from __future__ import annotations

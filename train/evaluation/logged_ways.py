@@ -1,11 +1,12 @@
 """Missions of the twin from those that robots really drove: start and goal of logged episodes.
 
-A store keeps no goal, but in each row how far it was and, once within reach of the far look-ahead
-point, where. Where the robot never came that near, the distances from along its way tell it,
-unless it hardly moved aside. What is not told, and what the floor has no way for, is counted.
+A store keeps no goal. Each row has the goal's distance and, once the goal is within reach of the
+far look-ahead point, its position. If the robot never came that near, the goal is computed from
+distances along its way, unless it hardly moved aside. Episodes whose goal stays unknown, and those
+that the floor has no way for, are counted.
 
-Recordings may each have a frame of their own. A recording's ways are missions of the floor whose
-frame it is in, of those that there are.
+Recordings may each have a frame of their own. A recording's ways are missions of the floor that has
+the same frame.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A policy as an ONNX file: for a robot that has no PyTorch, and for whatever else can act.
 
-The file says all that is needed to use it rightly: the task (observation entries in order, the
-action table in m/s and rad/s, the control period) stands in its metadata as JSON.
+The file's metadata holds all that is needed to use it, as JSON: the task, with its observation
+entries in order, the action table in m/s and rad/s, and the control period.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The scripted drivers that a policy is measured against: the planner, the operator, a random one.
 
-The planner is what a robot without learning would do; the operator sees pallets, people and wet
-floor as they are, so it is what somebody who knew everything would reach; neither explores here.
+The planner drives as a robot without learning would. The operator sees pallets, people and wet
+floor as they are, so it is an upper bound for a driver that knows everything. Neither explores.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Did a run get worse than a baseline: per perturbation and condition, on the same episodes.
 
 A baseline is another run, or a file that keeps one's evaluation under a name, small enough to be
-committed beside the code that a pipeline tests. Differences are paired by episode: what an episode
-is like is the same for both, so only what the policies made of it is left to vary.
+committed beside the code that a pipeline tests. Differences are paired by episode: both policies
+drive the same episode, so only the policies differ.
 """
 
 from __future__ import annotations

@@ -58,10 +58,10 @@ class FeedRecord(Stateful):
     Args:
         audit_share: of all batches, chosen by `seed`.
         actions: names of the task's; without them there are no rows in `actions`.
-        greedy: the policy's action (B,) for observations (B, D), asked for audited batches.
-        labels: of the ring's episodes as they end; None: nobody tells, and no row waits for them.
-        perturbations: in force in the ring's episodes, where they are known.
-        quotas: what decides the shares of a batch; None: nothing does, and `fed` has no rows.
+        greedy: returns the policy's action (B,) for observations (B, D) of audited batches.
+        labels: of the ring's episodes as they end; None: there are none, and no row waits.
+        perturbations: in force in the ring's episodes, if they are known.
+        quotas: decides the shares of a batch; None: there are no quotas, and `fed` has no rows.
     """
 
     STATE: ClassVar[tuple[str, ...]] = (

@@ -1,9 +1,9 @@
 """What a batch is made of: rows of logs and fresh rows from the twin, both by quota.
 
-The half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948) is put together here,
-from two sources that share one packed row layout, by one gather each. What each stratum has of the
-batch, and how much of it is logged, the share controller says
-(`restock.replay.sampling.share_controller`).
+This module builds the half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948)
+from two sources that share one packed row layout, by one gather each. The share controller
+(`restock.replay.sampling.share_controller`) decides the share of each stratum, and how much of it
+is logged.
 """
 
 from __future__ import annotations
