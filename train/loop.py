@@ -46,7 +46,7 @@ Notify = Callable[[str, dict[str, Any]], None]  # an event's name ("progress", "
 
 
 class TrainingInterrupted(RestockError):
-    """Ctrl-C; there is a checkpoint to go on from."""
+    """A run was interrupted, and has a checkpoint to go on from."""
 
     exit_code = ExitCode.INTERRUPTED
 

@@ -1,4 +1,4 @@
-"""What was collected, kept whole: labelled episodes of the twin, to be put in a store like logs.
+"""Whole labelled episodes of the twin, kept to be put in a store like logs.
 
 The ring keeps packed n-step rows and forgets the oldest. Here every labelled episode is kept in the
 run's directory, steps and signals, until `restock train --flush-fresh STORE` writes them as one
@@ -29,7 +29,7 @@ _KINDS = {"action": "i2", "truth": "<U64", "exposure": "<U64"}
 
 @dataclass(frozen=True)
 class FreshEpisode:
-    """An episode of T steps as it is kept; of the last of its T + 1 observations no action is."""
+    """A kept episode of T steps: T + 1 observations, and no action in the last one."""
 
     count: int  # T
     terminated: bool
@@ -50,7 +50,7 @@ class FreshEpisode:
 
 
 class FreshLog(Stateful):
-    """Episodes of N environments, kept in `folder` a file each time some are labelled.
+    """Keeps episodes of N environments: writes one file to `folder` per batch of labelled episodes.
 
     Args:
         longest: steps of an episode at most.

@@ -2,13 +2,13 @@
 
 Logged rows are drawn by the shares of their strata, as the critic's are: a network that clones the
 majority finds nothing plausible in the rare cases (arXiv:2310.04413). Fresh rows are drawn alike.
-Of a teacher who keeps to no side, each row says as much of its mirror image: half of them are drawn
-as that.
+If a teacher keeps to no side, a row's mirror image is as valid as the row: half of the rows are
+drawn mirrored.
 
-Cloned are the rows of named drivers, and others' successes. An operator is called where the planner
-fails, so the logs hold few rows of how it drives where nothing is wrong, or beside people whom the
-planner gets past. A clone of those rows alone is poor there. The rest is in the logs as well:
-episodes that other drivers brought to their goal without help (filtered behaviour cloning, %BC in
+The rows of named drivers are cloned, and other drivers' successes. An operator is called when the
+planner fails, so the logs hold few rows of how it drives when nothing is wrong, or beside people
+whom the planner gets past, and a clone of those rows alone is poor there. Episodes that other
+drivers brought to their goal without help fill that gap (filtered behaviour cloning, %BC in
 arXiv:2106.01345).
 """
 
@@ -81,7 +81,7 @@ class Imitation(Stateful):
 
     Args:
         batch_size: M.
-        mirror: of the task, where rows are mirrored.
+        mirror: of the task, if rows are mirrored.
 
     Raises:
         ConfigError: the logs have no row of the policies that are to be cloned.

@@ -1,4 +1,4 @@
-"""The logged rows of a run, with what the record and the terms of the loss need to know of each."""
+"""The logged rows of a run, with the columns that the record and the loss terms need."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ class Logs:
 
 @dataclass(frozen=True)
 class LogTerms:
-    """Per row of the panel, on the learner's device; None where no term asks."""
+    """Masks over the panel's rows on the learner's device; None if no loss term needs one."""
 
     expert: Tensor | None  # (n,) bool: DQfD's margin applies
 

@@ -39,7 +39,7 @@ MAX_CHANGE = 0.1  # of a share per interval
 
 
 class Practice(Stateful):
-    """Counts ended missions by arm; at the end of an interval it sets the twin's shares.
+    """Counts ended missions by arm, and sets the twin's shares at the end of an interval.
 
     Raises:
         ConfigError: the rule's floors do not fit the arms, or it lacks what it needs.

@@ -1,7 +1,11 @@
 """Rows as they were sampled: columns that grow by a batch, their sums by episode, and audit rows.
 
-The update loop only appends, in one pass of compiled code where there is any; what is worked out of
-the columns is worked out once an interval, or for the few batches whose every row is written down.
+The update loop only appends, in one pass of compiled code if it is built. Statistics are computed
+once an interval, and the rows of a few audited batches are written down.
+
+Some conditions look ahead, so a row of the twin has its condition only once its episode has ended;
+by then it may have been drawn. An interval's fresh rows are therefore held until every one of them
+has its condition, and written after that: with it, in every table.
 """
 
 from __future__ import annotations
@@ -114,7 +118,7 @@ class SampledRows(Stateful):
 
 @dataclass(frozen=True)
 class BatchValues:
-    """What was worked out of each row of a batch (B,), its logged rows first."""
+    """Values computed for each row of a batch (B,), its logged rows first."""
 
     td: F32
     q: F32
@@ -339,7 +343,7 @@ class EpisodeLabels(Stateful):
 class HeldInterval:
     """The fresh rows of a closed interval.
 
-    `rows` are columns (n,) of `sampled_rows.FRESH`; of each audited batch there are columns in
+    `rows` are columns (n,) of `FRESH`; of each audited batch there are columns in
     `audits`. `open_rows` are the rows that the ring held without a condition as it was closed.
     """
 

@@ -31,8 +31,8 @@ Label = NDArray[np.int16]
 class Teacher(Protocol):
     """A driver that says what it would do in each of N environments, without driving them.
 
-    It may look at the environment itself, beyond what the observation says. It is asked once a
-    step, in order, and once before training begins; where it keeps `state_dict` and
+    It may look at the environment itself, beyond what the observation says. It is queried once a
+    step, in order, and once before training begins. If it has `state_dict` and
     `load_state_dict`, a run that is resumed goes on exactly as it would have.
     """
 
@@ -75,14 +75,14 @@ class _Called:
 
 
 class TeacherFailed(ConfigError):
-    """It raised an error, or its answer was none."""
+    """The teacher raised an error, or its answer was invalid."""
 
 
 class AskedTeacher(Stateful):
     """A teacher whose answers are checked.
 
     Args:
-        teacher: who is asked.
+        teacher: the one that is queried.
         task: whose actions it names.
         name: for errors: `teacher.source` as it was given.
     """

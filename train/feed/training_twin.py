@@ -95,7 +95,7 @@ def make_twin(
 
 
 class NoTwin:
-    """Stands where a run has its twin, and cannot be driven in."""
+    """A placeholder for the twin of a run on the logs alone; it cannot be driven in."""
 
     num_envs = 1
 

@@ -1,10 +1,10 @@
-"""A run's updates where its learner is on a GPU: drawn and recorded here, made there.
+"""A run's updates with its learner on a GPU: drawn and recorded here, made there.
 
 The samplers that a run on the CPU has draw the batches, so that a seed feeds the same rows to both;
-row numbers, a few kilobytes, go to the device, where the logs' rows and a mirror of the ring lie.
-While it is at one block of updates the next is drawn and the one before is recorded: the host waits
-once a block, if at all. Where a draw depends on the TD errors of the batch before (priorities,
-adaptive shares), a block is of one update, and the host waits at each.
+row numbers, a few kilobytes, go to the device, which holds the logs' rows and a mirror of the ring.
+While the device makes one block of updates, the next is drawn and the one before is recorded: the
+host waits once a block, if at all. If a draw depends on the TD errors of the batch before
+(priorities, adaptive shares), a block has one update, and the host waits after each.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class DeviceTable:
 
 
 class UpdateBlocks:
-    """Makes a learner's updates in blocks. Made once what it is about is restored."""
+    """Makes a learner's updates in blocks; create it after the session is restored."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """One stream of scalars by environment step, and the sinks that it goes to.
 
-A sink that fails never ends a run: what it did not take is counted, the first reason is said, and
-after some failures in a row it is left alone. `RUN/tracking.json` has the counts and the ids by
+A sink that fails never ends a run: its failed calls are counted, the first reason is printed, and
+after some failures in a row it is disabled. `RUN/tracking.json` has the counts and the ids by
 which W&B and MLflow know the run.
 """
 
@@ -65,7 +65,7 @@ class TensorBoard:
 
 @dataclass
 class _Count:
-    """What a sink did not take."""
+    """The failed calls of a sink."""
 
     failed: int = 0
     in_a_row: int = 0
@@ -73,12 +73,12 @@ class _Count:
 
 
 class Events:
-    """Gives every number to every sink; none, and it does nothing.
+    """Gives every number to every sink.
 
     Args:
         run: the run's directory.
         sinks: name -> what opens it.
-        say: told when one fails for the first time, and at the end how often it did.
+        say: called when one fails for the first time, and at the end with the count.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""What `restock eval` drove, kept by its settings in `RUN/eval/episodes.parquet`: it adds up.
+"""Episodes that `restock eval` drove, collected in `RUN/eval/episodes.parquet`.
 
-An episode is named by who drove it, where, under what and from which seed. One that is driven again
-replaces itself; any other stands beside those that were there. What is shown of them is the newest
-floors, and of the run's own policy its newest version, as of a limited one its newest limits.
+An episode is identified by its policy, floor, perturbation and seed. If it is driven again, it
+replaces the earlier one; all others are kept. Pages show the newest floors, the newest version of
+the run's own policy, and the newest limits of a limited one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What a policy's episodes came to: success, return and safety side by side, each with an interval.
+"""Measures of a policy's episodes: success, return and safety, each with an interval.
 
 Episodes are rows of a run's `eval/episodes` (`EVAL_EPISODES`). Intervals are 95 %: Wilson's of
-success, a bootstrap over episodes of the rest. They say what other episodes of the kind would have
-changed, not what another training seed would have.
+success, a bootstrap over episodes of the rest. They cover what other episodes of the kind would
+have changed, not what another training seed would have.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """A run: one directory that holds everything about it, readable at any moment, even after a kill.
 
-config.json            what was asked for and with what: resolved config, panel, task, versions
+config.json            resolved config, panel, task and versions
 progress.parquet …     the tables of `run_tables`, each replaced in one step at a flush
 checkpoints/           latest.safetensors (all state) and best.safetensors (the policy kept)
 tensorboard/           the same curves as events; tracking.json: ids of other trackers
-eval/                  what `restock eval` measured
-.lock                  while a process trains it: which
+eval/                  results of `restock eval`
+.lock                  the process that trains it, while it does
 """
 
 from __future__ import annotations
@@ -319,7 +319,7 @@ LOCK = ".lock"  # in a run; says who writes it: process and machine
 
 
 class RunLock:
-    """Taken when it is made, until `release`."""
+    """The lock of a run: taken when it is made, until `release`."""
 
     def __init__(self, run: Path) -> None:
         """Take the lock; raise RunError if another process trains this run."""

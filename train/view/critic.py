@@ -21,7 +21,7 @@ from restock.train.run.run_profile import profile_of_run
 
 @dataclass(frozen=True)
 class Critic:
-    """Of T steps, by the last checkpoint of a run, or by the policy it kept where none is left."""
+    """A critic's values over T steps, by the last checkpoint of a run, else by its kept policy."""
 
     run: str
     weights: str  # which networks: a text for people

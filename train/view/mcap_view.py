@@ -32,7 +32,7 @@ _BOX, _CYLINDER, _ADD, _DELETE_ALL = 1, 3, 0, 3
 
 @dataclass(frozen=True)
 class _Side:
-    """Below which topics and in which frames an episode stands."""
+    """The topics and frames of an episode."""
 
     topics: str
     map: str
