@@ -149,10 +149,10 @@ def print_table(
 
     console, piped = stdout(), not sys.stdout.isatty()
     least = [_least_width(rows, name, short=SHORT if piped else 0) for name in names]
-    apart, least = (GAP, least) if piped else _fitted(least, console.width)
-    padding = (0, 1) if apart == GAP else (0, apart - 1, 0, 0)
+    apart, widths = (GAP, least) if piped else _fitted(least, console.width)
+    padding = (0, 1, 0, 1) if apart == GAP else (0, apart - 1, 0, 0)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=padding)
-    for name, width in zip(names, least, strict=True):
+    for name, width in zip(names, widths, strict=True):
         justify: Literal["left", "right"]
         justify = "right" if _numeric(rows, name) else "left"
         table.add_column(name, justify=justify, overflow="fold", min_width=width)
@@ -209,7 +209,7 @@ def _least_width(rows: Sequence[Row], name: str, *, short: int = SHORT) -> int:
     return max([min(full, short), *map(cell_len, [*name.split(), *uncut])])
 
 
-def _fitted(least: list[int], width: int) -> tuple[int, list[int] | list[None]]:
+def _fitted(least: Sequence[int], width: int) -> tuple[int, Sequence[int | None]]:
     """Return how far apart the columns of a terminal's table stand, and their least widths.
 
     If words do not fit even then, rich cuts them as it must.
