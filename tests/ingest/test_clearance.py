@@ -114,7 +114,7 @@ def test_the_last_angle_says_what_the_increment_says() -> None:
 
 
 @pytest.mark.parametrize("last", ["angle_increment", "angle_max"])
-def test_a_lidar_upside_down_sees_what_it_sees_upright_at_negated_angles(last: str) -> None:
+def test_a_lidar_upside_down_sees_at_negated_angles(last: str) -> None:
     """Points that an upright one has on its left, it reports on its right."""
     named = {"ranges_m": "ranges", "angle_min_rad": "angle_min", f"{last}_rad": last}
     upright = msgspec.structs.replace(SCAN, fields=named)

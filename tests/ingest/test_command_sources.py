@@ -138,7 +138,7 @@ def test_no_later_command_says_who_drives_now(tmp_path):
     assert {p for s, p in other if s > 5.2} == {"unknown"}
 
 
-def test_a_recording_without_them_is_of_unknown_drivers_and_keeps_its_hash(tmp_path, capsys):
+def test_a_recording_without_sources_has_unknown_drivers(tmp_path, capsys):
     topics = taken_over()
     bag = write_topics(topics, tmp_path / "bag")
     profile = profile_of(bag, tmp_path, SOURCES)
@@ -259,7 +259,7 @@ def test_what_is_no_source_is_refused_with_its_key(old, new, said, tmp_path, cap
     assert "`command_sources.teleop.fields`: /joy: no field 'button'" in capsys.readouterr().err
 
 
-def test_a_proposal_takes_the_output_and_names_its_inputs_by_what_they_say(tmp_path, capsys):
+def test_a_proposal_finds_the_multiplexer_by_its_commands(tmp_path, capsys):
     """Whatever the topics' names: the output is what follows, who drives what it follows."""
     topics = taken_over()
     topics["/cmd_vel_out_of_planner"] = topics.pop(NAV)

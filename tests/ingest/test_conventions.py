@@ -102,7 +102,7 @@ def test_odometry_without_speeds_makes_no_rows(tmp_path: Path) -> None:
     assert set(steps.problem) == {"wheels: no estimate"}
 
 
-def test_a_fix_is_none_by_its_status_whether_the_profile_names_it_or_not(tmp_path: Path) -> None:
+def test_a_fix_without_status_ok_is_none(tmp_path: Path) -> None:
     topics = drive()
     tenth = np.arange(0, SECONDS, 0.1)
     fix = {

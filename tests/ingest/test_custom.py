@@ -50,7 +50,7 @@ def column(table: str, fields: dict[str, FieldColumn], times: list[float] | None
     return steps_with(table, fields, times).custom.table["s"].to_pylist()
 
 
-def test_a_value_is_held_from_when_it_was_measured_and_no_longer_than_its_age():
+def test_a_value_is_held_from_its_measurement_to_its_age():
     fields = {"v": np.array([10.0, 20.0])}
     held = column(signal("s", "v", "max_age_s = 1.0"), fields, [0.5, 3.0])
     # Ticks are every .2 s from .005 s on.
@@ -79,7 +79,7 @@ def test_messages_that_lack_the_element_are_no_samples():
     assert held[11:] == [23.5] * 19
 
 
-def test_an_empty_list_is_a_value_and_a_number_that_is_none_is_null():
+def test_an_empty_list_is_a_value_and_nan_is_null():
     ranges = ragged([[1.0, np.inf, 3.0, 4.0], [], [np.nan] * 3, [2.0], [2.0], [2.0]])
     lists = column(signal("s", "ranges[::2]"), {"ranges": ranges})
     assert [lists[i] for i in (1, 6, 11, 16)] == [[1.0, 3.0], [], [None, None], [2.0]]
@@ -325,7 +325,7 @@ def test_conditions_use_them_and_label_runs_changed_ones_again(store, tmp_path, 
     assert versions["n"] == 1
 
 
-def test_a_condition_on_a_signal_that_is_not_stored_asks_for_an_ingest(store, tmp_path, capsys):
+def test_a_condition_on_an_unstored_signal_needs_an_ingest(store, tmp_path, capsys):
     more = signal("imu_z", "linear_acceleration.z", topic="/imu", kind="sensor_msgs/msg/Imu")
     own = '[[condition]]\nname = "heavy"\ntiming = "pre"\nsql = "imu_z > 9"\n'
     profile = tmp_path / "p.toml"

@@ -137,7 +137,7 @@ def test_the_usual_names_alone_tell_of_no_kind():
     assert robot_kinds(robots) == [[0], [1], [2, 3]]
 
 
-def test_every_recording_is_of_a_kind_and_the_largest_of_one_are_read(tmp_path: Path):
+def test_the_largest_recordings_of_one_kind_are_read(tmp_path: Path):
     """Of 12 large drives and a small one of another robot, the small one was not looked at, and
     its rows were mixed with the others'."""
     mine = traits(command=TWIST, frames="odom -> base_link", lidar=LIDAR)

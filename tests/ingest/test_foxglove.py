@@ -123,7 +123,7 @@ def test_poses_are_by_satellite_fixes_where_nothing_else_says(
 
 
 @ENCODINGS
-def test_goals_and_plans_are_proposed_and_are_no_poses_of_the_robot(
+def test_goals_and_plans_are_not_taken_for_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], encoding: str
 ) -> None:
     at = {"timestamp": 0.0, "frame_id": "map"}
@@ -143,7 +143,7 @@ def test_goals_and_plans_are_proposed_and_are_no_poses_of_the_robot(
     assert topics == ("/goal_pose", "/plan", "/pose")
 
 
-def test_a_type_of_ross_name_with_other_fields_is_not_taken_for_it(
+def test_a_ros_type_name_with_other_fields_is_not_taken(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     TYPES["geometry_msgs/msg/Twist"] = {"speed": "number", "turn": "number"}

@@ -129,7 +129,7 @@ def test_what_stands_on_the_driven_path_is_unknown_not_false(tmp_path, capsys) -
         ]
 
 
-def test_no_feature_but_goal_and_route_changes_with_what_came_after(tmp_path, capsys) -> None:
+def test_only_goal_and_route_features_depend_on_the_future(tmp_path, capsys) -> None:
     bag, file, _ = proposed(Unguided(26.0), tmp_path, capsys)
     bare = tmp_path / "none.toml"
     text = file.read_text().replace('goal = "route"', 'goal = "none"')
@@ -163,14 +163,14 @@ def test_no_feature_but_goal_and_route_changes_with_what_came_after(tmp_path, ca
         assert all(repr(row) == repr(every[row[0]]) for row in rows)
 
 
-def test_a_robot_that_gets_nowhere_has_no_goal_and_the_proposal_says_so(tmp_path, capsys) -> None:
+def test_a_robot_that_gets_nowhere_has_no_goal(tmp_path, capsys) -> None:
     _, file, said = proposed(Turntable(20.0), tmp_path, capsys)
     assert load_profile(file).task.goal == "none"
     assert "in hindsight" in said["toml"]
     assert said["transitions"] > 90
 
 
-def test_a_robot_that_mostly_stood_has_goals_where_they_are_asked_for(tmp_path, capsys) -> None:
+def test_a_robot_that_mostly_stood_has_goals_if_requested(tmp_path, capsys) -> None:
     _, file, said = proposed(Waiting(72.0), tmp_path, capsys)
     assert load_profile(file).task.goal == "none"
     assert said["transitions"] > 340
@@ -190,7 +190,7 @@ def test_where_it_got_nowhere_no_goal_can_be_asked_for(tmp_path, capsys) -> None
     assert said["transitions"] > 90
 
 
-def test_the_key_is_checked_and_leaves_other_profiles_as_they_were(tmp_path) -> None:
+def test_the_goal_key_leaves_other_profiles_unchanged(tmp_path) -> None:
     logged = load_profile("warehouse_amr")
     text = profile_toml(logged)
     assert parse_profile(text, where="text").hash == logged.hash
@@ -211,7 +211,7 @@ def test_rules_of_hindsight_are_refused_where_goals_are_logged(tmp_path) -> None
 
 @pytest.mark.parametrize("key", ["goal_moved_m", "plan_goal_tolerance_m"])
 @pytest.mark.parametrize("goals", ["goal.source", "task.goal"])
-def test_limits_of_logged_goals_are_refused_where_no_goals_are_logged(tmp_path, key, goals) -> None:
+def test_limits_of_logged_goals_need_logged_goals(tmp_path, key, goals) -> None:
     logged = load_profile("warehouse_amr")
     inputs = replace(logged.inputs, goal=None, plan=None)
     if goals == "goal.source":

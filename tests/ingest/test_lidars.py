@@ -156,7 +156,7 @@ def sectors_of(steps: Steps) -> Any:
     st.floats(-0.2, 0.2),
     st.integers(0, 99),
 )
-def test_a_beam_counts_where_it_ends_as_seen_from_the_bodys_lidar(
+def test_a_beam_counts_where_it_ends_as_seen_from_the_body(
     place: Place, ahead_m: float, seed: int
 ) -> None:
     body = msgspec.structs.replace(TASK.body, lidar_x_m=ahead_m)
@@ -279,7 +279,7 @@ def test_a_running_robot_sees_by_all_lidars_what_ingest_stores(tmp_path: Path) -
     assert compared > 10
 
 
-def test_a_moment_shows_the_scans_together_as_seen_from_the_middle(tmp_path: Path) -> None:
+def test_a_moment_shows_the_joined_scans_from_the_middle(tmp_path: Path) -> None:
     bag, profile = Corridor().bag(tmp_path / "bag"), parse_profile(two_lidars(), where="p")
     with open_recording(bag) as recording:
         scans = seen_between(recording, profile, 1_700_000_001 * 10**9, 1_700_000_003 * 10**9).scans

@@ -84,7 +84,7 @@ def blind(drives: Path) -> tuple[Path, IngestResult]:
     return store, ingest(drives / "blind", BLIND, store=StoreWriter(store))
 
 
-def test_a_profile_without_a_scan_has_no_sectors_whatever_it_says():
+def test_a_profile_without_a_scan_has_no_sectors():
     assert "sectors = 36" in WAREHOUSE
     assert (BLIND.task.sectors, BLIND.task.lidar) == (0, False)
     lidar = [n for n in load_profile("warehouse_amr").task.observation_names if "deg" in n]
@@ -129,7 +129,7 @@ def test_its_moments_are_viewed_without_what_a_lidar_sees(blind, tmp_path):
     assert not [name for name in topics if "seen" in name or "clearance" in name]
 
 
-def test_a_wall_beside_the_robot_costs_what_does_not_see_it_nothing(drives, tmp_path):
+def test_an_unseen_wall_beside_the_robot_costs_nothing(drives, tmp_path):
     """`tight` is 0 where clearance is unknown; with the lidar the same steps cost .05 each."""
     from support.driven_robot import columns, scans
 
@@ -238,14 +238,14 @@ def test_labels_made_again_stay_unknown(drives, tmp_path):
         ]
 
 
-def test_every_shipped_condition_that_names_a_lidar_signal_is_found():
+def test_all_conditions_with_lidar_signals_are_found():
     every = [*shipped().values(), *shipped(kind="exposure").values()]
     assert sorted(unseen(every)) == NEEDS_ONE
     assert [one.name for one in reported(every, lidar=False)] == ["wheel_slip", "slippery_floor"]
     assert reported(every, lidar=True) == every
 
 
-def test_the_limiter_of_a_robot_that_sees_nothing_keeps_its_speed_alone():
+def test_the_limiter_without_a_lidar_limits_speed_alone():
     limits = Limits.of(BLIND.task)
     fast = np.array([[0.5, 0.0], [9.0, 0.0]])
     limited = limit(limits, fast, np.zeros((2, 0)), np.array([[0.5, 0.0], [1.0, 0.0]]))
@@ -253,7 +253,7 @@ def test_the_limiter_of_a_robot_that_sees_nothing_keeps_its_speed_alone():
     assert limited.command[:, 0].tolist() == [0.5, limits.fastest[0]]
 
 
-def test_a_proposed_profile_says_that_it_has_no_lidar_and_ingests(drives, tmp_path, capsys):
+def test_a_proposal_without_a_lidar_says_so_and_ingests(drives, tmp_path, capsys):
     profile, store = tmp_path / "mine.toml", tmp_path / "store"
     assert main(["profile", "new", str(drives / "blind"), "--out", str(profile)]) in (0, 3)
     text = profile.read_text()

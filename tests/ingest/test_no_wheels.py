@@ -99,7 +99,7 @@ def test_a_robot_on_a_ramp_is_on_wheels(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("speeds", [{}, {"linear.z": np.where(SECONDS < 3, 0.1, 0.0)}])
-def test_commands_that_mostly_stay_on_the_floor_are_of_a_robot_on_wheels(speeds, tmp_path, capsys):
+def test_commands_mostly_on_the_floor_are_of_a_wheeled_robot(speeds, tmp_path, capsys):
     bag = write_topics(servoed(**speeds), tmp_path / "bag")
     assert main(["profile", "new", str(bag), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["problems"] == []

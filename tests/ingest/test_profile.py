@@ -29,7 +29,7 @@ def test_the_shipped_profiles_load():
         assert {c.name for c in profile.conditions} >= {"wheel_slip", "blocked_aisle"}
 
 
-def test_the_hash_names_all_that_a_profile_says_but_its_conditions():
+def test_the_hash_covers_a_profile_without_its_conditions():
     assert parse_profile(TEXT, where="a").hash == load_profile("warehouse_amr").hash
     changed = parse_profile(TEXT.replace("max_gap_s = 0.5", "max_gap_s = 0.6"), where="a")
     assert changed.hash != load_profile("warehouse_amr").hash
@@ -169,7 +169,7 @@ def bag(tmp_path_factory):
     return write_bag(Drive(), tmp_path_factory.mktemp("bag") / "drive")
 
 
-def test_a_proposed_profile_reads_the_recording_it_was_proposed_from(bag, tmp_path, capsys):
+def test_a_proposed_profile_reads_its_recording(bag, tmp_path, capsys):
     file = tmp_path / "mine.toml"
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
     assert capsys.readouterr().out == ""

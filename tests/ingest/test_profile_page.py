@@ -69,7 +69,7 @@ def test_the_page_on_the_sample_logs(tmp_path, monkeypatch, capsys):
     assert {one["status"] for one in recordings} == {"unchanged"}
 
 
-def test_every_key_of_a_signal_and_every_reduction_is_on_the_page():
+def test_the_page_has_all_signal_keys_and_reductions():
     from typing import get_args
 
     from restock.ingest.profile.custom_signal import CustomSignal, Reduce

@@ -290,7 +290,7 @@ def test_poses_in_utm_coordinates_are_stored_to_the_millimetre(tmp_path, capsys)
 
 
 @pytest.mark.parametrize("bumper", [True, False])
-def test_a_contact_ends_an_episode_whether_a_bumper_was_recorded_or_not(bumper, tmp_path, capsys):
+def test_a_contact_ends_an_episode_with_or_without_a_bumper(bumper, tmp_path, capsys):
     class Robot(Drive):
         def topics(self):
             topics = super().topics()

@@ -12,7 +12,7 @@ from restock.ingest.propose.evidence.candidates import camera_topics
 from restock.ingest.propose.propose import propose_profile
 
 
-def test_a_proposal_has_each_camera_and_works_once_its_comment_is_taken_away(
+def test_an_uncommented_proposed_camera_works(
     tmp_path: Path,
 ) -> None:
     with open_recording(camera_bag(tmp_path / "bag")) as recording:
@@ -35,7 +35,7 @@ def test_a_proposal_has_each_camera_and_works_once_its_comment_is_taken_away(
     }
 
 
-def test_topics_name_their_cameras_and_a_topic_without_frames_says_why(tmp_path: Path) -> None:
+def test_cameras_are_named_by_topics_that_have_frames(tmp_path: Path) -> None:
     whole = file_of(picture(1))
     topics = {
         "/camera/image_raw": raw([picture(0)] * 4),

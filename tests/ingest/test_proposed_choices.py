@@ -309,7 +309,7 @@ def test_a_fast_robot_keeps_the_default_time_limit(tmp_path, capsys):
     assert "time_limit_steps" not in said["toml"]
 
 
-def test_logged_missions_that_take_longer_than_the_time_limit_are_said(tmp_path, capsys):
+def test_advice_on_missions_longer_than_the_time_limit(tmp_path, capsys):
     """Cut there they have failed, though the robot arrived."""
     drive = Drive(60.0, goals=[(0.0, 28.0, 1.0)])
     _, said, file = propose(drive, tmp_path, capsys)

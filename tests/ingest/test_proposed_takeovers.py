@@ -104,7 +104,7 @@ def test_a_topic_of_that_name_and_another_type_is_somebody_elses(tmp_path):
     assert proposed(taken_over("std_msgs/msg/String"), tmp_path)[2].command_sources == {}
 
 
-def test_what_the_node_published_is_read_as_its_own_profile_reads_it(tmp_path):
+def test_node_topics_are_proposed_as_its_own_profile_has_them(tmp_path):
     plain = proposed(driven(), tmp_path, "plain")[2]
     bag, file, profile = proposed(in_shadow() | taken_over(), tmp_path)
     expected = with_node_topics(plain)

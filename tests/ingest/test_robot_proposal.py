@@ -164,7 +164,7 @@ def test_a_hostile_description_is_refused(text: str, message: str) -> None:
     assert message in found
 
 
-def test_a_urdf_that_xacro_wrote_is_used_though_it_still_names_the_namespace() -> None:
+def test_a_urdf_written_by_xacro_is_used() -> None:
     text = XACRO.format(BASE + wheels((0, 0.2), (0, -0.2)))
     assert of(text).values["track_m"] == 0.4
 
@@ -251,7 +251,7 @@ def test_a_proposed_profile_has_the_robot_of_the_file(tmp_path: Path) -> None:
     assert by_logs.lidar.beams == own.robot.lidar.beams
 
 
-def test_the_description_of_an_arm_does_not_hide_that_of_its_base(tmp_path: Path) -> None:
+def test_an_arms_description_does_not_hide_its_bases(tmp_path: Path) -> None:
     texts = {"/arm": robot(), "/base": robot(wheels((0.2, 0.22), (0.2, -0.22)))}
     topics = typed_topics(Drive())
     for place, text in texts.items():
@@ -300,7 +300,7 @@ SHARED_BY_ALL = "; /robot2 has none of its own that can be used: CHECK THAT IT I
         ({"/robot1/robot_description": said(robot(SMALL))}, None, None, None, None),
     ],
 )
-def test_of_two_robots_in_a_recording_each_has_its_own_outline_and_description(
+def test_two_robots_in_a_recording_have_their_own_outlines(
     said_of: dict[str, tuple[str, TopicColumns]],
     length_m: float | None,
     width_m: float | None,

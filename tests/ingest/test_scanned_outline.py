@@ -84,7 +84,7 @@ class Passing(Turning):
         return found
 
 
-def test_what_rests_on_a_guessed_outline_is_uncertain_until_somebody_measures(tmp_path, capsys):
+def test_conditions_by_a_guessed_outline_are_uncertain(tmp_path, capsys):
     """A robot .33 m wide passes .16 m clear of poles: to a guess of .48 m each was too near."""
     drive = Passing(12.0, nearest_m=0.325)
     topics = {name: (TYPES[name], c) for name, c in drive.topics().items()}
@@ -140,7 +140,7 @@ def test_its_own_parts_are_its_body_and_no_obstacles(tmp_path, capsys):
     assert "range_min_m = 0.225  # beyond the robot's own parts" in text
 
 
-def test_what_stands_still_beside_a_robot_that_does_not_turn_is_not_its_own(tmp_path, capsys):
+def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path, capsys):
     drive = Turning(12.0, post_m=0.21)
     topics = drive.topics()
     straight = Drive(12.0).topics()["/amcl_pose"]
@@ -196,7 +196,7 @@ def test_a_guessed_outline_holds_the_lidar_that_transforms_place(tmp_path, capsy
     assert "upside_down" not in text
 
 
-def test_a_lidar_outside_a_measured_outline_is_turned_as_transforms_say(tmp_path, capsys):
+def test_a_lidar_outside_the_outline_is_turned_by_transforms(tmp_path, capsys):
     """Its base frame is no middle, as that of a car, between its rear wheels."""
     topics = {name: (TYPES[name], c) for name, c in Framed(12.0).topics().items()}
     topics["/tf_static"] = (TYPES["/tf_static"], lidar_at(0.9, 0.0, 3.0))
@@ -208,7 +208,7 @@ def test_a_lidar_outside_a_measured_outline_is_turned_as_transforms_say(tmp_path
     assert "; a guess; base_link has it 0.90 m ahead, outside" in text
 
 
-def test_a_lidar_that_hangs_upside_down_gives_the_rows_that_it_gives_upright(tmp_path, capsys):
+def test_a_lidar_upside_down_gives_the_rows_of_an_upright_one(tmp_path, capsys):
     """By its frame. What it sees on the robot's left, it reports on its own right."""
     found, texts = [], []
     for roll, sign in ((0.0, 1), (np.pi, -1)):

@@ -79,7 +79,7 @@ def test_a_topic_of_no_robot_is_not_taken_for_its_own(tmp_path: Path) -> None:
     assert (inputs.pose.topic, inputs.wheels.topic) == ("/robot1/amcl_pose", "/robot1/odom")
 
 
-def test_a_robot_whose_topics_have_names_of_their_own_can_be_named(tmp_path: Path) -> None:
+def test_a_robot_with_topic_names_of_its_own_can_be_named(tmp_path: Path) -> None:
     with open_recording(write_fleet(tmp_path, own="/base")) as recording:
         assert robots_in(recording) == []
         choose_robot(recording, "robot1")
@@ -142,7 +142,7 @@ def test_of_one_robot_its_namespace_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["robot3", "front", "/", "robot1/cmd_vel"])
-def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
+def test_an_absent_robot_is_refused_with_those_present(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bag, out = write_fleet(tmp_path), tmp_path / "robot.toml"

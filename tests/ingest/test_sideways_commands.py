@@ -34,7 +34,7 @@ def test_commands_with_a_speed_sideways_are_counted() -> None:
     assert sideways_notes(command("drive.speed"), {}) == []
 
 
-def test_a_proposal_says_what_is_asked_for_in_vain_or_that_nothing_is(tmp_path, capsys) -> None:
+def test_a_proposal_names_sideways_or_missing_commands(tmp_path, capsys) -> None:
     """`start` shows what a proposal advises, and not what an ingest notes."""
     said = {}
     for name, mps in (("aside", 0.3), ("never", 0.0)):

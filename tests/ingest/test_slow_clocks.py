@@ -55,7 +55,7 @@ def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
 
 
 @pytest.mark.parametrize("pace", PACES)
-def test_command_and_state_of_a_row_are_within_one_hold_of_each_other(pace: float) -> None:
+def test_command_and_state_of_a_row_are_within_one_hold(pace: float) -> None:
     profile = load_profile("warehouse_amr")
     whole = steps_of(profile, turning())
     steps = steps_of(profile, at_pace(turning(), pace))
@@ -123,7 +123,7 @@ def test_a_pause_costs_no_row_and_pairs_nothing_wrongly(pace: float) -> None:
     assert apart_s.max() <= 0.12
 
 
-def test_a_reset_of_the_simulation_starts_a_segment_with_a_map_of_its_own() -> None:
+def test_a_simulation_reset_starts_a_segment_with_its_own_map() -> None:
     profile = load_profile("warehouse_amr")
     first = at_pace(turning(20.0), 0.5)
     second = at_pace(turning(20.0), 0.9)

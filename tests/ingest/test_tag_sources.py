@@ -60,7 +60,7 @@ def said(path: Path) -> tuple[list[tuple[str, str, dict[str, str]]], list[str]]:
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
-def test_custom_data_of_a_bag_is_read_with_and_without_its_metadata_yaml(tmp_path, plugin):
+def test_custom_data_is_read_without_metadata_yaml_too(tmp_path, plugin):
     """As it was written: `007`, a date and `~` inside are text."""
     data = {"robot": "007", "day": "2026-10-05", "note": "a: b\n# c", "on": "yes"}
     folder = bag(tmp_path / "bag", plugin, data)
@@ -241,7 +241,7 @@ def test_records_that_mean_two_things_by_a_name():
     assert resolve_tags(rules, PLACE, own, {}, {}).tags == {"lidar": "1", "serial": "2"}
 
 
-def test_a_path_that_no_pattern_matches_is_refused_unless_the_tags_are_given(tmp_path):
+def test_a_path_without_a_match_is_refused_unless_tags_are_given(tmp_path):
     place = tmp_path / "run.mcap"
     rules = TagRules(from_path=["never/{site}/{robot}/*", "nor/{robot}/*"])
     with pytest.raises(RecordingError, match=r"match 'never/{site}/{robot}/\*' nor") as no:
