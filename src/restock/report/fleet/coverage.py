@@ -32,7 +32,7 @@ from restock.report.look.queries import ask, statements
 from restock.words import by_priority, counted, plural, uncertain_labels
 
 MAX_DOTS = 1500
-MAX_CELLS_ACROSS = 90  # of the map
+MAX_CELLS_ACROSS = 90  # cells of the map along an axis
 PALE_ROWS = 0.5  # where a bar of the logarithmic axis begins
 
 

@@ -23,9 +23,9 @@ from restock.words import counted, plural
 
 MAX_ROBOTS = 12  # in a chart: those with findings first
 MAX_PERIODS = 26  # the newest
-MAX_FINDINGS = 8  # with a chart of their own
-_BEYOND = 3.0  # sizes past it look alike
-_BESIDE = ("driving", "conditions")  # what tells of the use, not of the hardware
+MAX_FINDINGS = 8  # findings with a chart of their own
+_BEYOND = 3.0  # larger sizes look alike
+_BESIDE = ("driving", "conditions")  # parts about the use, not about the hardware
 _VERDICTS = ("changed", "undecided", "unchanged", "too few")
 _PERIODS = alt.Axis(labelAngle=-60, grid=False)
 _SCOPE = {

@@ -12,7 +12,7 @@ from restock.replay.store.column_docs import UNITS
 from restock.replay.store.column_docs import unit as unit_of
 from restock.report.look.blocks import Rows, words
 
-_MEANINGS = {  # what a signal tells of; docs/coverage.md has how each is measured
+_MEANINGS = {  # what a signal measures; docs/coverage.md says how
     "odometry_scale": "localised metres per metre that the wheels report, driving straight",
     "wheel_yaw_scale": "yaw rate of the gyroscope divided by that of the wheels, when turning",
     "wheel_pull_radpm": "turn that the wheels did not report, per metre of straight driving",
@@ -61,7 +61,7 @@ def change_text(row: dict[str, Any]) -> str:
     ratio = row["compared"] == "ratio"
     values = [row["change"], row["change_low"], row["change_high"]]
     least = 0.0 if ratio else 1e-3 * max(abs(row["change_low"]), abs(row["change_high"]))
-    value, low, high = (  # what is far below the interval's width is nothing
+    value, low, high = (  # values far below the interval's width are zero
         f"{v:.3f}" if ratio else f"{v if abs(v) >= least else 0.0:+.3g}" for v in values
     )
     unit = " sd" if row["compared"] == "spread" else ""

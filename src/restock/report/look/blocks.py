@@ -11,7 +11,7 @@ from typing import Any
 from restock.stats import interval_text
 
 Rows = list[dict[str, Any]]
-MAX_ROWS = 24  # of a table that need not be folded
+MAX_ROWS = 24  # rows of a table that need not be folded
 BROAD, WIDE = 4, 6  # columns: with more, a phone and a tablet show rows as lists
 
 

@@ -24,8 +24,8 @@ from restock.train.twin.missions.registry import MISSIONS
 
 Row = Mapping[str, Any]
 
-HALF = (300, 470)  # of a figure that shares a line with another on a desktop
-FULL = (300, 630, 1000)  # of one with the line for itself
+HALF = (300, 470)  # widths of a figure that shares a line on a desktop
+FULL = (300, 630, 1000)  # widths of a figure with a line for itself
 
 # Okabe-Ito: colour-blind readers can distinguish them too.
 CONDITION_COLOURS = {
@@ -46,14 +46,14 @@ POLICY_COLOURS = {
     "operator": "#2563eb",
     "random": "#9ca3af",
 }
-# Of other policies: none looks like another or like those above, in either theme.
+# Colours of other policies, distinct from each other and from those above in both themes.
 POLICY_SPARES = ("#be185d", "#b58900", "#0c98dd", "#111827", "#7f1d1d")
 SOURCE_COLOURS = {"logs": "#334155", "fresh": "#14b8a6"}
 
-FEW_POINTS = 10  # of a line, with which each is drawn
+FEW_POINTS = 10  # a line of at most so many points shows each of them
 STEPS = {"env_steps": "environment steps", "gradient_steps": "updates"}
-SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, nought is 0k
-LETTER_PX = 5.8  # of a label, about
+SHORT_NUMBERS = "format(datum.value, '~s')"  # 0, 500, 50k; as an axis' `format`, zero is 0k
+LETTER_PX = 5.8  # width of a letter of a label, about
 WIDER_FONT = 0.15  # by so much a label may be wider in a browser than in the font it was drawn with
 FONT = "Inter, Helvetica Neue, Helvetica, Arial, Liberation Sans, sans-serif"
 

@@ -25,10 +25,10 @@ from restock.report.look.blocks import words
 
 Spec = dict[str, Any]
 
-HIDDEN_SHARE = 0.12  # of a series' opacity that is left while another is alone
-HALO_PX2, HALO_OPACITY = 280, 0.35  # of a line's point below the pointer
+HIDDEN_SHARE = 0.12  # share of a series' opacity while another is isolated
+HALO_PX2, HALO_OPACITY = 280, 0.35  # halo of a line's point below the pointer
 _POSITIONS = ("x", "x2", "y", "y2")
-_ENDS = ("", "low", "high")  # of the name of a column: its interval's
+_ENDS = ("", "low", "high")  # endings of the names of an interval's columns
 _LICENCE = "/* Vega, Vega-Lite, Vega-Embed: (c) University of Washington, BSD-3-Clause */\n"
 
 

@@ -72,7 +72,7 @@ def _heatmap(cells: Rows) -> Drawing:
     names = list(dict.fromkeys(cell["row"] for cell in cells))
 
     def chart(width: int) -> Any:
-        # Of few pixels a tile bears no number: the pointer shows it, and the table has the largest.
+        # A small tile has no number: the pointer shows it, and the table has the largest.
         labels_px = min(charts.label_px(names), 200 if width > charts.FULL[0] else 140)
         tile = (width - labels_px - 12) // max(len(set(actions)), 1)
         axis = alt.Axis(

@@ -35,20 +35,20 @@ PACKAGE = "restock.report.run"
 CELL_M = 0.25
 NO_GOAL = "The task has no goal: success is not defined."
 MAX_DOTS = 1500
-_TABLES = (  # of a run, that run.sql asks
+_TABLES = (  # tables of a run that run.sql reads
     *("strata", "conditions", "actions", "ages", "policies", "evaluations", "probe", "progress"),
 )
 
 
 @dataclass
 class Facts:
-    """Everything that the page is made of. Lists are empty where a run is not that far yet."""
+    """The facts that a page is made of. Lists are empty if a run is not that far yet."""
 
     run: Path
     config: dict[str, Any]
     sampled: Rows  # per source and stratum: available, intended, drawn
     fed: Rows = field(default_factory=list, kw_only=True)  # per stratum, of all rows fed
-    conditions: Rows  # in the batches, whatever the strata are
+    conditions: Rows  # in the batches, independent of the strata
     actions: Rows  # in the batches, and wanted, by source, stratum and condition
     ages: Rows
     policies: Rows
@@ -57,30 +57,31 @@ class Facts:
     lag: Rows
     loss: Rows
     trained: dict[str, Any]  # steps, updates and time in all
-    cells: Rows  # of `restock eval`, with Wilson intervals as low and high
+    cells: Rows  # results of `restock eval`, with Wilson intervals as low and high
     failures: Rows
     panel: Panel | None = None
-    policy: PolicyOrigin | None = None  # of the run, that would drive now
-    driven_step: int | None = None  # of training, from which the policy is that `cells` are of
-    evaluation: str = ""  # which of the episodes that were driven are shown
-    ways: Rows = field(default_factory=list)  # as `cells`, on the ways of logs, beside those
-    evaluation_on_ways: str = ""  # which they are
-    floor: Warehouse | None = None  # that the run drives on, where it is one
-    visited: Rows = field(default_factory=list)  # of the floor, by recordings in its frame
+    policy: PolicyOrigin | None = None  # the run's policy that would drive now
+    driven_step: int | None = None  # training step of the policy in `cells`
+    evaluation: str = ""  # which of the driven episodes are shown
+    ways: Rows = field(default_factory=list)  # as `cells`, but on the routes of the logs
+    evaluation_on_ways: str = ""  # which routes these are
+    floor: Warehouse | None = None  # the floor that the run drives on, if it is one
+    visited: Rows = field(default_factory=list)  # cells of the floor, by recordings in its frame
     rare: Rows = field(default_factory=list)
     elsewhere: int = 0  # recordings in other frames
-    floors: int = 1  # that the run drives on
+    floors: int = 1  # number of floors that the run drives on
     recordings: Rows = field(default_factory=list)
     logged: Rows = field(default_factory=list)  # share of logged rows per condition
     labels: Rows = field(default_factory=list)  # scores of the store's labels, pooled
-    reliability: Rows = field(default_factory=list)  # of their probabilities
+    reliability: Rows = field(default_factory=list)  # how reliable the labels' probabilities are
     off_policy: Rows = field(default_factory=list)  # off-policy estimates, over all conditions
-    clones: list[CloneQuality] = field(default_factory=list)  # of who drove in the logs
+    clones: list[CloneQuality] = field(default_factory=list)  # clones of the logs' drivers
     clean: dict[str, dict[str, Any]] = field(default_factory=dict)  # measures by policy, pooled
-    practice: Rows = field(default_factory=list)  # an interval x arm of missions
-    teacher: Rows = field(default_factory=list)  # what its filter did at last
+    practice: Rows = field(default_factory=list)  # per interval and arm of missions
+    teacher: Rows = field(default_factory=list)  # what its filter did in the last interval
     missing: list[str] = field(default_factory=list)  # what could not be read, and why
-    compared: dict[str, Rows] = field(default_factory=dict)  # with whom, as `headline` asks
+    # Comparison runs, keyed as `headline` expects.
+    compared: dict[str, Rows] = field(default_factory=dict)
 
     @property
     def strata(self) -> list[Stratum]:

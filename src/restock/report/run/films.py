@@ -17,7 +17,7 @@ from restock.train.twin.floors.floors import open_floors
 from restock.words import counted, policy_words
 
 FOLDER, DOCUMENT = "eval/films", "films.json"
-BODY_M = (0.62, 0.44)  # of the robot as it is drawn, length and breadth
+BODY_M = (0.62, 0.44)  # length and width of the robot as drawn
 PALLET_M, FORKLIFT_M, PERSON_M = (1.2, 0.8), (1.6, 0.8), 0.22
 GAP = 24  # SVG units between the frames
 

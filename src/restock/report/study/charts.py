@@ -14,7 +14,7 @@ from restock.report.look import charts
 from restock.report.look.blocks import Drawing, Rows, words
 from restock.report.look.charts import POLICY_COLOURS
 
-# None of them is a reference's: the planner and the operator are as in every report.
+# None is a reference's: planner and operator have their colours of every report.
 ARM_COLOURS = ("#0f766e", "#7c3aed", "#cc79a7", "#84643a", "#56b4e9", "#b58900", "#6b7280")
 _PERCENT = alt.Axis(format="%", values=[0, 0.25, 0.5, 0.75, 1])
 _SHARE = alt.Scale(domain=[0, 1])

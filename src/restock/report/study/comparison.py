@@ -12,7 +12,7 @@ from restock.stats import MIN_PAIRS, interval_text
 from restock.words import counted, verdict_said
 
 MAX_NAMED = 3
-MAX_SETTINGS = 4  # that differ, to be named in a line
+MAX_SETTINGS = 4  # differing settings that are named in a line
 FREE_KINDS = ("free", "software")
 HELD = {"feed": "replay", "target": "the target rule", "algorithm": "the algorithm"}
 _KINDS = {"comparable": "good", "inconclusive": "open", "incomparable": "bad"}
