@@ -50,7 +50,7 @@ AGAIN = "run it again: recordings that are already in the store are skipped"
 
 @dataclass(frozen=True)
 class IngestJob:
-    """What to do with every recording. `store` None is a dry run."""
+    """Instructions for every recording. `store` None is a dry run."""
 
     profile: Profile
     store: str | Path | None
@@ -149,7 +149,7 @@ def ingest_all(
 def _one_by_one(
     job: IngestJob, paths: Sequence[Path], group: CommitGroup, watch: Watch | None
 ) -> Generator[tuple[int, Prepared | RestockError]]:
-    """One after the other; what waits is committed while a long one is read, too."""
+    """Prepare one recording after the other, and commit what waits while a long one is read."""
 
     def watched(what: str, done: int, of: int) -> None:
         group.commit_if_due()
@@ -161,7 +161,7 @@ def _one_by_one(
 
 
 def out_of_memory(path: Path) -> RecordingError:
-    """The error of a recording for which memory did not suffice."""
+    """Return the error of a recording that ran out of memory."""
     return RecordingError(
         "out of memory", where=str(path), remedy=f"use fewer --workers or more memory, then {AGAIN}"
     )
@@ -191,8 +191,10 @@ def side_by_side(
     died: Callable[[Path, int], D],
     patience_s: Callable[[], float | None] = lambda: None,
 ) -> Generator[tuple[int, T | D] | None]:
-    """What `work` gives for each path, with its place, as it comes; `died(path, exit code)` where
-    it died. None where nothing came for `patience_s()` seconds, which is asked at each wait.
+    """Yield what `work` returns for each path, with its place, as it comes.
+
+    A path whose process died gives `died(path, exit code)`. Yields None if nothing came for
+    `patience_s()` seconds, which is evaluated at each wait.
 
     The largest recordings are begun first, so that no process is left alone with one at the end.
     When the caller stops early, or Ctrl-C does, no work goes on.
@@ -253,7 +255,7 @@ def warm_up() -> None:
 
 
 def _serve(pipe: Connection, work: Callable[[Path], T]) -> None:
-    """A worker: one recording after the other, until there are no more, or the parent is gone."""
+    """Run a worker: one recording after the other, until none is left or the parent is gone."""
     from restock.ingest.containers.formats.mcap_file import ChunkReader
 
     ChunkReader.ahead = False  # the other workers have the other cores
@@ -305,8 +307,9 @@ def prepare_on_ray(
     workers: int = 1,
     patience_s: Callable[[], float | None] = lambda: None,
 ) -> Generator[tuple[int, Prepared | RestockError] | None]:
-    """What was made of each recording, with its place in `paths`, as it comes; None where nothing
-    came for `patience_s()` seconds. Nothing of it is committed.
+    """Yield what was made of each recording, with its place in `paths`, as it comes.
+
+    Yields None if nothing came for `patience_s()` seconds. Nothing is committed here.
 
     Raises:
         ConfigError: Ray is not installed, or the cluster does not answer.
@@ -388,7 +391,7 @@ def _expect(address: str | None) -> None:
 def _task(
     job: IngestJob, path: Path, folder: str, environment: dict[str, str]
 ) -> Prepared | RestockError:
-    """One recording, on whatever machine."""
+    """Prepare one recording on whatever machine runs the task."""
     from restock.ingest.containers.formats.mcap_file import ChunkReader
 
     ChunkReader.ahead = False  # the task was given one core

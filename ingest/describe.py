@@ -1,4 +1,4 @@
-"""What a recording says about itself, as plain data: the content of `restock info`."""
+"""Description of a recording as plain data: the content of `restock info`."""
 
 from __future__ import annotations
 
@@ -90,9 +90,11 @@ def describe_recording(
 
 
 def offered(text: str) -> list[dict[str, Any]]:
-    """The quality of service that publishers offered, each once: reliability, durability, history
-    and depth, as far as the file's text says them. It is not read as YAML: that is slow, and it may
-    be damaged."""
+    """Return the quality of service that publishers offered, each profile once.
+
+    Reads reliability, durability, history and depth as far as the file has them. It is not parsed
+    as YAML: that is slow, and it may be damaged.
+    """
     found: list[dict[str, Any]] = []
     for block in re.split(r"^- ", text, flags=re.MULTILINE)[1 : MAX_PROFILES + 1]:
         said = dict(re.findall(r"^\s*(\w+):\s*(\w+)\s*$", block, re.MULTILINE))
@@ -109,7 +111,7 @@ def offered(text: str) -> list[dict[str, Any]]:
 
 
 def _clocks(recording: Recording) -> dict[str, dict[str, Any]]:
-    """The clocks of every topic that can be decoded."""
+    """Compare the clocks of every topic that can be decoded."""
     wanted = {
         name: [STAMP] if STAMP in recording.leaves(name) else []
         for name, topic in recording.topics.items()

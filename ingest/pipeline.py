@@ -1,4 +1,4 @@
-"""One recording, end to end: columns, steps, episodes, labels, rows, and the commit.
+"""Ingest of one recording, end to end: columns, steps, episodes, labels, rows, and the commit.
 
 profile = load_profile("warehouse_amr")
 outcome = ingest(Path("logs/run.mcap"), profile, store=StoreWriter("store"))
@@ -91,7 +91,7 @@ def ingest(
 
 @dataclass(frozen=True)
 class Reading:
-    """How a recording is read: the arguments of `ingest` by these names."""
+    """Options for reading a recording: the arguments of `ingest` by these names."""
 
     force: bool = False
     salvage: bool = False
@@ -100,7 +100,7 @@ class Reading:
     tags: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for what the command line cannot say."""
+        """Raise ConfigError for values that the command line does not allow."""
         if self.repeated not in get_args(OnRepeat):
             has = ", ".join(get_args(OnRepeat))
             raise ConfigError(f"no rule for repeated: {self.repeated!r}", remedy=f"give {has}")
@@ -163,7 +163,7 @@ def prepare(
 
 
 def _before(store: StoreWriter | None, recording: Recording) -> dict[str, Any] | None:
-    """The manifest row of the same recording, if it is in the store."""
+    """Return the manifest row of the same recording if it is in the store."""
     if store is None:
         return None
     rows = store.live(recording.recording_id).to_pylist(maps_as_pydicts="strict")
@@ -171,13 +171,13 @@ def _before(store: StoreWriter | None, recording: Recording) -> dict[str, Any] |
 
 
 def _unchanged(before: Mapping[str, Any], profile: Profile) -> bool:
-    """Whether the rows of this manifest were made by the same definitions."""
+    """Return whether the rows of this manifest were made by the same definitions."""
     by_rules = {**before, "labels_version": rules_of(before["labels_version"])}
     return all(by_rules[name] == value for name, value in definitions(profile).items())
 
 
 def _other_robot(before: Mapping[str, Any], profile: Profile) -> bool:
-    """Whether the profile that a recording was ingested with says something else in [robot]."""
+    """Return whether the profile of an earlier ingest has another [robot] table."""
     if not (text := before.get("profile_toml")):
         return False
     try:
@@ -290,7 +290,7 @@ class _Ingest:
     def _frames_written(
         self, store: StoreWriter, manifest: Mapping[str, Any], kept: Sequence[KeptFrames]
     ) -> Iterator[None]:
-        """The frames in their file; gone again where the block fails.
+        """Write the frames to their file, and delete it again if the block fails.
 
         Raises:
             RecordingError: a frame that was read before is not there any more.

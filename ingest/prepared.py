@@ -29,7 +29,7 @@ OnRepeat = Literal["keep", "refuse", "replace"]
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What became of one recording: the counts of its manifest, and its notes."""
+    """Outcome of one recording: the counts of its manifest, and its notes."""
 
     path: str
     status: Status
@@ -48,7 +48,7 @@ class IngestResult:
 
     @property
     def lossy(self) -> bool:
-        """Whether data of the topics used was lost, or contradicts itself."""
+        """Return whether data of the topics used was lost, or contradicts itself."""
         return bool(self.lost_messages or self.contradictions)
 
 
@@ -121,7 +121,7 @@ def _removal(store: StoreWriter, recording_id: str) -> str:
 def _commit(
     store: StoreWriter, group: dict[int, Prepared], *, begun: bool = False
 ) -> dict[int, IngestResult | StoreError | RecordingError]:
-    """One commit of all, or where that fails, of each; `begun` where one with others failed."""
+    """Commit all in one, or if that fails, each alone; `begun` if a commit of several had begun."""
     staged = {place: one.staged for place, one in group.items() if one.staged}
     several = list(staged.values())
     if not several:
@@ -150,7 +150,7 @@ def _commit(
 def _finished(
     store: StoreWriter, one: Prepared, staged: Staged, version: int, later: Sequence[Ingest]
 ) -> IngestResult | StoreError:
-    """The result of a recording that is in the store, those `later` of its group left aside."""
+    """Build the result of a committed recording, ignoring the `later` ones of its group."""
     repeats = None
     if one.repeated is not None:
         # Looked for after the commit: another process may have written the same drive meanwhile.
@@ -177,8 +177,10 @@ def _finished(
 
 
 def _replaced(store: StoreWriter, part: RepeatedDrive) -> tuple[int | None, str]:
-    """Take a part of what was just ingested out of the store: the store's version, None where it
-    stays; and what is to be said."""
+    """Remove a recording that is only a part of what was just ingested.
+
+    Returns the store's version (None if the part stays) and a note for the user.
+    """
     why = "it has steps that this one has not"
     if part.is_part:
         (reported,) = remove_recordings(store, [part.recording_id], dry_run=True).recordings
@@ -221,8 +223,10 @@ class CommitGroup:
         self.commit_if_due()
 
     def _copy(self, result: IngestResult) -> IngestResult | None:
-        """What becomes of a recording that came before under another path, by which it has other
-        tags: those stay. Else each ingest of the two paths would change them, in turn."""
+        """Return the result of a recording that came before under another path with other tags.
+
+        The first path's tags stay. Otherwise each ingest of the two paths would change them.
+        """
         first = self._first.setdefault(result.manifest.get("recording_id", ""), result)
         tags = first.manifest.get("tags") or {}
         if (result.manifest.get("tags") or {}) == tags:
@@ -231,7 +235,7 @@ class CommitGroup:
         return IngestResult(result.path, "unchanged", first.manifest, notes=[note])
 
     def due_in_s(self) -> float | None:
-        """How long until what waits is to be committed; None where nothing does."""
+        """Return the seconds until waiting recordings must be committed; None if none waits."""
         if not self.waiting:
             return None
         if self._last_s is None or len(self.waiting) >= MOST:

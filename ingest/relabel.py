@@ -68,7 +68,7 @@ TWIN = "twin"  # format of the recordings that training makes of its episodes
 
 @dataclass(frozen=True)
 class Relabelled:
-    """What became of one recording's labels."""
+    """Outcome of relabelling one recording."""
 
     recording_id: str
     source_file: str
@@ -133,7 +133,7 @@ def relabel_store(
 def relabel_rows(
     store: StoreWriter, row: dict[str, Any], definitions: Sequence[Condition]
 ) -> tuple[pa.Table, pa.Table, Relabelled]:
-    """One recording's manifest (of which `row` is the old one) and rows with new labels.
+    """Return the manifest and rows of a recording with new labels; `row` is the old manifest.
 
     `definitions` are conditions of both kinds.
 
@@ -224,8 +224,10 @@ def relabel_rows(
 
 
 def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> Profile | None:
-    """The profile of a manifest's text with the conditions that label its rows now; None where it
-    has none, or one that only a newer Restock can read."""
+    """Return the manifest's profile with the conditions that label its rows now.
+
+    None if it has no profile, or one that only a newer Restock can read.
+    """
     try:
         profile = read_profile_toml(text or "", where="the manifest's profile")
     except ConfigError:
@@ -234,7 +236,7 @@ def _with_conditions(text: str | None, conditions: Sequence[Condition]) -> Profi
 
 
 def open_for_relabel(path: Path | str) -> StoreWriter:
-    """The store at `path`, which must be there.
+    """Open the store at `path`, which must exist.
 
     Raises:
         StoreError: there is none.
@@ -252,7 +254,7 @@ def open_for_relabel(path: Path | str) -> StoreWriter:
 
 @dataclass(frozen=True)
 class RecordingCorrections:
-    """What is said of one recording's labels."""
+    """People's corrections of one recording's labels."""
 
     ingest_id: str  # of the rows that it was said of
     corrections: list[Correction]
@@ -260,7 +262,7 @@ class RecordingCorrections:
 
 @dataclass(frozen=True)
 class Changed:
-    """What corrections did to one condition's rows."""
+    """Effect of corrections on one condition's rows."""
 
     added: int = 0  # the label is there now
     removed: int = 0
@@ -269,7 +271,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Corrected:
-    """What became of one recording."""
+    """Outcome of correcting one recording."""
 
     recording_id: str
     source_file: str
@@ -335,7 +337,7 @@ def remove_corrections(
 
 
 def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """The conditions of a kind that labelled a recording, as its manifest keeps them.
+    """Return the conditions of a kind that labelled a recording, as its manifest keeps them.
 
     Raises:
         StoreError: a newer Restock wrote them.
@@ -353,7 +355,7 @@ def stored_conditions(manifest: Mapping[str, Any], kind: Kind = "outcome") -> li
 def _one(
     store: StoreWriter, row: dict[str, Any], given: Sequence[Correction]
 ) -> tuple[pa.Table, pa.Table, Corrected]:
-    """One recording's manifest and rows, corrected."""
+    """Return the corrected manifest and rows of one recording."""
     before = store.rows(row["recording_id"], row["ingest_id"])
     conditions, offset_ns = stored_conditions(row), row["clock_offset_ns"]
     every = merged(corrections_in(row), given, Moments.of(before, offset_ns))
@@ -382,7 +384,7 @@ def _outcome(
     given: Sequence[Correction],
     conditions: Sequence[Condition],
 ) -> Corrected:
-    """What changed, and what was confirmed, of the conditions that are spoken of."""
+    """Count what changed and what was confirmed, for each condition that was corrected."""
     names = [c.name for c in conditions]
     was, now = held(before["conditions"], names), held(after["conditions"], names)
     moments = Moments.of(before, row["clock_offset_ns"])
@@ -412,7 +414,7 @@ def _write(
     instead_of: Mapping[str, str],
     dry_run: bool,
 ) -> int | None:
-    """One commit, unless there is nothing to write, or it is not to be written."""
+    """Write everything in one commit, unless there is nothing to write or it is a dry run."""
     first = next(recordings, None)
     if first is None:
         return None

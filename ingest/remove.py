@@ -39,7 +39,7 @@ class RemovedRecording:
 
 @dataclass(frozen=True)
 class Removed:
-    """What was removed from a store, or would be."""
+    """Recordings that were removed from a store, or would be."""
 
     recordings: list[RemovedRecording] = field(default_factory=list)
     left: int = 0  # recordings that stay
@@ -90,7 +90,7 @@ def _by_path(row: Mapping[str, Any]) -> tuple[str, str]:
 def _chosen(
     live: Sequence[dict[str, Any]], names: Iterable[str], where: str
 ) -> list[dict[str, Any]]:
-    """The manifests that are named, each once. Raises StoreError where a name does not decide."""
+    """Return the named manifests, each once. Raise StoreError if a name is ambiguous or unknown."""
     chosen: dict[str, dict[str, Any]] = {}
     problems = []
     for name in dict.fromkeys(names):
@@ -111,7 +111,7 @@ def _chosen(
 
 
 def _named(live: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """The recordings that a name may be of: by id or path as it stands, else by what ends so."""
+    """Find the recordings that a name fits: by id or exact path, else by the path's end."""
     digits = name.lower()
     if len(digits) == ID_DIGITS and (found := [r for r in live if r["recording_id"] == digits]):
         return found
@@ -133,13 +133,13 @@ def _absolute(path: str) -> str:
 
 
 def _ends_with(row: Mapping[str, Any], name: str) -> bool:
-    """Whether the last parts of a recording's path are these, as in `b.mcap` of `logs/b.mcap`."""
+    """Return whether a path ends in these parts, as `logs/b.mcap` ends in `b.mcap`."""
     given = PurePath(name).parts
     return bool(given) and PurePath(row["source_file"]).parts[-len(given) :] == given
 
 
 def _problem(live: Sequence[dict[str, Any]], name: str, found: Sequence[dict[str, Any]]) -> str:
-    """What is wrong with a name, and which recordings it may be meant for."""
+    """Say why a name does not select one recording, and which ones it may mean."""
     if found:
         what = f"{name!r} is the name of {len(found)} recordings"
         return f"{what}: {_listed(found)}"

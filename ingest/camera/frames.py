@@ -41,13 +41,12 @@ _RAW_FIELDS = ("encoding", "width", "height", "step", "is_bigendian", "data")
 
 
 def image_fields(kind: str) -> tuple[str, ...]:
-    """The field paths of a message of one of the two types."""
+    """Return the field paths that an image message of this type has."""
     return _COMPRESSED_FIELDS if kind == COMPRESSED else _RAW_FIELDS
 
 
 def other_field(kind: str, leaves: Sequence[Leaf]) -> str | None:
-    """The first field that a message of this type does not have as ROS defines it, by the
-    definition that its file brings; None where it has all."""
+    """Return the first field that differs from ROS's definition of this type; None if none does."""
     found = {leaf.path.removesuffix("[]"): leaf for leaf in leaves}
     fields = image_fields(kind)
     return next((name for name in fields if not _is_field(name, found.get(name))), None)
@@ -65,7 +64,7 @@ def _is_field(name: str, leaf: Leaf | None) -> bool:
 
 
 def frame_reduction(kind: str) -> Reduction:
-    """What makes the columns of a camera's messages of this type."""
+    """Build the reduction that turns a camera's messages into columns."""
 
     def apply(fields: Fields) -> dict[str, FieldColumn]:
         payloads = image_bytes(fields)
@@ -92,7 +91,7 @@ def frame_reduction(kind: str) -> Reduction:
 
 
 def image_bytes(fields: Fields) -> list[bytes]:
-    """The bytes of each message's image."""
+    """Return the image bytes of each message."""
     column = fields["data"]
     assert isinstance(column, Ragged)
     view = np.ascontiguousarray(np.asarray(column.values, np.uint8)).data
@@ -101,7 +100,7 @@ def image_bytes(fields: Fields) -> list[bytes]:
 
 
 def layouts(kind: str, fields: Fields) -> Callable[[int, bytes], ImageLayout]:
-    """What gives the layout of a message's image by its row and bytes, or raises ImageProblem."""
+    """Return a function that gives an image's layout by row and bytes, or raises ImageProblem."""
     if kind == COMPRESSED:
         formats = np.asarray(fields["format"], object)
         return lambda row, data: compressed_layout(data, str(formats[row]))
@@ -142,8 +141,7 @@ class CameraFrames:
         return most + Counter(rest)
 
     def in_force(self, ticks: Ints) -> tuple[Ints, Ints, Ints]:
-        """The frames in force at some of these ticks, in their order, and the first and the last
-        tick (of all) at which each is: (K,) each."""
+        """Return the frames in force at these ticks, and the first and last tick of each, (K,)."""
         at = self.at_tick[ticks]
         seen = at >= 0
         frames, which = np.unique(at[seen], return_inverse=True)
@@ -154,7 +152,7 @@ class CameraFrames:
         return frames, first, last
 
     def account(self, kept: int, steps: int) -> dict[str, Any]:
-        """What became of its decoded messages: they are the sum of all counts but `steps`."""
+        """Count what became of the decoded messages: all counts but `steps` add up to them."""
         problems = self.problems
         usable, decoded = int(self.usable.sum()), len(self.columns)
         return {
@@ -168,8 +166,10 @@ class CameraFrames:
 
 
 def usable_frames(columns: TopicColumns, row: Ints, stamp_ns: Ints, max_hz: float | None) -> Bools:
-    """(S,) which of these messages, in the order of their stamps, are frames to keep: with
-    `max_hz`, the first in each 1 / max_hz seconds of the alignment clock."""
+    """Return which messages (S,), in stamp order, are frames to keep.
+
+    With `max_hz`, the first in each 1 / max_hz seconds of the alignment clock.
+    """
     problem = np.asarray(columns.fields[PROBLEM], object)[row]
     usable = np.asarray((problem == "") & (stamp_ns >= 0), np.bool_)
     if max_hz is not None:
@@ -200,7 +200,7 @@ class KeptFrames:
         return cls(name, frames, *frames.in_force(ticks), int((frames.at_tick[ticks] >= 0).sum()))
 
     def manifest_row(self, recording: Recording, file: str) -> dict[str, Any]:
-        """What became of its messages, as `recordings.cameras` holds it."""
+        """Return the counts of its messages, as `recordings.cameras` holds them."""
         topic = recording.topics[self.frames.camera.topic]
         sizes = np.asarray(self.frames.columns.fields[SIZE], np.int64)
         return {
@@ -215,7 +215,7 @@ class KeptFrames:
 
 
 def kept_frames(cameras: Mapping[str, CameraFrames], ticks: Ints) -> list[KeptFrames]:
-    """The frames of each camera that steps in episodes have."""
+    """Return the frames of each camera that steps in episodes use."""
     return [KeptFrames.of(name, frames, ticks) for name, frames in cameras.items()]
 
 

@@ -44,7 +44,7 @@ class ImageProblem(ValueError):
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """What is needed to read the bytes of an image."""
+    """Size and format of an image, as needed to read its bytes."""
 
     encoding: str  # jpeg, png, or one of ENCODINGS
     width: int
@@ -56,7 +56,7 @@ class ImageLayout:
 
 
 def compressed_layout(data: bytes, said: str) -> ImageLayout:
-    """Of a JPEG or PNG file, by its own header; `said` is the message's format.
+    """Read the layout of a JPEG or PNG file from its header; `said` is the message's format.
 
     Raises:
         ImageProblem: it is neither, its header is damaged, or its end is missing.
@@ -76,7 +76,7 @@ def compressed_layout(data: bytes, said: str) -> ImageLayout:
 def raw_layout(
     size_bytes: int, encoding: str, width: int, height: int, row_bytes: int, big_endian: bool
 ) -> ImageLayout:
-    """Of a raw image, by its message.
+    """Build the layout of a raw image from the fields of its message.
 
     Raises:
         ImageProblem: an unknown encoding, or bytes that are not as many as the rest says.
@@ -137,7 +137,7 @@ def _bound(layout: ImageLayout) -> None:
 
 
 def _jpeg(data: bytes) -> ImageLayout:
-    """By the markers before the scan."""
+    """Read the layout of a JPEG from the markers before its scan."""
     if data[-4096:].rstrip(b"\x00")[-2:] != b"\xff\xd9":  # some cameras pad with zeros
         raise ImageProblem("truncated JPEG: its end is missing")
     at = 2

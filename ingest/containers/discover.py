@@ -59,7 +59,7 @@ _ZSTD = re.compile(r"\.zstd?$")
 
 
 def recording_path(path: Path | str) -> Path:
-    """The path that is given, which is refused where it is empty: to Path, the working directory.
+    """Return the given path; an empty one is refused, as Path takes it for the working directory.
 
     Raises:
         RecordingError: it is empty.
@@ -73,8 +73,10 @@ def recording_path(path: Path | str) -> Path:
 
 
 def recordings_in(path: Path | str) -> list[Path]:
-    """The recordings at a path: a file, a bag's folder, a folder of many (searched deeply), or a
-    glob. A bag with all its split files is one recording, named by its folder.
+    """Find the recordings at a path: a file, a bag's folder, a folder of many, or a glob.
+
+    Folders are searched deeply. A bag with all its split files is one recording, named by its
+    folder.
 
     Raises:
         RecordingError: no such path, or no recording in it.
@@ -87,7 +89,7 @@ def recordings_in(path: Path | str) -> list[Path]:
 
 
 def cannot_be_read(error: OSError, path: Path) -> RecordingError:
-    """What the file system refuses: permissions, a folder that is not mounted any more, …"""
+    """Build the error for a path that the file system does not let us read."""
     return RecordingError(
         f"cannot be read: {error.strerror or error}",
         where=str(error.filename or path),
@@ -126,7 +128,7 @@ def _found(path: Path) -> list[Path]:
 
 
 def _refuse_special(path: Path) -> None:
-    """Reading a pipe, a socket or a device would wait, or never end."""
+    """Refuse pipes, sockets and devices: reading one would wait, or never end."""
     if path.exists() and not path.is_file() and not path.is_dir():
         raise RecordingError(
             "a pipe, a socket or a device, not a file",
@@ -164,12 +166,12 @@ def _within(folder: Path) -> list[Path]:
 
 
 def is_storage_name(path: Path) -> bool:
-    """Whether a file is named like a recording."""
+    """Return whether a file is named like a recording."""
     return path.name.endswith(endings())
 
 
 def is_bag(folder: Path) -> bool:
-    """Whether a folder is one rosbag2 bag: it has metadata.yaml, or split files of its name."""
+    """Return whether a folder is one rosbag2 bag: metadata.yaml, or split files of its name."""
     if (folder / METADATA).is_file():
         return True
     files = [item for item in folder.iterdir() if item.is_file() and is_storage_name(item)]
@@ -179,7 +181,7 @@ def is_bag(folder: Path) -> bool:
 
 @dataclass(frozen=True)
 class ClaimedTopic:
-    """What metadata.yaml claims of a topic; None where that is missing or of another type."""
+    """Topic as metadata.yaml claims it; None if a value is missing or of another type."""
 
     name: str | None
     serialization: str | None
@@ -188,7 +190,7 @@ class ClaimedTopic:
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """What metadata.yaml claims of a bag: none of it is trusted."""
+    """Claims of a bag's metadata.yaml, none of which is trusted."""
 
     files: tuple[str, ...] = ()  # names without folders: only files in the bag's own are read
     topics: tuple[ClaimedTopic, ...] = ()
@@ -196,8 +198,10 @@ class BagMetadata:
 
 
 def bag_files(folder: Path, metadata: BagMetadata) -> tuple[list[Path], list[str], list[str]]:
-    """Return a bag's storage files in order, the names that its metadata lists but that are
-    missing, and in words, which files are copies of others: their messages would count twice."""
+    """Return a bag's storage files in order, listed names that are missing, and copies in words.
+
+    Messages of a copy would count twice, so it is not read.
+    """
     present = {item.name: item for item in folder.iterdir() if item.is_file()}
     storages = {name: item for name, item in present.items() if is_storage_name(item)}
     order = []
@@ -229,8 +233,10 @@ def _equal(one: Path, other: Path) -> bool:
 
 
 def holes(files: Sequence[Path], *, from_zero: bool) -> list[str]:
-    """Return the names that a bag's files lack by their numbers (`run_0.db3`, `run_2.db3`), which
-    rosbag2 counts from 0. It leaves out the first files if it was told to keep only the last."""
+    """Return the names that a bag's files lack by their numbers (`run_0.db3`, `run_2.db3`).
+
+    rosbag2 counts from 0, but leaves out the first files if it keeps only the last.
+    """
     series: dict[str, dict[int, str]] = {}
     for file in files:
         if part := _PART.fullmatch(file.name):
@@ -250,7 +256,7 @@ def _natural(name: str) -> list[int | str]:
 
 
 def read_metadata(folder: Path) -> tuple[BagMetadata, str | None]:
-    """What metadata.yaml claims, and what is wrong with it if it cannot be used."""
+    """Read the claims of metadata.yaml, and say what is wrong if it cannot be used."""
     file = folder / METADATA
     if not file.is_file():
         return BagMetadata(), f"no {METADATA}: read from the storage files alone"

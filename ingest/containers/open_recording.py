@@ -65,7 +65,7 @@ def refuse_no_recording(path: Path) -> None:
 
 
 def with_definitions(typestore: str | None, folder: Path | None) -> str | None:
-    """The name of a type store with a folder's .msg and .idl files on top: `humble+/the/folder`.
+    """Name a type store with a folder's .msg and .idl files on top: `humble+/the/folder`.
 
     Raises:
         RecordingError: no such distribution or folder, or no definition in it that can be read.
@@ -227,9 +227,11 @@ class _Opening:
                 )
 
     def _compare(self, metadata: BagMetadata, files: list[Path]) -> None:
-        """Compare metadata.yaml with the files: what it counts and they do not hold is lost, and
-        what they hold beyond it is noted. Names that it lists do not matter if every message is
-        there."""
+        """Compare metadata.yaml with the files.
+
+        Messages that it counts and they do not hold are lost; what they hold beyond it is noted.
+        Names that it lists do not matter if every message is there.
+        """
         counts = Counter[str]()
         for storage in self.storages:
             for channel in storage.channels.values():

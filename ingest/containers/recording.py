@@ -1,4 +1,4 @@
-"""One recording, open: its topics, its columns, and the account of what became of each message.
+"""Open recordings: topics, columns, and the account of what became of each message.
 
 Whatever the container, messages come in the order of their log time, and what was expected, read,
 decoded and skipped is kept per topic.
@@ -75,7 +75,7 @@ class _Stream:
 
 
 class Recording:
-    """One recording, open: an MCAP file, or a bag with all its files.
+    """An open recording: an MCAP file, or a bag with all its files.
 
     `topics` names every topic with its type and count; `read` decodes some of them. After it
     `accounts` says per topic what was expected, read, decoded and skipped, and `lost_messages`
@@ -160,8 +160,10 @@ class Recording:
         return f"{said}: only those of {', '.join(sorted(read))} are read"
 
     def _alike(self, one: _Stream, other: _Stream) -> bool:
-        """Whether messages of both have the same type, or types of the same fields: ROS 1 has
-        tf/tfMessage and tf2_msgs/TFMessage."""
+        """Return whether messages of both have the same type, or types of the same fields.
+
+        ROS 1 has tf/tfMessage and tf2_msgs/TFMessage.
+        """
         if one.channel.type == other.channel.type:
             return True
         try:
@@ -194,7 +196,7 @@ class Recording:
 
     @property
     def size_bytes(self) -> int:
-        """Of all its files."""
+        """Return the bytes of all its files."""
         return sum(file.stat().st_size for file in self.files)
 
     @property
@@ -208,7 +210,7 @@ class Recording:
         return list(found.values())
 
     def qos(self, topic: str) -> str:
-        """The quality of service that a topic's publishers offered, as its file has it: YAML."""
+        """Return the quality of service that a topic's publishers offered: YAML, as in the file."""
         return next((one.channel.qos for one in self._channels(topic) if one.channel.qos), "")
 
     @property
@@ -221,12 +223,12 @@ class Recording:
 
     @property
     def messages(self) -> int:
-        """Of all topics, by the container's own count."""
+        """Return the messages of all topics, by the container's own count."""
         return sum(topic.expected for topic in self.topics.values())
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums confirm what was read; final after `read`."""
+        """Return whether checksums confirm what was read; final after `read`."""
         states = {storage.integrity for storage in self._storages}
         if "damaged" in states or self._bag_damage:
             return "damaged"
@@ -234,23 +236,23 @@ class Recording:
 
     @property
     def damage(self) -> list[Damage]:
-        """What of its files could not be read."""
+        """Return what of its files could not be read."""
         return self._bag_damage + [item for storage in self._storages for item in storage.damage]
 
     @property
     def extras(self) -> list[Extra]:
-        """What its files hold besides messages: attachments and metadata records, by name."""
+        """Return its attachments and metadata records, by name."""
         return [extra for storage in self._storages for extra in storage.extras]
 
     @property
     def metadata(self) -> list[Metadata]:
-        """What it says of itself as a whole: the custom_data of a bag, metadata records."""
+        """Return the metadata of the whole recording: custom_data of a bag, metadata records."""
         every = [*self._bag_metadata, *(m for storage in self._storages for m in storage.metadata)]
         return [item for item in every if item.entries]
 
     @property
     def lost_messages(self) -> list[LostMessages]:
-        """What is missing, each once: of the files, and, for other reasons, of the topics read."""
+        """Return what is missing, each once: from the files, and from the topics that were read."""
         damaged = {item.what for item in self.damage}
         lost = [LostMessages(None, _count(item), item.what) for item in self._bag_damage]
         for storage in self._storages:
@@ -314,8 +316,10 @@ class Recording:
         return columns
 
     def batches(self, topic: str, fields: Sequence[str]) -> Iterator[tuple[Ints, Fields]]:
-        """Some messages of a topic after the other, in the order they lie in: their log times (N,),
-        and columns of these fields. What cannot be decoded is left out; `read` accounts for it."""
+        """Yield log times (N,) and columns of these fields, some messages of a topic at a time.
+
+        They come in file order. What cannot be decoded is left out; `read` accounts for it.
+        """
         self._expect_open()
         for storage in self._storages:
             decoders: dict[int, Decoder] = {}
@@ -368,7 +372,7 @@ class Recording:
         storage: Storage,
         readings: Mapping[str, TopicReading],
     ) -> Iterator[int]:
-        """Yields how many messages were read, some after the other."""
+        """Read one file, and yield how many messages were read each time."""
         decoders: dict[int, Decoder] = {}
         topics: dict[int, str] = {}
         for topic, reading in readings.items():
@@ -429,12 +433,12 @@ class Recording:
 
 
 def _count(damage: Damage) -> int | None:
-    """How many messages it cost; None where that is not known."""
+    """Return how many messages damage cost; None if that is not known."""
     return sum(damage.messages.values()) or None
 
 
 def _messages(channel: Channel, batch: MessageBatch, rows: NDArray[Any]) -> Iterator[RawMessage]:
-    """These rows of a batch (numbers or a mask); what cannot be decompressed is left out."""
+    """Yield these rows of a batch (numbers or a mask); skip what cannot be decompressed."""
     if rows.dtype == np.bool_:
         rows = np.flatnonzero(rows)
     for some, _ in decompressed(batch.select(rows)):

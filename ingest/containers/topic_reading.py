@@ -1,4 +1,4 @@
-"""One topic being read: batches of payloads in, columns that grow out, and their account.
+"""Reading of one topic: batches of payloads in, columns out, and an account of losses.
 
 Of a batch only the wanted fields stay, and of wide ones (a scan's ranges) only what a `Reduction`
 makes of them: what is in memory does not grow with a recording's bytes.
@@ -35,7 +35,7 @@ Fields = Mapping[str, FieldColumn]
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """What a recording says about a topic before anything is read."""
+    """Description of a topic before anything is read."""
 
     name: str
     type: str  # "nav_msgs/msg/Odometry"; "" where the container names none
@@ -50,7 +50,7 @@ FAR_BACK_NS = 100_000_000  # between two messages of a topic, as they lie in the
 
 @dataclass
 class Account:
-    """What became of a topic's messages: expected = decoded + lost, always."""
+    """Account of a topic's messages: expected = decoded + lost, always."""
 
     topic: str
     type: str
@@ -88,7 +88,7 @@ class Reduction:
 
 
 class TopicReading:
-    """One topic's columns and account so far."""
+    """Columns and account of one topic so far."""
 
     def __init__(
         self, topic: TopicInfo, wanted: Iterable[str], reduction: Reduction | None = None
@@ -161,7 +161,7 @@ class TopicReading:
             self._account.reasons[reason] = self._account.reasons.get(reason, 0) + count
 
     def close(self, lost: Mapping[str, int]) -> Account:
-        """The account, reconciled: messages that are counted but not there are lost too."""
+        """Reconcile and return the account: messages that are counted but missing are lost too."""
         account = self._account
         self._add(lost)
         unexplained = account.expected - account.decoded - sum(account.reasons.values())
@@ -170,7 +170,7 @@ class TopicReading:
         return account
 
     def columns(self) -> TopicColumns:
-        """All of it, in the order of log time."""
+        """Return all columns, in the order of log time."""
         log = self._log.column()
         fields: dict[str, FieldColumn] = {}
         order, lap = None, None
@@ -192,7 +192,7 @@ class TopicReading:
 
 
 def together(batches: Iterable[tuple[int, MessageBatch]]) -> Iterator[tuple[int, MessageBatch]]:
-    """The same messages by channel, in the same order, with small batches put together.
+    """Yield the same messages in the same order, with small batches of a channel put together.
 
     Decoding has a cost per batch, besides that per message: of a topic of few messages a second
     there are only a handful in 8 MiB of a recording.

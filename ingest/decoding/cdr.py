@@ -52,7 +52,7 @@ class CdrPlan:
     paths: dict[str, tuple[str, tuple[int | None, ...]]]  # wanted -> kind, repetitions inside
 
     def decode(self, frame: Frame) -> Columns:
-        """The wanted fields of all messages of the frame; its cursor is then past the last field.
+        """Decode the wanted fields of all messages, and move the cursor past the last field.
 
         Raises:
             BadRows: messages that end too early, or hold invalid text.
@@ -63,12 +63,12 @@ class CdrPlan:
         return out
 
     def empty(self) -> Columns:
-        """The columns of no message."""
+        """Return the columns of no messages."""
         return {path: empty_column(kind, dims) for path, (kind, dims) in self.paths.items()}
 
 
 def empty_column(kind: str, dims: tuple[int | None, ...]) -> FieldColumn:
-    """A column without rows, of the shape that rows would have."""
+    """Return a column without rows, of the shape that rows would have."""
     dtype = {"string": np.dtype(object), "time": np.dtype(np.int64)}.get(kind) or DTYPES[kind]
     column: FieldColumn = np.zeros(0, dtype)
     for length in reversed(dims):
@@ -155,7 +155,7 @@ class Repeat:
         return only if isinstance(only, FixedFields) else None
 
     def decode(self, frame: Frame, out: Columns) -> None:
-        """All elements of all messages, as far as possible at once."""
+        """Decode all elements of all messages, as far as possible at once."""
         count = self.length if self.length is not None else frame.read_uint32(1 if self.ros1 else 4)
         if not self.inner.operations:  # ROS 1: messages without fields take no bytes
             return
@@ -209,7 +209,7 @@ class _Elements:
         self.parts: list[Columns] = []
 
     def read(self) -> Columns:
-        """All elements, in order; the frame's cursor is then past the last."""
+        """Read all elements in order, and move the frame's cursor past the last."""
         most = int(self.counts.max())
         left = self.counts.copy()
         step = 0
@@ -274,7 +274,7 @@ class _Compiler:
         self.message, self.wanted, self.ros1 = message, wanted, ros1
 
     def plan(self, name: str, prefix: str) -> CdrPlan:
-        """The plan of a message whose fields' paths start with `prefix`."""
+        """Compile the plan of a message whose fields' paths start with `prefix`."""
         plan = CdrPlan([], {})
         fixed: list[FixedField] = []
         self._message(name, prefix, plan, fixed)
@@ -363,7 +363,7 @@ class _Compiler:
 
 
 def compile_plan(message: RosType, wanted: Iterable[str], *, ros1: bool = False) -> CdrPlan:
-    """The plan that reads these leaf paths of a message type (each as `Leaf.path` gives it).
+    """Compile the plan that reads these leaf paths of a message type (as `Leaf.path` gives them).
 
     Raises:
         CannotDecode: the type uses something unsupported.
@@ -401,7 +401,7 @@ class ColumnDecoder:
         return self._named(self._plan.empty())
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """The batch's columns; a message that does not decode is counted, by reason."""
+        """Decode a batch to columns, counting messages that do not decode by reason."""
         if self._ros1:
             every = np.arange(len(batch))
             return self._join([self._decode_rows(batch, every, "<", 0)], Counter())
@@ -446,7 +446,7 @@ class ColumnDecoder:
     def _one_by_one(
         self, batch: MessageBatch, rows: NDArray[np.intp], bad: Counter[str]
     ) -> Decoded:
-        """What is wrong differs from row to row: let every row fail for itself."""
+        """Decode row by row, so that each fails for itself, as what is wrong differs."""
         part = batch.select(rows)
         slow = RowDecoder(self._message, self._leaves, ros1=self._ros1).decode(part)
         return Decoded(rows[slow.rows], slow.fields, bad + Counter(slow.bad))

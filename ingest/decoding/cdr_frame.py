@@ -1,4 +1,4 @@
-"""Where a batch of messages is being read: a cursor per message, and gathers from one buffer.
+"""Reading position in a batch of messages: a cursor per message, and gathers from one buffer.
 
 A cursor that is the same for all messages is one int, not an array: as long as messages are laid
 out alike, as most of a topic's are, position arithmetic costs nothing.
@@ -47,7 +47,7 @@ class TextBuffer:
         self._text: str | None = None
 
     def texts(self, at: Ints, stop: Ints) -> list[str] | None:
-        """The texts at these places; None where they are not all ASCII, or not in such a buffer."""
+        """Slice the texts at these places; None if not all are ASCII, or the buffer has none."""
         if self._whole is None:
             return None
         if self._text is None:
@@ -87,7 +87,7 @@ class Frame:
         return len(self.origin)
 
     def select(self, rows: NDArray[np.intp], position: Position) -> Frame:
-        """Some of the messages (or some of them several times), at these positions."""
+        """Select messages (some perhaps several times), at these positions."""
         return Frame(
             self.buffer,
             self.order,
@@ -119,7 +119,7 @@ class Frame:
 
 
 def uniform(values: Position) -> Position:
-    """One int where all values are the same."""
+    """Return one int if all values are the same, else the values."""
     if isinstance(values, int):
         return values
     if len(values) and (values == values[0]).all():
@@ -128,19 +128,19 @@ def uniform(values: Position) -> Position:
 
 
 def spread(value: Position, count: int) -> Ints:
-    """An array of `count`, whatever it was."""
+    """Return an array of `count` values, from one int or an array."""
     return np.full(count, value, np.int64) if isinstance(value, int) else value
 
 
 def native(values: NDArray[Any]) -> NDArray[Any]:
-    """The same values in this machine's byte order."""
+    """Convert values to this machine's byte order."""
     return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
 
 
 def gather_sequences(
     buffer: NDArray[np.uint8], at: Ints, counts: Position, dtype: np.dtype[Any]
 ) -> Ragged:
-    """`counts` consecutive values of `dtype` from each byte position."""
+    """Gather `counts` consecutive values of `dtype` from each byte position."""
     if isinstance(counts, int):
         if counts == 0:
             return Ragged(np.zeros(0, dtype.newbyteorder("=")), np.zeros(len(at) + 1, np.int64))
@@ -209,7 +209,7 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class FixedField:
-    """One primitive, or a fixed array of them, among fields of fixed size."""
+    """A primitive, or a fixed array of them, among fields of fixed size."""
 
     dtype: np.dtype[Any]  # "<" is implied
     count: int | None  # of a fixed array
@@ -285,7 +285,7 @@ class FixedFields:
         frame.position = stop
 
     def take(self, frame: Frame, at: Ints, layout: _Layout, out: Columns) -> None:
-        """The wanted items at these byte positions; they must fit."""
+        """Gather the wanted fields at these byte positions, which must fit."""
         times: dict[str, NDArray[np.int64]] = {}
         for first, structures in layout.groups:
             structs = gather(frame.buffer, at + first, structures[frame.order])
@@ -304,7 +304,7 @@ class FixedFields:
                     out[str(field.path)] = values
 
     def stride(self, phase: int) -> int | None:
-        """The size of one more element of these fields, where that is the same every time."""
+        """Return the size of one more element of these fields; None if it varies."""
         size = self.layouts[phase].size
         return size if (phase + size) & self.mask == phase else None
 

@@ -31,17 +31,17 @@ class Ragged:
         return len(self.offsets) - 1
 
     def __getitem__(self, row: int) -> NDArray[Any] | Ragged:
-        """One row's values (an array), or one row's rows (Ragged)."""
+        """Return one row's values (an array), or one row's rows (Ragged)."""
         index = range(len(self))[row]
         return cut(self.values, int(self.offsets[index]), int(self.offsets[index + 1]))
 
     @property
     def lengths(self) -> Ints:
-        """How many values each row holds, (N,)."""
+        """Return how many values each row holds, (N,)."""
         return np.diff(self.offsets)
 
     def take(self, rows: NDArray[np.intp]) -> Ragged:
-        """These rows, in this order."""
+        """Select rows, in this order."""
         lengths = self.lengths[rows]
         offsets = offsets_of(lengths)
         # Element j of the output comes from where its row starts, plus its place in the row.
@@ -68,7 +68,7 @@ def cut(column: FieldColumn, start: int, stop: int) -> FieldColumn:
 
 
 def take(column: FieldColumn, rows: NDArray[Any]) -> FieldColumn:
-    """These rows of a column, in this order."""
+    """Select rows of a column, in this order."""
     return column.take(rows) if isinstance(column, Ragged) else column[rows]
 
 
@@ -86,7 +86,7 @@ def join(columns: Sequence[FieldColumn]) -> FieldColumn:
 
 
 def equal(left: FieldColumn, right: FieldColumn) -> bool:
-    """Whether two columns hold the same values (NaN equal to NaN), shapes and types."""
+    """Return whether two columns have the same values (NaN equals NaN), shapes and types."""
     if isinstance(left, Ragged) or isinstance(right, Ragged):
         return (
             isinstance(left, Ragged)
@@ -100,7 +100,7 @@ def equal(left: FieldColumn, right: FieldColumn) -> bool:
 
 
 def gather(buffer: NDArray[np.uint8], at: Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """One value of `dtype` (which may be a structure or an array) at each byte position, (N, …).
+    """Gather one value of `dtype` (also a structure or array) at each byte position, (N, …).
 
     Positions must fit. All bytes of a value are moved at once, whatever its fields.
     """
@@ -169,7 +169,7 @@ class GrowingArray:
         self._size = size
 
     def column(self) -> NDArray[Any]:
-        """All of it, (N, …)."""
+        """Return the whole column, (N, …)."""
         return self._room[: self._size]
 
 
@@ -195,10 +195,10 @@ class GrowingRagged:
         self._offsets.add(part.offsets[1:] + before, expected + 1)
 
     def column(self) -> Ragged:
-        """All of it."""
+        """Return the whole column."""
         return Ragged(self._values.column(), self._offsets.column())
 
 
 def growing(empty: FieldColumn) -> GrowingArray | GrowingRagged:
-    """What grows into a column of the kind of this empty one."""
+    """Make a growing column of the same kind as this empty one."""
     return GrowingRagged(empty) if isinstance(empty, Ragged) else GrowingArray(empty)

@@ -1,4 +1,4 @@
-"""Which decoder reads a channel: by the encoding of its messages."""
+"""Choice of a channel's decoder, by the encoding of its messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SAMPLE_MESSAGES = 1000
 
 
 def type_of(channel: Channel, distro: str, payloads: Sample) -> MessageType:
-    """The type of a channel's messages; its first ones tell what a definition does not.
+    """Return the type of a channel's messages; the first messages show what no definition says.
 
     Raises:
         CannotDecode: an encoding or a type that is not supported, and why.
@@ -53,7 +53,7 @@ def _first(payloads: Iterable[bytes]) -> list[bytes]:
 
 
 def decoder_of(channel: Channel, kind: MessageType, leaves: Sequence[Leaf]) -> Decoder:
-    """What decodes these fields of a channel's messages.
+    """Make the decoder of these fields of a channel's messages.
 
     Raises:
         CannotDecode: the type uses something unsupported.

@@ -81,8 +81,11 @@ def _idl_types(text: str) -> Typesdict:
 
 
 def _where(error: Exception) -> str:
-    """Say where parsing ended: rosbags' errors have a line of the whole text, one of the place in
-    it, what is there, and perhaps a set of what was expected."""
+    """Say where parsing ended.
+
+    rosbags' errors have a line of the whole text, one of the place in it, what is there, and
+    perhaps a set of what was expected.
+    """
     lines = re.sub(r"\n\{['\"].*\Z", "", str(error) or type(error).__name__).splitlines()
     if len(lines) < 3:
         return f": {' '.join(lines)}"
@@ -106,7 +109,7 @@ ACKERMANN = {
 
 @cache
 def ackermann_types() -> Typesdict:
-    """The types of ackermann_msgs."""
+    """Return the types of ackermann_msgs."""
     types: Typesdict = {}
     for name, text in ACKERMANN.items():
         types.update(get_types_from_msg(text, name))
@@ -196,7 +199,7 @@ def _field(name: str, description: Any) -> FieldType:
 
 
 def distro_types(distro: str) -> Typesdict:
-    """A distribution's message definitions; of `humble+DIR`, those of a folder on top.
+    """Return a distribution's message definitions; for `humble+DIR`, with a folder's on top.
 
     Raises:
         RecordingError: no distribution of that name, or no definitions in that folder.
@@ -229,7 +232,7 @@ def _distro_store(distro: str) -> Typestore:
 
 
 def message_type(channel: Channel, distro: str) -> RosType:
-    """The type of a channel's messages.
+    """Return the type of a channel's messages.
 
     Raises:
         CannotDecode: a service or action event, an undefined type, or a definition
@@ -281,6 +284,6 @@ def _embedded(name: str, form: str, definition: bytes, distro: str) -> RosType:
 
 
 def _named(types: Typesdict) -> set[str]:
-    """The messages that fields of these types are made of."""
+    """Return the messages that fields of these types consist of."""
     fields = [_field(*item) for _, items in types.values() for item in items]
     return {field.message for field in fields if field.message}

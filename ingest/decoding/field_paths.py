@@ -53,7 +53,7 @@ class Many:
 
 @dataclass(frozen=True)
 class FieldType:
-    """One field: a primitive (`base`) or a message (`message`), alone or repeated."""
+    """A field: a primitive (`base`) or a message (`message`), alone or repeated."""
 
     name: str
     base: str | None  # key of DTYPES, or "string"
@@ -89,7 +89,7 @@ class MessageType(ABC):
 
     @abstractmethod
     def fields_of(self, name: str) -> Sequence[FieldType]:
-        """The fields of a message of this type's family.
+        """Return the fields of a message of this type's family.
 
         Raises:
             CannotDecode: it is not defined, or uses something unsupported.
@@ -132,7 +132,7 @@ class MessageType(ABC):
                 yield from self._leaves(field.message, inner, through, inside, count)
 
     def leaf(self, path: str) -> Leaf:
-        """One field path.
+        """Resolve one field path.
 
         Raises:
             RecordingError: the type has no such field; names those it has.

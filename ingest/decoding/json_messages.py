@@ -45,7 +45,7 @@ Sample = Callable[[], Iterable[bytes]]
 
 @dataclass
 class Node:
-    """What is known of the values at one place of the messages."""
+    """Knowledge about the values at one place of the messages."""
 
     seen: Counter[str] = field(default_factory=Counter)  # JSON Schema's kinds; null is left out
     members: dict[str, Node] = field(default_factory=dict)  # of objects
@@ -55,7 +55,7 @@ class Node:
 
     @property
     def kind(self) -> str | None:
-        """Of most values here: one odd message does not decide what the others are."""
+        """Return the kind of most values here, so that one odd message does not decide."""
         seen = self.seen
         if seen["number"] and seen["integer"]:
             seen = seen + Counter(number=seen["integer"]) - Counter(integer=seen["integer"])
@@ -96,7 +96,7 @@ class JsonType(MessageType):
 
 
 def parse(payload: bytes) -> dict[str, Any]:
-    """One message.
+    """Parse one message.
 
     Raises:
         Unparsable: not JSON, nested too deeply, too large, or not an object.
@@ -161,7 +161,7 @@ class _Schema:
         return node
 
     def _at(self, target: str) -> Any:
-        """What a reference within the document points to; others describe nothing."""
+        """Follow a reference within the document; others describe nothing."""
         place = self._document if target.startswith("#") else None
         for part in target.split("/")[1:]:
             place = place.get(part) if isinstance(place, dict) else None
@@ -169,7 +169,7 @@ class _Schema:
 
 
 def _complete(node: Node) -> bool:
-    """Whether the schema describes all: not with an object without members, or any array."""
+    """Return whether the schema describes everything, members and array items included."""
     if not node.declared or (node.kind == "object" and not node.members):
         return False
     if node.kind == "array" and (node.items is None or not _complete(node.items)):

@@ -23,7 +23,7 @@ _SHORT_NAME = re.compile(r"(\w+)/(\w+)")
 
 @dataclass(frozen=True)
 class Channel:
-    """One stream of messages of one type in one file.
+    """A stream of messages of one type in one file.
 
     Some writers leave the `msg` out of a ROS type's name: the type has it.
     """
@@ -57,7 +57,7 @@ class MessageBatch:
         return len(self.start)
 
     def select(self, rows: NDArray[np.intp]) -> MessageBatch:
-        """These rows, in the same buffer."""
+        """Select rows, in the same buffer."""
         return MessageBatch(
             self.buffer,
             self.start[rows],
@@ -68,7 +68,7 @@ class MessageBatch:
 
     @property
     def size_bytes(self) -> int:
-        """Of all payloads."""
+        """Return the bytes of all payloads."""
         return int((self.stop - self.start).sum())
 
     def payloads(self) -> list[bytes]:
@@ -102,13 +102,13 @@ class PendingBatch:
         return len(self._payloads)
 
     def add(self, payloads: Sequence[bytes], log_time_ns: Ints, publish_time_ns: Ints) -> None:
-        """Some more, in file order."""
+        """Add messages, in file order."""
         self._payloads += payloads
         self._log_time_ns.append(log_time_ns)
         self._publish_time_ns.append(publish_time_ns)
         self.size_bytes += sum(map(len, payloads))
 
     def batch(self) -> MessageBatch:
-        """All of them."""
+        """Return all of them as one batch."""
         log, publish = np.concatenate(self._log_time_ns), np.concatenate(self._publish_time_ns)
         return MessageBatch.of(self._payloads, log, publish)

@@ -80,7 +80,7 @@ def _field(field: Any) -> FieldType:
 
 @lru_cache(KEPT)
 def protobuf_type(name: str, definition: bytes) -> ProtobufType:
-    """The type of this name in a serialised FileDescriptorSet.
+    """Return the type of this name in a serialised FileDescriptorSet.
 
     Raises:
         CannotDecode: no such set, or the type is not in it, or it uses something unsupported.

@@ -28,7 +28,7 @@ BYTES_AT_ONCE = 1 << 20  # of payloads that are parsed, and so objects, at the s
 
 @dataclass(frozen=True)
 class Decoded:
-    """One batch, decoded: columns of the good rows, and why the others failed."""
+    """Decoded batch: columns of the good rows, and why the others failed."""
 
     rows: NDArray[np.intp]  # (G,) of the batch
     fields: dict[str, FieldColumn]  # (G, …) each
@@ -43,7 +43,7 @@ class Decoder(Protocol):
         ...
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """The batch's columns; a message that does not decode is counted, by reason."""
+        """Decode a batch to columns, counting messages that do not decode by reason."""
         ...
 
 
@@ -52,18 +52,18 @@ class Unparsable(Exception):
 
 
 class Parser(Protocol):
-    """One message format, message by message. Every method raises Unparsable."""
+    """Parser of one message format, message by message. Every method raises Unparsable."""
 
     def parse(self, payload: bytes) -> Any:
-        """One message."""
+        """Parse one message."""
         ...
 
     def member(self, message: Any, field: FieldType) -> Any:
-        """The value of one of its fields; a repeated one's with a length, and iterable."""
+        """Return the value of one field; that of a repeated field has a length and is iterable."""
         ...
 
     def stamp_ns(self, value: Any) -> int:
-        """A time or a duration."""
+        """Convert a time or a duration to nanoseconds."""
         ...
 
     def array(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
@@ -86,7 +86,7 @@ class ParsedDecoder:
         return self._columns([])
 
     def decode(self, batch: MessageBatch) -> Decoded:
-        """The batch's columns; a message that does not decode is counted, by reason."""
+        """Decode a batch to columns, counting messages that do not decode by reason."""
         parts, rows, bad = [self.empty()], list[int](), Counter[str]()
         for some in _slices(batch):
             messages, good = list[Any](), list[int]()
@@ -115,7 +115,7 @@ class ParsedDecoder:
 
 
 def _slices(batch: MessageBatch) -> Iterator[range]:
-    """The batch's rows, of about BYTES_AT_ONCE each time."""
+    """Yield the batch's rows, about BYTES_AT_ONCE at a time."""
     lengths = (batch.stop - batch.start).tolist()
     start = size = 0
     for row, length in enumerate(lengths):
@@ -128,7 +128,7 @@ def _slices(batch: MessageBatch) -> Iterator[range]:
 
 
 def column_of(messages: Sequence[Any], leaf: Leaf, parser: Parser) -> FieldColumn:
-    """The values at a field path of parsed messages, (N, …) or Ragged.
+    """Return the values at a field path of parsed messages, (N, …) or Ragged.
 
     Raises:
         Unparsable: one of the messages has no such value.
@@ -211,7 +211,7 @@ class _RosParser:
 
 
 def _family(message: RosType) -> Typesdict:
-    """The type and those it is made of: all that rosbags must compile."""
+    """Return the type and those it contains: all that rosbags must compile."""
     wanted: list[str] = [message.name]
     family: Typesdict = {}
     while wanted:

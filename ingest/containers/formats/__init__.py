@@ -1,1 +1,1 @@
-"""How recordings lie in bytes: MCAP, rosbag2's sqlite3 and ROS 1 bags, whole or damaged."""
+"""Container formats: MCAP, rosbag2's sqlite3 and ROS 1 bags, whole or damaged."""

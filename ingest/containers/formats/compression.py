@@ -21,7 +21,7 @@ FILE = 256 << 20
 
 
 def most_bytes(stored: int, at_least: int = CHUNK) -> int:
-    """The most that `stored` compressed bytes may hold."""
+    """Return the largest plausible size of `stored` compressed bytes."""
     return max(at_least, RATIO * stored)
 
 
@@ -60,8 +60,9 @@ def decompress_file(path: Path, target: Path, *, salvage: bool) -> str | None:
 
 
 def decompressed(batch: MessageBatch) -> Iterator[tuple[MessageBatch, int]]:
-    """The batch with zstd payloads decompressed, and how many could not be: in pieces of about
-    PIECE bytes, for they may hold many times more than the batch.
+    """Yield the batch with zstd payloads decompressed, and how many could not be.
+
+    It comes in pieces of about PIECE bytes, as it may hold many times more than the batch.
 
     Whether a payload is compressed shows in its first four bytes: CDR starts with two zeros, or
     a zero and another small number.

@@ -1,4 +1,4 @@
-"""One MCAP chunk: bounded decompression, where its messages are, and what it defines."""
+"""MCAP chunks: bounded decompression, the places of messages, and definitions."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class BadChunk(Exception):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Where a chunk is in the file, with the fields of its record and its message index."""
+    """Place of a chunk in the file, with the fields of its record and its message index."""
 
     at: int  # of its record in the file
     start: int  # of its (compressed) records
@@ -106,7 +106,7 @@ def refuse_implausible(chunk: Chunk) -> None:
 
 
 def inflate(chunk: Chunk, stored: bytes) -> bytes:
-    """The records of a chunk that is stored so, uncompressed and checked against its CRC.
+    """Decompress a chunk's stored bytes and check them against its CRC.
 
     Raises:
         BadChunk: unknown compression, an implausible size, damaged data or a wrong CRC.
@@ -120,7 +120,7 @@ def inflate(chunk: Chunk, stored: bytes) -> bytes:
 
 
 def inflate_into(chunk: Chunk, stored: bytes, room: NDArray[np.uint8]) -> None:
-    """The same into `room`, which has the chunk's size: memory that is used again costs less.
+    """Decompress into `room`, which has the chunk's size: reusing memory costs less.
 
     Raises:
         BadChunk: as `inflate`.
@@ -149,8 +149,7 @@ def _check(chunk: Chunk, data: bytes | memoryview) -> None:
 
 
 def inflate_partly(chunk: Chunk, file: Buffer, limit: int = MAX_CHUNK) -> bytes:
-    """Return the first records of a chunk, up to `limit` bytes and as far as they decompress;
-    unchecked."""
+    """Return a chunk's first records, unchecked, up to `limit` bytes or the damage."""
     limit = min(limit, chunk.size, most_bytes(chunk.stop - chunk.start))
     if chunk.compression == "":
         return file[chunk.start : min(chunk.start + limit, chunk.stop)]
@@ -194,7 +193,7 @@ class Indexed:
 def indexed_messages(
     buffer: NDArray[np.uint8], parts: Sequence[Indexed], channel: int
 ) -> Messages | None:
-    """A channel's messages by its index entries in some chunks, which lie in this order.
+    """Find a channel's messages by its index entries in some chunks, which lie in this order.
 
     None where the index does not fit the chunks: then they are to be walked.
     """
@@ -231,13 +230,13 @@ def first_offset(entries: bytes) -> int:
 
 
 def _stamps(values: NDArray[np.uint64]) -> Ints:
-    """Times of 64 bits without a sign: what int64 cannot hold (2262) stays the last that it can."""
+    """Convert unsigned 64-bit times to int64; times after 2262 become the largest int64."""
     stamps: Ints = np.minimum(values, np.uint64(LATEST_NS)).astype(np.int64)
     return stamps
 
 
 def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
-    """Where the message records of an uncompressed chunk start, per channel, and what is cut."""
+    """Find where message records start in an uncompressed chunk, per channel, and what is cut."""
     places: list[int] = []
     note = places.append
     length_at = struct.Struct("<xQ").unpack_from  # after the opcode
@@ -279,7 +278,7 @@ def _messages(at: Ints, head: NDArray[np.void]) -> Messages:
 
 
 class SchemaRecord(NamedTuple):
-    """How the messages of some channels are defined."""
+    """Definition of the messages of some channels."""
 
     name: str = ""
     encoding: str = ""
@@ -342,8 +341,10 @@ class Definitions:
         }
 
     def repeated_in(self, records: bytes, channels: set[int]) -> Definitions:
-        """Return the definitions of these channels whose records are among `records`, byte by byte:
-        searching takes a hundredth of the time of walking."""
+        """Return the definitions of these channels whose exact records are among `records`.
+
+        Searching for bytes takes a hundredth of the time of walking.
+        """
         channels = channels & self.channels.keys()
         schemas = {self.channels[n].schema_id for n in channels} & self.schemas.keys()
         return Definitions(

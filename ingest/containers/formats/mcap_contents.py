@@ -1,4 +1,4 @@
-"""What is in an MCAP file: its chunks, loose messages, channels and counts, from one walk.
+"""Contents of an MCAP file: chunks, loose messages, channels and counts, from one walk.
 
 The summary at a file's end is used for counts and compared for schemas and channels, never used
 for where things are: the walk over the top-level records is cheap (a few records a chunk) and finds
@@ -48,7 +48,7 @@ _MANY = (Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.CHUNK_INDEX)
 
 
 class Statistics(NamedTuple):
-    """How many messages the file claims to hold."""
+    """Number of messages that the file claims to hold."""
 
     messages: int
     by_channel: dict[int, int]
@@ -56,7 +56,7 @@ class Statistics(NamedTuple):
 
 @dataclass
 class Contents:
-    """What the walk found."""
+    """Result of the walk over a file."""
 
     profile: str = ""
     chunks: list[Chunk] = field(default_factory=list)
@@ -166,8 +166,10 @@ def take_record(contents: Contents, file: FileBytes, opcode: int, at: int, stop:
 
 
 def check_summary(contents: Contents, file: FileBytes, at: int, stop: int) -> list[str]:
-    """Check the summary by the CRC in the footer, whose content is file[at:stop]: drop what it says
-    if they differ. Return what is wrong, in words."""
+    """Check the summary by the CRC in the footer, whose content is file[at:stop].
+
+    Drops what the summary says if they differ. Returns what is wrong, in words.
+    """
     if stop - at < FOOTER_BYTES:
         return ["its footer is too short"]
     footer = parse(Op.FOOTER, file, at, stop)
@@ -182,7 +184,7 @@ def check_summary(contents: Contents, file: FileBytes, at: int, stop: int) -> li
 
 
 def statistics_at(file: FileBytes, at: int, stop: int) -> Statistics:
-    """The statistics record whose content is file[at:stop]."""
+    """Read the statistics record whose content is file[at:stop]."""
     record = parse(Op.STATISTICS, file, at, stop)
     return Statistics(record["message_count"], record["channel_message_counts"])
 
@@ -195,8 +197,11 @@ def _name(contents: Contents, extra: Extra) -> None:
 
 
 def _keep(contents: Contents, file: str, name: str, said: dict[str, str]) -> None:
-    """Keep what a metadata record says. rosbag2 writes its metadata.yaml into one of its own, when
-    it opens the file and again when it closes it: the last counts."""
+    """Keep the entries of a metadata record.
+
+    rosbag2 writes its metadata.yaml into one when it opens the file and again when it closes it:
+    the last counts.
+    """
     if name == ROSBAG2:
         contents.rosbag2 = said.get("serialized_metadata", "")
         return
@@ -221,8 +226,10 @@ def _chunk(file: FileBytes, at: int, stop: int) -> Chunk:
 
 
 def cut_chunk_at(file: FileBytes, at: int, end: int) -> Chunk | None:
-    """The chunk at a place, whatever its record's length field is: its fields, and what there is of
-    its records before `end`. None where that is nothing."""
+    """Read the chunk at a place whatever its record's length field is, up to `end`.
+
+    None if nothing of its records is there.
+    """
     if at < 0 or at + PREFIX + 40 > end or file[at] != Op.CHUNK:
         return None
     head = at + PREFIX
@@ -272,7 +279,7 @@ class _Summary:
 
 
 def _summary(file: FileBytes) -> _Summary | None:
-    """The summary section, if it is whole."""
+    """Read the summary section; None if it is not whole."""
     end = len(file) - len(MAGIC)
     at = end - FOOTER_SIZE
     if at < len(MAGIC) or file[end:] != MAGIC or file[at] != Op.FOOTER:
@@ -300,7 +307,7 @@ def _summary(file: FileBytes) -> _Summary | None:
 
 
 def _by_index(file: FileBytes, contents: Contents, summary: _Summary, cut: int) -> list[str]:
-    """The chunks are those of the chunk index whose records agree with it."""
+    """Take the chunks of the chunk index whose records agree with it."""
     lost = []
     chunks = []
     for record in summary.indexed:
@@ -361,8 +368,10 @@ def _by_scan(file: FileBytes, contents: Contents, cut: int) -> list[str]:
 
 
 def _lost(contents: Contents, cut: int, until: int) -> str:
-    """What is lost between two places, in words; a chunk that begins at the first is read as far
-    as it goes."""
+    """Describe what is lost between two places.
+
+    A chunk that begins at the first place is read as far as it goes.
+    """
     at = f"{until - cut:,} bytes from byte {cut:,} on"
     if contents.cut_chunk is None or contents.cut_chunk.at != cut:
         return f"{at} are lost"
@@ -370,7 +379,7 @@ def _lost(contents: Contents, cut: int, until: int) -> str:
 
 
 def _recognised(file: FileBytes, start: int) -> Iterator[int]:
-    """Where chunks with a compression by name are, by two lengths that agree."""
+    """Yield the places of compressed chunks, recognised by two lengths that agree."""
     nearest = {name: file.find(name, start) for name in _NAMES}
     while places := {at: name for name, at in nearest.items() if at >= 0}:
         place = min(places)

@@ -59,7 +59,7 @@ class Checks:
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums confirm what was read so far."""
+        """Return whether checksums confirm what was read so far."""
         if self.damage:
             return "damaged"
         return "verified" if self.verified and not self.unchecked else "unverified"
@@ -70,17 +70,17 @@ class Checks:
             self.damage.append(Damage(what, messages))
 
     def lost(self, chunk: Chunk, why: BadChunk) -> None:
-        """A chunk that cannot be read."""
+        """Note a chunk that cannot be read."""
         self.damaged(f"chunk at byte {chunk.at:,} is lost: {why}", chunk.counts())
 
     def read(self, chunk: Chunk) -> None:
-        """A chunk whose CRC matches, or that has none."""
+        """Count a chunk whose CRC matches, or that has none."""
         self.verified += bool(chunk.crc)
         self.unchecked += not chunk.crc
 
 
 class _Inflated(NamedTuple):
-    """What some chunks hold, where each lies in it, and what became of each."""
+    """Content of some chunks: where each lies in the buffer, and what was wrong with it."""
 
     buffer: NDArray[np.uint8]
     parts: list[_Part]
@@ -101,7 +101,7 @@ class ChunkReader:
         self._scratch = _no_scratch()
 
     def inflate(self, chunk: Chunk) -> bytes:
-        """One chunk's records; nothing where they cannot be read."""
+        """Return one chunk's records; nothing if they cannot be read."""
         if chunk is self._cut:
             return mcap_chunk.inflate_partly(chunk, self._file)
         try:
@@ -113,8 +113,10 @@ class ChunkReader:
         return data
 
     def begin_in(self, chunk: Chunk, channels: set[int]) -> tuple[set[int], bytes]:
-        """Return which of these channels have messages in a chunk, as far as that is known without
-        walking it, and its records before the first messages of all of them: unchecked."""
+        """Return which of these channels have messages in a chunk, as far as known without walking.
+
+        Also returns its records before the first messages of all of them, unchecked.
+        """
         if walked := self.walked.get(chunk.at):
             first = {n: int(walked[n].min()) for n in walked.keys() & channels}
         else:
@@ -125,7 +127,7 @@ class ChunkReader:
         return {*first}, mcap_chunk.inflate_partly(chunk, self._file, max(first.values()))
 
     def walk(self, chunk: Chunk) -> Positions:
-        """Where a chunk's messages are, by walking it; remembered, as it is needed again."""
+        """Find a chunk's messages by walking it, and remember them."""
         if chunk.at not in self.walked:
             self.walked[chunk.at] = self._walk_part(chunk, self.inflate(chunk))
         return self.walked[chunk.at]
@@ -255,8 +257,10 @@ def _no_scratch() -> list[NDArray[np.uint8]]:
 
 
 def _ahead(works: Iterable[Callable[[int], _Inflated]]) -> Iterator[_Inflated]:
-    """What these works give, in their order: the next AHEAD are done while one is used. Each gets
-    the number of a memory that no other of them has."""
+    """Yield the results of these works in order, doing the next AHEAD while one is used.
+
+    Each gets the number of a memory that no other running work has.
+    """
     pool = ThreadPoolExecutor(AHEAD, thread_name_prefix="inflate")
     waiting: deque[Future[_Inflated]] = deque()
     try:
@@ -286,7 +290,7 @@ GROUP_BYTES = 8 << 20  # of chunks decoded together: enough to amortise numpy's 
 
 
 class McapFile:
-    """One MCAP file, chunked or not, with or without summary, statistics and message index.
+    """An MCAP file, chunked or not, with or without summary, statistics and message index.
 
     `watch` is told how far it is opened: without statistics its messages must be counted.
 
@@ -434,7 +438,7 @@ class McapFile:
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums confirm what was read so far."""
+        """Return whether checksums confirm what was read so far."""
         return self._checks.integrity
 
     def _check_loose(self) -> None:
@@ -464,7 +468,7 @@ class McapFile:
         yield from self._chunks.read(self._groups(wanted), wanted, ahead=self._ahead(wanted))
 
     def _ahead(self, wanted: set[int]) -> bool:
-        """Whether to decompress on other threads: where there is enough to do and a core for it.
+        """Return whether decompressing on other threads pays: enough work, and a free core.
 
         Of chunks far larger than a group, several at once would take too much memory.
         """
@@ -479,7 +483,7 @@ class McapFile:
     def _loose(
         self, channels: Collection[int]
     ) -> Iterator[tuple[int, NDArray[np.uint8], Messages]]:
-        """These channels' messages outside chunks, from about 8 MiB of the file at a time."""
+        """Yield these channels' messages outside chunks, about 8 MiB of the file at a time."""
         places = {c: np.asarray(self._contents.loose[c], np.int64) for c in sorted(channels)}
         if not places:
             return

@@ -18,7 +18,7 @@ PREFIX = 9  # every record: opcode (1 byte), length of its content (8 bytes)
 
 
 def _fastest_crc32() -> Callable[..., int]:
-    """The CRC-32 of MCAP's checksums: that of `isal`, nine times as fast, where it is installed."""
+    """Return the fastest CRC-32 function: `isal`'s, nine times as fast, if it is installed."""
     try:
         from isal import isal_zlib
     except ImportError:
@@ -53,7 +53,7 @@ class FileBytes:
     @overload
     def __getitem__(self, key: slice) -> bytes: ...
     def __getitem__(self, key: int | slice) -> int | bytes:
-        """As of bytes.
+        """Return a byte or a slice, as bytes do.
 
         Raises:
             RecordingError: the file is shorter than it was when it was opened.
@@ -76,7 +76,7 @@ class FileBytes:
         return self._window[: max(stop - start, 0)]
 
     def large(self, start: int, stop: int) -> bytes:
-        """As a slice, of what is read once and is not small; several threads may.
+        """Read a large slice that is needed once; safe to call from several threads.
 
         Raises:
             RecordingError: the file is shorter than it was when it was opened.
@@ -106,7 +106,7 @@ class FileBytes:
         return crc
 
     def find(self, what: bytes, start: int) -> int:
-        """Where these bytes are next, from a place on; -1 where they are not."""
+        """Return where these bytes occur next, from `start` on; -1 if they do not."""
         for at in range(start, self._size, self.PIECE):
             found = self[at : at + self.PIECE + len(what) - 1].find(what)
             if found >= 0:
@@ -244,7 +244,7 @@ def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]
 
 
 def parse(op: Op, buffer: Buffer, start: int, stop: int) -> dict[str, Any]:
-    """The fields of the record whose content is buffer[start:stop]. Bytes after them are padding.
+    """Parse the record whose content is buffer[start:stop]. Bytes after its fields are padding.
 
     Raises:
         Malformed: a field reaches beyond the record.

@@ -57,7 +57,7 @@ _MESSAGE, _CONNECTION = bytes([RecordType.MSGDATA]), bytes([RecordType.CONNECTIO
 
 @dataclass
 class Walked:
-    """What the chunks of a bag without an index hold."""
+    """Content of the chunks of a bag without an index."""
 
     counts: dict[int, Counter[int]] = field(default_factory=dict)  # by position and connection
     spans: list[tuple[int, int]] = field(default_factory=list)
@@ -95,7 +95,7 @@ def walk(
 
 
 def _fields(data: bytes, at: int, stop: int) -> dict[bytes, bytes]:
-    """The fields of a record's header."""
+    """Parse the fields of a record's header."""
     fields = {b"time": b""}
     while at < stop:
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")
@@ -184,7 +184,7 @@ class Bag(Reader):
     def _connection(
         self, key: int, outer: dict[bytes, bytes], inner: dict[bytes, bytes]
     ) -> Connection:
-        """A connection, as a chunk defines it."""
+        """Build a connection from its definition in a chunk."""
         texts = {
             name: (inner.get(name) or outer.get(name) or b"").decode(errors="replace")
             for name in (b"topic", b"type", b"md5sum", b"message_definition")
@@ -216,7 +216,7 @@ class Bag(Reader):
         ]
 
     def inflated(self, position: int) -> bytes:
-        """A chunk's records; from the second time on kept, while there is room."""
+        """Decompress a chunk's records; from the second time on they are kept if there is room."""
         if (kept := self._kept.get(position)) is not None:
             return kept
         data = self._inflated(position)
@@ -282,7 +282,7 @@ _Places: TypeAlias = tuple[dict[int, Ints], int | None]
 
 
 class Ros1File:
-    """One ROS 1 bag of format 2.0, read only. The format has no checksums: never verified.
+    """A ROS 1 bag of format 2.0, read only. The format has no checksums, so it is never verified.
 
     Raises:
         RecordingError: it cannot be opened; a bag that was cut short has no index, and is read
@@ -343,7 +343,7 @@ class Ros1File:
         )
 
     def _salvaged(self, path: Path, error: Exception, watch: Watch) -> Walked:
-        """What its chunks hold, where it has no index.
+        """Read the chunks of a bag that has no index.
 
         Raises:
             RecordingError: nothing.
@@ -371,8 +371,10 @@ class Ros1File:
         return walked
 
     def _by_index(self) -> dict[int, Counter[int]]:
-        """Messages per chunk and channel, by the bag's two indexes; by walking a chunk of which
-        they say different things."""
+        """Count messages per chunk and channel by the bag's two indexes.
+
+        A chunk on which they differ is walked.
+        """
         counts = {position: Counter[int]() for position in self._reader.chunks}
         for channel, index in self._reader.indexes.items():
             for entry in index:
@@ -391,8 +393,10 @@ class Ros1File:
         return counts
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """Chunk by chunk, by what it holds, whatever the index says; one that is damaged costs
-        only its own messages."""
+        """Yield the messages chunk by chunk, by what each holds, whatever the index says.
+
+        A damaged chunk costs only its own messages.
+        """
         wanted = set(channels)
         for position in sorted(self._reader.chunks):
             if position in self._places and not wanted & self._places[position][0].keys():
@@ -438,7 +442,7 @@ class Ros1File:
 
 
 def _batch(data: bytes, places: Ints) -> MessageBatch:
-    """The messages that lie at these places of a chunk."""
+    """Build a batch of the messages at these places of a chunk."""
     start, stop, times = places.T
     return MessageBatch(np.frombuffer(data, np.uint8), start, stop, times, times)
 

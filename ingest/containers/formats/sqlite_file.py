@@ -80,8 +80,10 @@ class DamagedSqliteError(RecordingError):
 
 
 class SqliteFile:
-    """One whole sqlite3 storage file, read only. rosbag2 keeps no checksums: it is never verified,
-    but SQLite's own check of its pages must pass.
+    """A whole sqlite3 storage file, read only.
+
+    rosbag2 keeps no checksums, so it is never verified, but SQLite's own check of its pages must
+    pass.
 
     Rows that a writer left in a `-wal` or `-journal` file beside it count too: such a file is
     read from a private copy, so that nothing next to the user's recording is ever written.
@@ -138,8 +140,10 @@ class SqliteFile:
             raise DamagedSqliteError(f"cut short: {size:,} bytes of {page * pages:,}", self.path)
 
     def _refuse_damaged(self) -> None:
-        """SQLite's quick check: of every page, and that each has its place. It costs about what
-        reading all rows costs."""
+        """Run SQLite's quick check: of every page, and that each has its place.
+
+        It costs about as much as reading all rows.
+        """
         self._connection.execute("PRAGMA ignore_check_constraints = ON")  # those are programs
         try:
             found = self._connection.execute(f"PRAGMA quick_check({MAX_FOUND})").fetchall()
@@ -238,7 +242,7 @@ class SqliteFile:
             self.damage.append(Damage(what))
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """One pass in rowid order, which is the order of arrival."""
+        """Yield all messages in one pass in rowid order, which is the order of arrival."""
         wanted = [channel for channel in channels if channel in self.channels]
         marks = ",".join("?" * len(wanted))
         query = (  # large ones are fetched one by one
@@ -273,7 +277,7 @@ class SqliteFile:
                         yield whole
 
     def _large(self, row: _Row) -> list[_Row]:
-        """A row with its data, which may have some hundred MB; none where it has more than that."""
+        """Read a row with its data, up to some hundred MB; return nothing for a larger one."""
         topic, stamp, _, size, number = row
         if size is not None and size <= MAX_MESSAGE:
             query = "SELECT data FROM messages WHERE id = ?"
@@ -289,7 +293,7 @@ class SqliteFile:
         return []
 
     def _fetch(self, cursor: sqlite3.Cursor, row_bytes: int) -> list[_Row]:
-        """Some rows, fewer of larger ones: how large they are shows in those before."""
+        """Fetch some rows, fewer if the rows before were large."""
         some = min(max(BYTES_PER_BATCH // max(row_bytes, 1), 1), ROWS_PER_FETCH)
         try:
             return cursor.fetchmany(some)
@@ -305,7 +309,7 @@ class SqliteFile:
 
 
 def _sidecars(path: Path) -> list[Path]:
-    """What a writer left beside a file, to be merged into it."""
+    """Return the files that a writer left beside a file, to be merged into it."""
     beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
     return [item for item in beside if item.is_file() and item.stat().st_size]
 
@@ -315,7 +319,7 @@ def _size(path: Path) -> int:
 
 
 def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
-    """A copy of a file with what lies beside it, where anything does."""
+    """Copy a file with what lies beside it; None if nothing does."""
     if not (sidecars := _sidecars(path)):
         return None
     folder = tempfile.TemporaryDirectory(prefix="restock-")
@@ -325,7 +329,7 @@ def _private_copy(path: Path) -> tempfile.TemporaryDirectory[str] | None:
 
 
 def _merged(path: Path) -> tempfile.TemporaryDirectory[str] | None:
-    """A private copy into which SQLite merged what lies beside the file, as far as it can."""
+    """Copy a file and let SQLite merge what lies beside it, as far as it can."""
     copy = _private_copy(path)
     if copy:
         with suppress(sqlite3.DatabaseError):

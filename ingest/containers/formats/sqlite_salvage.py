@@ -1,5 +1,6 @@
-"""What a cut or damaged `.db3` file still holds: the messages in its whole pages, and a count of
-those that are missing. SQLite itself stops at the first damage.
+"""Salvage of cut or damaged `.db3` files: messages in whole pages, and a count of the others.
+
+SQLite itself stops at the first damage.
 
 A leaf page of a table is recognised by its form, wherever it lies, and its rows by their columns.
 If pages were inserted or removed, the page numbers in a file are off: by how much shows in the
@@ -45,13 +46,13 @@ class NotAPage(Exception):
 
 @dataclass(frozen=True)
 class Moves:
-    """By how many pages what is named as page `named` lies further on: at some pages, in order."""
+    """Number of pages by which the page named `named` has moved, at some pages in order."""
 
     named: Ints
     by: Ints
 
     def of(self, page: int) -> int | None:
-        """How far a page moved; None where those around it moved differently."""
+        """Return how far a page moved; None if those around it moved differently."""
         if not len(self.named):
             return 0
         at = int(np.searchsorted(self.named, page))
@@ -73,12 +74,12 @@ class Pages:
         self.count = path.stat().st_size // self.page_size
 
     def page(self, number: int) -> bytes:
-        """A page; the first is number 1."""
+        """Read a page; the first is number 1."""
         self._file.seek((number - 1) * self.page_size)
         return self._file.read(self.page_size)
 
     def tables(self) -> Iterator[tuple[int, int, bytes]]:
-        """The number, kind and content of every page that starts like one of a table."""
+        """Yield number, kind and content of every page that starts like one of a table."""
         for number in range(1, self.count + 1):
             content = self.page(number)
             kind = content[0] if number > 1 and content else 0
@@ -90,7 +91,7 @@ class Pages:
         self._file.close()
 
     def cells(self, page: bytes) -> list[Cell]:
-        """The rows of a leaf page.
+        """Parse the rows of a leaf page.
 
         Raises:
             NotAPage: not all of it has the form of one.
@@ -101,7 +102,7 @@ class Pages:
         return cells
 
     def cell(self, page: bytes, at: int) -> Cell:
-        """The row that starts at a place of a leaf page."""
+        """Parse the row that starts at a place of a leaf page."""
         size, start = _varint(page, at)
         rowid, start = _varint(page, start)
         rowid -= (rowid >> 63) << 64
@@ -119,7 +120,7 @@ class Pages:
         return Cell(rowid, *_types(content, size), size, content, overflow)
 
     def payload(self, cell: Cell, moves: Moves, taken: Bools) -> bytes | None:
-        """The whole content of a row; None where pages of it are missing, or not surely its own.
+        """Read a row's whole content; None if some of its pages are missing or not surely its own.
 
         `taken` marks the pages that belong to something; those of this row are added.
         """
@@ -143,7 +144,7 @@ class Pages:
 
 
 def children(page: bytes) -> list[tuple[int, int]]:
-    """The pages below an interior page, each with the last row number it may hold.
+    """Return the pages below an interior page, each with the last row number it may hold.
 
     Raises:
         NotAPage: not all of it has the form of one.
@@ -159,7 +160,7 @@ def children(page: bytes) -> list[tuple[int, int]]:
 
 
 def moves_of(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]]]) -> Moves:
-    """How far pages moved: from the leaves (last row number, page), and interior pages.
+    """Find how far pages moved, from the leaves (last row number, page) and interior pages.
 
     An interior page counts where it is the one right above leaves: each of its rows' numbers is
     the last of the leaf that comes next.
@@ -180,7 +181,7 @@ def moves_of(leaves: list[tuple[int, int]], interiors: list[list[tuple[int, int]
 
 
 def integer(cell: Cell, column: int) -> int | None:
-    """The integer in a column of a row; None where it holds something else."""
+    """Read the integer in a column of a row; None if it holds something else."""
     at = cell.body + sum(map(_size, cell.types[:column]))
     kind = cell.types[column]
     if kind not in INT_SIZES or at + INT_SIZES[kind] > len(cell.local):
@@ -193,7 +194,7 @@ def integer(cell: Cell, column: int) -> int | None:
 
 
 def column(cell: Cell, payload: bytes, number: int) -> bytes:
-    """The bytes of a column that holds a text or a blob."""
+    """Return the bytes of a text or blob column."""
     at = cell.body + sum(map(_size, cell.types[:number]))
     return payload[at : at + _size(cell.types[number])]
 
@@ -217,7 +218,7 @@ def _pointers(page: bytes, start: int) -> tuple[int, ...]:
 
 
 def _types(content: bytes, size: int) -> tuple[tuple[int, ...], int]:
-    """The types of a record's columns, and where they start."""
+    """Read the types of a record's columns, and where the columns start."""
     stop, at = _varint(content, 0)
     if not at <= stop <= len(content):
         raise NotAPage
@@ -237,7 +238,7 @@ def _size(kind: int) -> int:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """A number of one to nine bytes, and where it ends."""
+    """Read a number of one to nine bytes, and return where it ends."""
     value = 0
     for place in range(at, min(at + 8, len(data))):
         byte = data[place]
@@ -323,7 +324,7 @@ class SalvagedSqliteFile:
         return np.concatenate(pieces)
 
     def _messages(self, cells: list[Cell], page: int) -> Iterator[tuple[int, int, int, int, int]]:
-        """The messages of a leaf page; the rows of the other tables are kept."""
+        """Yield the messages of a leaf page, and keep the rows of the other tables."""
         for place, cell in enumerate(cells):
             if _is_message(cell.types):
                 topic, stamp = integer(cell, 1), integer(cell, 2)
@@ -352,7 +353,7 @@ class SalvagedSqliteFile:
         }
 
     def _known(self, rows: Ints) -> Ints:
-        """The messages of topics in the order of their row numbers; the rest is counted."""
+        """Return the messages of known topics in the order of their row numbers; count the rest."""
         _, first = np.unique(rows[:, 0], return_index=True)
         rows = rows[first]
         named = np.isin(rows[:, 1], list(self.channels))
@@ -369,7 +370,7 @@ class SalvagedSqliteFile:
         self.damage.append(Damage(what, {-1: count}))
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """One pass in the order of row numbers, which is the order of arrival."""
+        """Yield all messages in one pass in the order of row numbers, the order of arrival."""
         pending: dict[int, PendingBatch] = {}
         size, lost, wanted = 0, dict[int, int](), list(channels)
         taken = self._taken.copy()
@@ -403,7 +404,7 @@ class SalvagedSqliteFile:
 
 
 def _is_message(types: tuple[int, ...]) -> bool:
-    """Whether a row is one of `messages`: no id of its own, a topic, a stamp and the data."""
+    """Return whether a row is of `messages`: no id of its own, a topic, a stamp and the data."""
     return (
         len(types) == 4
         and types[0] == 0

@@ -1,4 +1,4 @@
-"""What every container of messages offers: the seam between file formats and recordings."""
+"""Interface that every container of messages implements, between file formats and recordings."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _CUSTOM_DATA = re.compile(
 
 
 def unwatched(doing: str, done: int, whole: int) -> None:
-    """A `Watch` that is not interested."""
+    """Ignore progress: a `Watch` that does nothing."""
 
 
 @dataclass
 class Damage:
-    """What of a file could not be read, and how many messages that cost where it is known."""
+    """Part of a file that could not be read, and how many messages that cost if known."""
 
     what: str
     messages: dict[int, int] = field(default_factory=dict)  # by channel id
@@ -52,7 +52,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Extra:
-    """What a file holds besides messages."""
+    """Attachment or metadata record of a file."""
 
     kind: Literal["attachment", "metadata"]
     name: str
@@ -74,7 +74,7 @@ class Packed(NamedTuple):
 
 
 class Metadata(NamedTuple):
-    """What a recorder, or who came after it, says of a whole recording: text by name."""
+    """Metadata of a whole recording, by its recorder or added later: text by name."""
 
     source: str  # where it says so, for errors
     record: str  # name of the MCAP record; "" for the custom_data of a bag
@@ -84,7 +84,7 @@ class Metadata(NamedTuple):
 def keep_entries(
     said: Mapping[str, str], kept: Collection[Metadata] = ()
 ) -> tuple[dict[str, str], int]:
-    """Those of a record's entries that are kept beside `kept`, and how many are not."""
+    """Return the entries of a record that still fit beside `kept`, and how many do not."""
     room = MAX_ENTRIES - sum(len(item.entries) for item in kept)
     short = {n: v for n, v in said.items() if len(n) <= MAX_TEXT and len(v) <= MAX_TEXT}
     entries = dict(list(short.items())[: max(room, 0)])
@@ -92,8 +92,9 @@ def keep_entries(
 
 
 def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tuple[Metadata, int]:
-    """rosbag2's `custom_data` in the text of a bag's metadata, which is `source`, and how many of
-    its entries are not kept beside `kept`.
+    """Read rosbag2's `custom_data` from the text of a bag's metadata, which is `source`.
+
+    Also returns how many of its entries do not fit beside `kept`.
 
     Raises:
         ValueError: it is too long, or no YAML.
@@ -128,7 +129,7 @@ def _custom_data(text: str) -> tuple[dict[str, str], int]:
 
 
 class Storage(Protocol):
-    """One open file of messages.
+    """An open file of messages.
 
     `counts` are the messages by the container's own count, per channel id; `span_ns` the first and
     last log time, or None when it holds no message. `damage` is final once everything wanted
@@ -149,11 +150,11 @@ class Storage(Protocol):
 
     @property
     def integrity(self) -> Integrity:
-        """Whether checksums confirm what was read so far."""
+        """Return whether checksums confirm what was read so far."""
         ...
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, MessageBatch]]:
-        """The messages of these channels, by channel, in file order within each channel."""
+        """Yield the messages of these channels, in file order within each channel."""
         ...
 
     def close(self) -> None:
