@@ -80,8 +80,8 @@ class Profile(Checked, frozen=True):
     behaviour_policy: str = "unknown"  # the driver, if no topic tells
     # Behaviour policy -> its commands (of a person, of navigation) before one is chosen to drive.
     command_sources: dict[str, Input] = msgspec.field(default_factory=dict)
-    # What was chosen among them, where the command is that smoothed or limited: it is by whose
-    # command it follows.
+    # The topic that was chosen among them, if the command is that one smoothed or limited: who
+    # drives is the source whose command it repeats.
     command_through: Input | None = None
     clock: Clock = Clock()
     episodes: Episodes = Episodes()

@@ -43,8 +43,8 @@ from restock.ingest.propose.trial import Advice, Trial
 MAX_DRIVES = 12  # of one kind, that a proposal reads
 MAX_NAMED = 5  # of those that it does not read, in a profile's first lines
 MAX_BASES = 4  # that are tried on all drives
-# Poses on a map are worth so many times the time that odometry serves: where some drives have no
-# map, most of the time would be lost for want of it.
+# Time with poses on a map is worth so many times as much as with odometry. It is not worth more, as
+# drives without a map would be lost.
 LOCALISED_WORTH = 1.25
 SAME_PACE = 1.5  # times the period: commands that are no further apart than this are of one pace
 
@@ -260,7 +260,7 @@ def _hold(drives: Sequence[CommandHold]) -> CommandHold:
 def _bases(drives: Sequence[Evidence]) -> list[Evidence]:
     """Return a drive of each proposed clock and source of poses, the fullest first.
 
-    Where one drive was told what to do far more often than another, a tick a command would be
+    If one drive has far more frequent commands than another, a tick a command would be
     another time in each: then there is a tick every period, the middle one of the drives.
     """
     fullest = sorted(drives, key=_fullness, reverse=True)

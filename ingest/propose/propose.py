@@ -66,9 +66,9 @@ class Proposal:
     transitions: int = 0
     problems: list[str] = field(default_factory=list)  # why it cannot be used as it is
     advice: list[Advice] = field(default_factory=list)  # what choices cost, and what to try
-    commands: list[str] = field(default_factory=list)  # topics, where several may drive the robot
-    kinds: list[RobotKind] = field(default_factory=list)  # where there are several: its own first
-    findings: list[Finding] = field(default_factory=list)  # where it contradicts itself
+    commands: list[str] = field(default_factory=list)  # topics, if several may drive the robot
+    kinds: list[RobotKind] = field(default_factory=list)  # if there are several: its own first
+    findings: list[Finding] = field(default_factory=list)  # contradictions in the recording
     wheeled: bool = True  # False: it is taken for a drone's recording, or an arm's, or cameras'
 
 

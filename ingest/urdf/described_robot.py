@@ -20,7 +20,7 @@ from restock.ingest.urdf.description import (
     BASE_FRAMES,
     F64,
     HEAVIEST_KG,
-    LONGEST,
+    MAX_LETTERS,
     Description,
     Joint,
     Place,
@@ -75,7 +75,7 @@ def read_urdf(path: Path) -> str:
     """
     try:
         with path.open("rb") as file:
-            content = file.read(4 * LONGEST + 1)
+            content = file.read(4 * MAX_LETTERS + 1)
         return content.decode("utf-8")
     except OSError as error:
         raise ConfigError(

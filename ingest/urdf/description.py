@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 BASE_FRAMES = ("base_link", "base_footprint", "base")  # best first
 F64 = NDArray[np.float64]
-LONGEST = 4_000_000  # letters of a description
+MAX_LETTERS = 4_000_000  # letters of a description
 MAX_LINKS = 5_000
 ANY = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar")
 HEAVIEST_KG = 100_000.0  # of a link
@@ -67,7 +67,7 @@ class Description:
 
 def read_description(text: str) -> Description | str:
     """Read a description, or say why it cannot be used."""
-    if len(text) > LONGEST:
+    if len(text) > MAX_LETTERS:
         return f"{len(text):,} characters are too many for a robot's description"
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         return "a robot's description must not declare entities"

@@ -57,7 +57,7 @@ class Candidate:
     name: str
     topic: TopicInfo
     path: str
-    unit: str  # "" where there is nothing to go by
+    unit: str  # "" if nothing shows it
     more: str = ""  # further TOML
     saw: str = ""  # what was seen, for a comment
 
@@ -232,7 +232,7 @@ class CameraTopic:
     topic: TopicInfo
     rate_hz: float | None
     frame: str  # "jpeg, 640 x 480", or why none of its first messages is a frame
-    size_bytes: int  # of that frame; 0 where there is none
+    size_bytes: int  # of that frame; 0 if there is none
     usable: bool
 
     def lines(self) -> list[str]:

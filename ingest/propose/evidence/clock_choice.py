@@ -21,7 +21,7 @@ from restock.ingest.steps.align import CLOCK_FIELD, CLOCK_TOPIC, ClockReport, al
 from restock.ingest.steps.clocks import STAMP, odd, topic_clock
 
 FASTEST_S, SLOWEST_S = 0.08, 0.5  # control periods that are proposed
-EVENTS_S = 0.2  # the control period where commands are not steady
+EVENTS_S = 0.2  # the control period if commands are not steady
 STEADY_S = (0.08, 0.5)  # commands this far apart make the ticks themselves
 PAUSE = 5.0  # a gap of more median gaps is a pause in driving
 MAX_HOLD_S = 5.0

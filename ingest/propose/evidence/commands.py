@@ -3,10 +3,10 @@
 A multiplexer's output repeats its inputs: where a topic changes to what another one has just said,
 and not the other way about, it comes after it.
 
-Some drivers stop a robot that hears nothing for half a second; others drive on until they are told
-otherwise. Where commands come seldom that decides the row count, so it is read from the poses: of
-every gap after a command to move, whether the robot still moved when the gap ended, or since when
-it stood. A command to stop holds until the next one whatever the driver does.
+Some drivers stop a robot that hears nothing for half a second; others drive on until the
+next command. If commands are rare that decides the row count, so it is read from the poses: in each
+gap after a command to move, the robot still moved when the gap ended, or it stood from some moment
+on. A command to stop holds until the next one whatever the driver does.
 
 And how fast the robot really went where it was commanded to go fastest: a driver scales down or
 cuts off what its wheels cannot do. Commands beyond that are no actions of the robot: a twin that
@@ -304,7 +304,7 @@ class Commands:
 
     speed_mps: float = 0.5
     yaw_rate_radps: float = 1.0
-    reverse_mps: tuple[float, ...] = ()  # slowest first; none where it was never told to back up
+    reverse_mps: tuple[float, ...] = ()  # slowest first; empty if it never backed up
     still: bool = False  # it was told nothing but to stand
     count: int = 0
     topic: str = ""

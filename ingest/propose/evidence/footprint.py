@@ -27,7 +27,7 @@ from restock.ingest.containers.recording import Recording
 from restock.ingest.containers.topic_reading import Fields, Reduction, TopicInfo
 from restock.ingest.decoding.columns import FieldColumn, Ragged
 from restock.ingest.profile.inputs import Input
-from restock.ingest.propose.evidence.roles import Kind, own_first, shared
+from restock.ingest.propose.evidence.roles import Kind, shared, sort_own_first
 from restock.ingest.steps.clearance import angle_keys, beam_angles
 from restock.ingest.steps.motion import PoseSeries
 from restock.ingest.urdf.description import Description, Place, extent, read_description
@@ -37,7 +37,7 @@ SIZES_M = (0.02, 30.0)  # of a robot that this can be
 
 
 MIN_ASIDE_M = 0.05  # of the middle
-DESCRIBED = "as described"  # where a lidar's place is from
+DESCRIBED = "as described"  # the source of a lidar's place
 UPSIDE_DOWN = (
     "the lidar hangs upside down by its frame, so its scans are turned over; if its driver does "
     "that already, left and right are swapped now: remove upside_down"
@@ -50,13 +50,13 @@ class Footprint:
 
     length_m: float
     width_m: float
-    source: str  # where that is from, in words
+    source: str  # of the outline, in words
     lidar_x_m: float | None = None  # ahead of the middle; None: nothing says
     lidar_y_m: float = 0.0  # to the left
     lidar_yaw_rad: float | None = None
     lidar_source: str = DESCRIBED
     upside_down: bool = False  # the lidar
-    lidar_unplaced: str = ""  # the frame of its scans, where nothing says which way it points
+    lidar_unplaced: str = ""  # the frame of its scans, if nothing gives its direction
     measured: bool = True  # False: a guess, though with a reason
 
     @property
@@ -122,7 +122,7 @@ def descriptions(recording: Recording) -> Iterator[tuple[str, str]]:
     Of several robots in the recording, those of the one to propose for, then those of none in
     particular.
     """
-    for name, topic in own_first(recording, recording.topics.items()):
+    for name, topic in sort_own_first(recording, recording.topics.items()):
         if topic.skipped or not topic.expected or topic.type != "std_msgs/msg/String":
             continue
         if name.split("/")[-1] != "robot_description":

@@ -72,7 +72,7 @@ from restock.ingest.propose.evidence.roles import (
     Roles,
     node_topics,
     other_robots_topics,
-    own_first,
+    sort_own_first,
     topics_for,
     usable_topics,
 )
@@ -84,7 +84,7 @@ from restock.ingest.task.hindsight import NO_MISSION, GoalSource
 from restock.ingest.urdf.description import BASE_FRAMES
 
 RADIUS_M = (0.1, 0.4)  # the least and the most of a goal
-MIN_ROWS = 100  # with a goal in hindsight, where these are wanted and the rest is left out
+MIN_ROWS = 100  # with a goal in hindsight, if these are wanted and the rest is left out
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class GoalChoice:
 
     source: GoalSource | None
     why: str = ""  # there is none
-    hindsight_wanted: bool = False  # also where most of the drive has none
+    hindsight_wanted: bool = False  # also if most of the drive has none
 
     @classmethod
     def of(cls, *, logged: bool, hindsight_wanted: bool = False) -> GoalChoice:
@@ -154,11 +154,11 @@ class Evidence:
     roles: Roles
     frames: FrameGuess | None
     poses_from_frames: bool
-    motion: MotionChoice | None  # where no topic has the wheels' speeds
+    motion: MotionChoice | None  # if no topic has the wheels' speeds
     commands: Commands
     chosen: CommandChoice
     hold: CommandHold
-    turned: DriveEvidence  # whether it steers as a car, where nothing describes it
+    turned: DriveEvidence  # whether it steers as a car, if nothing describes it
     paces_s: dict[str, float]  # topic -> between two of its messages, mostly; log time
     clock: ClockChoice
     gaps: Gaps
@@ -166,14 +166,14 @@ class Evidence:
     recorded_s: float  # that its sensors were recorded: rates are of it
     footprint: Footprint
     footprint_notes: list[str]
-    outline: ScannedOutline | None  # where its scans say something of it
+    outline: ScannedOutline | None  # if it has enough scans
     goal: GoalChoice
     signals: list[Candidate]
     cameras: list[CameraTopic]
     robot: RobotProposal
     node_topics: dict[str, str]  # of Restock's own node: name -> type
     unmeasured: dict[str, str]  # input -> which topics say that they do not measure it; or ""
-    origin_m: tuple[int, int] | None  # of positions, where poses are far from 0
+    origin_m: tuple[int, int] | None  # of positions, if poses are far from 0
 
 
 def gather(
@@ -189,7 +189,7 @@ def gather(
 
     def fitting(kinds: tuple[Kind, ...]) -> list[tuple[TopicInfo, Kind]]:
         found = topics_for(recording, topics, kinds)
-        return [fit for _, fit in own_first(recording, [(fit[0].name, fit) for fit in found])]
+        return [fit for _, fit in sort_own_first(recording, [(fit[0].name, fit) for fit in found])]
 
     roles = {role: fitting(kinds) for role, kinds in KINDS.items()}
     unmeasured: dict[str, str] = {}
@@ -210,7 +210,7 @@ def gather(
     frames = transform_frames(recording, edges)
     if frames is not None and all(kind.by_fix for _, kind in roles["pose"]):
         roles["pose"] = []  # transforms say where it faces, too
-    # Odometry drifts: where transforms lead to a map, they are the better pose.
+    # Odometry drifts: transforms that lead to a map are the better pose.
     drifts = all(is_motion(topic.type) for topic, _ in roles["pose"])
     framed = frames is not None and (frames.localised or not roles["pose"]) and drifts
     poses, poses_from = None, ""
@@ -251,7 +251,7 @@ def gather(
         commands = replace(commands, wheelbase_from=robot.wheelbase_from)
     paces = _paces(recording, roles)
     recorded_s = _recorded_s(recording, roles)
-    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_seldomest(paces, roles, poses))
+    gaps = replace(gaps, hold_s=hold.age_s, sensor_s=_slowest_s(paces, roles, poses))
     motion = None
     if not roles["wheels"] and poses is not None:
         motion = choose_motion(recording, poses, poses_from)
@@ -354,12 +354,12 @@ def _paces(recording: Recording, roles: Roles) -> dict[str, float]:
     for name, columns in recording.read({name: [] for name in sorted(names)}).items():
         gaps = columns.gaps_s()
         if len(gaps) > 1:
-            # The median, or the mean of half of them where messages come in bursts.
+            # The median, or half the 90th percentile if messages come in bursts.
             found[name] = max(float(np.median(gaps)), float(np.percentile(gaps, 90)) / 2)
     return found
 
 
-def _seldomest(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
+def _slowest_s(paces: dict[str, float], roles: Roles, poses: PoseSeries | None) -> float:
     """Return the time between two messages of pose or wheels, whichever come less often."""
     names = [
         fitting[0][0].name for role in ("pose", "wheels") for fitting in [roles[role]] if fitting

@@ -1,9 +1,9 @@
 """The `[robot]` of a proposed profile, by its description, its scans and how it turned.
 
-A robot with two driven sides turns on the spot; one that steers never does, however it is told to.
-So where nothing describes the robot, its drive shows: in turns on the spot, or in commands for such
-turns that it did not follow, though it drove otherwise. Where it was never told to, its logs do not
-tell: a robot that only ever drove in wide circles may have two driven sides.
+A robot with two driven sides turns on the spot; one that steers never does, whatever its commands.
+If nothing describes the robot, its drive shows in turns on the spot, or in commands for such turns
+that it did not follow, though it drove otherwise. Without such commands its logs do not show it: a
+robot that only ever drove in wide circles may have two driven sides.
 """
 
 from __future__ import annotations
@@ -233,9 +233,9 @@ def shown_wheelbase_m(
 
 
 BY_TURNS = "by which its steering angles explain best how it turned: MEASURE IT"
-WHEELBASE_PART = 0.6  # of the outline's length, where nothing says
+WHEELBASE_PART = 0.6  # of the outline's length, if nothing shows it
 _OF_STEERING = ("drive", "wheelbase_m", "max_steering_rad")
-MAX_BEAMS = 361  # in the twin, where each costs time: of a finer lidar every k-th
+MAX_BEAMS = 361  # in the twin, as each costs time: every k-th beam of a finer lidar
 
 
 @dataclass(frozen=True)

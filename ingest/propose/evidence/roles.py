@@ -37,7 +37,7 @@ class Kind:
     never: tuple[str, ...] = ()  # in the topic's name, they speak against it
     rather: tuple[str, ...] = ()  # in the topic's name, they put it after all others
     at_changes: bool = False  # messages come when something changes, and hold until then
-    origin: str = ""  # of scans: the field that says where in their frame the lidar is
+    origin: str = ""  # of scans: the field with the lidar's pose in their frame
 
     @property
     def by_fix(self) -> bool:
@@ -45,7 +45,7 @@ class Kind:
         return "latitude_deg" in self.fields
 
 
-# Where nothing else says where the robot is.
+# If nothing else gives the robot's position.
 _STATED_FIX = {
     "latitude_deg": "latitude",
     "longitude_deg": "longitude",
@@ -64,7 +64,7 @@ _ACKERMANN = ("low_level", "output", "ackermann_cmd", "drive")
 BY_HAND = ("teleop", "joy", "key", "web", "remote")
 _CHOSEN_FROM = (*NAVIGATION, *BY_HAND, "input")
 
-# A name of a pose that is not where the robot is.
+# Words in the names of poses that are not the robot's.
 _ELSEWHERE = (
     *("goal", "target", "initial", "waypoint", "click", "marker", "object", "human", "person"),
     *("people", "dock", "desired", "setpoint", "reference", "camera", "joint", "gripper"),
@@ -347,7 +347,7 @@ def other_robots_topics(recording: Recording) -> set[str]:
     return {name for name in recording.topics if name.startswith(others)}
 
 
-def own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[tuple[str, T]]:
+def sort_own_first(recording: Recording, found: Iterable[tuple[str, T]]) -> Iterable[tuple[str, T]]:
     """Drop what was found at other robots' topics or nodes, and put the unnamed last.
 
     With one robot, everything stays as found.
