@@ -55,15 +55,15 @@ class Ros:
     get_message: Any  # "std_msgs/msg/Bool" -> its class
 
     def sensor_qos(self) -> Any:
-        """Matches whatever a publisher offers."""
+        """Return a quality of service that matches whatever a publisher offers."""
         return self._qos(10, self.ReliabilityPolicy.BEST_EFFORT, self.DurabilityPolicy.VOLATILE)
 
     def command_qos(self) -> Any:
-        """The newest alone, surely."""
+        """Return a quality of service that delivers the newest message alone, reliably."""
         return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.VOLATILE)
 
     def latched_qos(self) -> Any:
-        """What was said last, to those who come later too."""
+        """Return a quality of service that also gives late subscribers the last message."""
         return self._qos(1, self.ReliabilityPolicy.RELIABLE, self.DurabilityPolicy.TRANSIENT_LOCAL)
 
     def _qos(self, depth: int, reliability: Any, durability: Any) -> Any:
@@ -71,7 +71,7 @@ class Ros:
 
 
 def load_ros() -> Ros:
-    """The ROS 2 that is sourced.
+    """Import the ROS 2 that is sourced.
 
     Raises:
         ConfigError: there is none.
@@ -106,7 +106,7 @@ NAME = "restock_policy"
 
 
 class PolicyNode:
-    """What a lifecycle node does in its transitions; `node` is an rclpy LifecycleNode."""
+    """Behaviour of a lifecycle node in its transitions; `node` is an rclpy LifecycleNode."""
 
     def __init__(self, ros: Ros, node: Any, policy: Path, *, drive: bool = False) -> None:
         self.ros, self.node = ros, node
@@ -194,7 +194,7 @@ class PolicyNode:
         self._log(f"{policy.path}: profile {profile.name}, task {task.hash}, {mode}")
 
     def activate(self) -> None:
-        """From now on it publishes; the lifecycle publishers must be enabled."""
+        """Start to publish; the lifecycle publishers must be enabled."""
         self._decided_s, self.active = time.monotonic(), True
         self._say(self._own())
 
@@ -229,7 +229,7 @@ class PolicyNode:
     # -- messages and ticks ---------------------------------------------------------------------
 
     def _subscribed(self, topic: str, pilot: Pilot) -> list[Any]:
-        """A request for latched messages matches no publisher that does not latch: so both."""
+        """Return the subscriptions' qualities: a latched one alone misses plain publishers."""
         latched = [self.ros.latched_qos()] if topic in pilot.latched else []
         return [self.ros.sensor_qos(), *latched]
 
@@ -256,7 +256,7 @@ class PolicyNode:
         self._command(*((0.0, 0.0) if late else decision.command))
 
     def _publish_shadow(self, decision: Decision) -> None:
-        """What it would do, and why: for the log, whoever drives."""
+        """Publish what it would do and why, for the log, whoever drives."""
         rule = self._classes["limiter"]()
         rule.data = decision.rule
         self._published["limiter"].publish(rule)
@@ -268,7 +268,7 @@ class PolicyNode:
             self._published["proposal"].publish(self._filled("proposal", *decision.proposal))
 
     def _watch(self) -> None:
-        """A stop where control ticks no longer come: a hanging decision, or a stopped clock."""
+        """Publish a stop if control ticks no longer come: a hanging decision or stopped clock."""
         if not self.active or self.pilot is None:
             return
         if time.monotonic() - self._decided_s > self.watchdog_s:
@@ -277,7 +277,7 @@ class PolicyNode:
                 self._command(0.0, 0.0)
 
     def _drives(self) -> bool:
-        """Whether its commands are the robot's."""
+        """Return whether its commands are the robot's."""
         return (
             not self.shadow and self.pilot is not None and not self.pilot.taken_over(self._now_ns())
         )
@@ -292,7 +292,7 @@ class PolicyNode:
         return self.form.fill(message, speed_mps, yaw_rate_radps)
 
     def _say(self, who: str) -> None:
-        """Who drives, once, for those who come later too."""
+        """Publish who drives, once, latched for late subscribers."""
         if not self.shadow and who != self._said:
             message = self._classes["behaviour"]()
             message.data = self._said = who
@@ -303,7 +303,7 @@ class PolicyNode:
         return json.dumps({"policy": "restock", "version": self.pilot.policy.version})
 
     def _report(self) -> None:
-        """Counts of decisions, stops and why, interventions, to /diagnostics."""
+        """Publish counts of decisions, stops by reason, and interventions to /diagnostics."""
         if self.pilot is None:
             return
         pilot, message = self.pilot, self._classes["diagnostics"]()
@@ -330,7 +330,7 @@ class PolicyNode:
     # -- parameters -----------------------------------------------------------------------------
 
     def _class(self, kind: str) -> Any:
-        """The class of a message type.
+        """Return the class of a message type.
 
         Raises:
             ConfigError: it is not installed.
@@ -349,7 +349,7 @@ class PolicyNode:
             self.node.declare_parameter(name, default)
 
     def _profiles(self, name: str, default: Any) -> None:
-        """A parameter whose default is the profile's, until `cleanup`."""
+        """Declare a parameter whose default is the profile's, until `cleanup`."""
         self._parameter(name, default)
         self._defaults[name] = default
 
@@ -357,7 +357,7 @@ class PolicyNode:
         return self.node.get_parameter(name).value
 
     def _limits(self, policy: PolicyFile) -> Limits | None:
-        """The limiter by the profile and the parameters `limiter_…`; below 0: not given."""
+        """Return the limits by profile and parameters `limiter_…`; below 0 means not given."""
         profile = policy.profile
         given = {}
         for name in Limiter.__struct_fields__:
@@ -385,8 +385,11 @@ class PolicyNode:
 
 
 def lifecycle_node(ros: Ros, policy: Path, *, drive: bool = False) -> Any:
-    """The node, unconfigured. Its transitions return SUCCESS, or FAILURE where it cannot be
-    configured, which leaves it unconfigured and says why."""
+    """Make the node, unconfigured.
+
+    Its transitions return SUCCESS, or FAILURE if it cannot be configured: it then stays
+    unconfigured and says why.
+    """
     returned = ros.TransitionCallbackReturn
 
     class Node(ros.LifecycleNode):  # type: ignore[misc, name-defined]

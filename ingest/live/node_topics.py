@@ -1,4 +1,4 @@
-"""What the node publishes, and how a profile reads it from a recording.
+"""Topics that the node publishes, and how a profile reads them from a recording.
 
 The limiter's rule, the proposed action and what would have been driven become columns
 (`limiter_rule`, `shadow_action`, `shadow_speed_mps`, `shadow_yaw_rate_radps`), null in recordings
@@ -43,7 +43,7 @@ class CommandForm:
 
     @classmethod
     def of(cls, profile: Profile, topic: str = "", kind: str = "") -> CommandForm:
-        """The command of a robot; `topic` and `kind` in place of the profile's.
+        """Return the form of a robot's command; `topic` and `kind` replace the profile's.
 
         Raises:
             ConfigError: a type that the profile does not read and that is no twist.
@@ -64,7 +64,7 @@ class CommandForm:
         return cls(topic, kind, *TWISTS[kind])
 
     def fill(self, message: Any, speed_mps: float, yaw_rate_radps: float) -> Any:
-        """The message with this command in it; what is not finite is a stop."""
+        """Write this command into the message; a value that is not finite becomes a stop."""
         turn = yaw_rate_radps
         if not (math.isfinite(speed_mps) and math.isfinite(turn)):
             speed_mps = turn = 0.0
@@ -80,7 +80,7 @@ class CommandForm:
 
 
 def with_node_topics(profile: Profile) -> Profile:
-    """The profile that also reads what the node published beside the robot's own topics."""
+    """Return the profile with inputs for what the node published beside the robot's own topics."""
     form = CommandForm.of(profile)
     age_s = 2 * profile.task.control_period_s
 

@@ -55,7 +55,7 @@ class LiveClock:
         self._fitted = False  # to every message
 
     def receive(self, topic: str, log_time_ns: int, stamp_ns: int) -> bool:
-        """Whether a message is on the clock; one that is tells the time."""
+        """Return whether a message is on the clock; one that is also sets it."""
         if not self.agrees(log_time_ns, stamp_ns):
             return False
         self._topics.setdefault(topic, _Delays()).add(log_time_ns, log_time_ns - stamp_ns)
@@ -63,7 +63,7 @@ class LiveClock:
         return True
 
     def agrees(self, log_time_ns: int, stamp_ns: int) -> bool:
-        """Whether a stamp is near the clock; any is, before the first message.
+        """Return whether a stamp is near the clock; any is before the first message.
 
         For that the clock of a moment ago will do: a fit to every message takes longer.
         """
@@ -75,8 +75,10 @@ class LiveClock:
         return abs(log_time_ns - stamp_ns - _at(line, log_time_ns)) <= self._jump_ns
 
     def offset_ns(self, log_time_ns: int) -> int:
-        """Log time less the robot's time at this log time: of the topic that comes with the least
-        delay. 0 before the first message."""
+        """Return log time less the robot's time at this log time; 0 before the first message.
+
+        It is that of the topic with the least delay.
+        """
         if not self._topics:
             return 0
         line = self._line if self._fitted else None
@@ -84,12 +86,12 @@ class LiveClock:
 
     @property
     def drifts(self) -> bool:
-        """Whether the clocks drifted apart by more than `align` tolerates."""
+        """Return whether the clocks drifted apart by more than `align` tolerates."""
         return self._reference.drift_ns > round(TOLERANCE_S * NS)
 
     @property
     def _reference(self) -> _Delays:
-        """Of the topic with most messages."""
+        """Return the delays of the topic with most messages."""
         return max(self._topics.values(), key=lambda delays: delays.count)
 
     def _fit(self) -> tuple[int, int, float]:
@@ -159,13 +161,13 @@ class _Delays:
         return float(grown / apart) if apart > 0 else 0.0
 
     def at_ns(self, log_time_ns: int, growth: float) -> int:
-        """The delay at a log time, by the last messages."""
+        """Return the delay at a log time, by the last messages."""
         log, delay = self._recent(_LEVEL_NS)
         ahead = float(np.median(delay - growth * log)) + growth * (log_time_ns - self.newest_ns)
         return self._delay_ns[-1] + round(ahead)
 
     def _recent(self, length_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times and delays of the last messages, less those of the newest: floats hold them."""
+        """Return times and delays of the last messages less the newest's, to fit into floats."""
         log, delay = (np.array(times, np.int64) for times in (self._log_ns, self._delay_ns))
         first = min(int(np.searchsorted(log, log[-1] - length_ns)), max(len(log) - _FEWEST, 0))
         log, delay = log[first:] - log[-1], delay[first:] - delay[-1]
@@ -179,7 +181,7 @@ _MOST = 2000  # messages of a topic between two ticks
 
 @dataclass(frozen=True)
 class Observed:
-    """What the robot knows at a tick."""
+    """Knowledge of the robot at a tick."""
 
     observation: NDArray[np.float32]  # (D,)
     stamp_ns: int  # of the tick on the alignment clock
@@ -232,13 +234,15 @@ class LiveObserver:
 
     @property
     def topics(self) -> dict[str, str]:
-        """What to subscribe to: topic -> message type."""
+        """Return the topics to subscribe to, with their message types."""
         return {topic: sources[0].type for topic, sources in self._inputs.items()}
 
     @property
     def offset_ns(self) -> int:
-        """Log time less the alignment clock at the last message, as ingest finds it: of the topic
-        that comes with the least delay, the median, or where the clocks drift what it is now."""
+        """Return log time less the alignment clock at the last message, as ingest finds it.
+
+        It is the median of the topic with the least delay, or if the clocks drift, the offset now.
+        """
         return self._clock.offset_ns(self._newest_ns)
 
     def receive(self, topic: str, message: Any, log_time_ns: int) -> None:
@@ -273,7 +277,7 @@ class LiveObserver:
             self._command, self._ticked = taken, False
 
     def observe(self, now_ns: int) -> Observed:
-        """The observation of a tick at `now_ns`, by the clock of the messages' log times."""
+        """Make the observation of a tick at `now_ns`, by the clock of the messages' log times."""
         offset_ns = (
             0 if self.profile.clock.alignment == "log_time" else self._clock.offset_ns(now_ns)
         )
@@ -329,7 +333,7 @@ class LiveObserver:
                 self._buffers[topic] = [m for m in messages if m.stamp_ns >= newest]
 
     def _commands(self, ticks: Sequence[int]) -> tuple[TopicColumns, Samples]:
-        """The command in force since the tick before; the one of this tick is still to come."""
+        """Return the command in force since the tick before; this tick's is still to come."""
         fields: dict[str, FieldColumn] = {
             path: np.zeros(1) for path in field_paths(self.profile.inputs.command)
         }
@@ -357,7 +361,7 @@ class LiveObserver:
 
 
 def value_of(message: Any, path: str) -> Any:
-    """A message's value at a path without lists, such as `twist.linear.x`, `data` or `buttons[4]`.
+    """Read a message's value at a path such as `twist.linear.x`, `data` or `buttons[4]`.
 
     Raises:
         AttributeError: the message has no such field.
@@ -391,7 +395,7 @@ def _columns(messages: Sequence[_Message]) -> TopicColumns:
 
 
 def _column(message: Any, path: str) -> FieldColumn:
-    """One message's value at a field path, as a column of one row."""
+    """Return one message's value at a field path, as a column of one row."""
     head, repeated, tail = path.partition("[].")
     value = _member(message, head.removesuffix("[]"))
     if repeated:

@@ -1,5 +1,6 @@
-"""What a policy would drive, message by message: observation, proposal, limiter, and who has taken
-over. It knows no ROS: the node, a played recording and the tests all drive by it.
+"""Decisions of a policy, message by message: observation, proposal, limiter, and takeovers.
+
+It knows no ROS: the node, a played recording and the tests all drive by it.
 
 What cannot be acted on is a stop, with its reason: an input that is silent, stale or unreadable, a
 clock that went back, a scan in which no beam says anything, a policy without numbers.
@@ -32,7 +33,7 @@ OTHER_TYPE = (AttributeError, IndexError, TypeError, ValueError)  # reading it r
 
 @dataclass(frozen=True)
 class Decision:
-    """What the policy would do at a tick."""
+    """Decision of the policy at a tick."""
 
     observed: Observed
     action: int | None  # that it proposes; None: nothing could be decided
@@ -80,12 +81,12 @@ class Pilot:
 
     @property
     def topics(self) -> dict[str, str]:
-        """What to subscribe to: topic -> message type."""
+        """Return the topics to subscribe to, with their message types."""
         return {source.topic: source.type for source in self._people} | self.observer.topics
 
     @property
     def latched(self) -> set[str]:
-        """Those whose last message counts however old it is, such as goals, plans and maps."""
+        """Return topics whose last message counts at any age, such as goals, plans and maps."""
         inputs = [source for _, source in self.profile.inputs.items()]
         aging = {source.topic for source in inputs if source.max_age_s is not None}
         return {source.topic for source in inputs} & self.observer.topics.keys() - aging
@@ -107,7 +108,7 @@ class Pilot:
         self._active_ns[source.topic] = now_ns if drives else None
 
     def taken_over(self, now_ns: int) -> bool:
-        """Whether a person drives."""
+        """Return whether a person drives."""
         for source in self._people:
             at_ns = self._active_ns.get(source.topic)
             held = source.max_age_s
@@ -118,7 +119,7 @@ class Pilot:
         return False
 
     def decide(self, now_ns: int) -> Decision:
-        """What to do at a tick, by the clock that messages were received by."""
+        """Decide what to do at a tick, by the clock that messages were received by."""
         observed, reason = self._observe(now_ns)
         action, proposal = None, (0.0, 0.0)
         if not reason:
@@ -236,7 +237,7 @@ def play(pilot: Pilot, recording: Path) -> Iterator[Played]:
 
 
 def summary(pilot: Pilot, played: list[Played]) -> dict[str, Any]:
-    """Counts, latency of decisions (observation and policy, ms) and agreement with what drove."""
+    """Summarise counts, latency of decisions (ms) and agreement with what drove."""
     took_ms = np.array([one.took_s for one in played]) * 1e3
     both = [
         (one.decision.action, one.drove)

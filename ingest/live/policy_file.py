@@ -59,7 +59,7 @@ class PolicyFile:
         self._input = taken.name
 
     def act(self, observation: F32) -> int | None:
-        """The best action for one observation (D,); None if its value is no finite number.
+        """Return the best action for an observation (D,); None if its value is not finite.
 
         Raises:
             ConfigError: the network's output is none of the task's actions.
@@ -73,7 +73,7 @@ class PolicyFile:
 
 
 def open_session(path: Path) -> Any:
-    """The ONNX runtime's session of a file, on one thread.
+    """Open an ONNX session of a file, on one thread.
 
     Raises:
         ConfigError: no such file, a folder, no ONNX model, or the runtime is not installed.

@@ -1,4 +1,4 @@
-"""One clock for all topics, the ticks of the control clock on it, and causal holds.
+"""Alignment of all topics to one clock, the ticks of the control clock on it, and causal holds.
 
 Three clocks may be in a recording: when a message was received (`log_time`), sent, and measured
 (`header.stamp`). The profile names one, the alignment clock; every sample of every topic is put
@@ -56,13 +56,13 @@ Rows: TypeAlias = "slice | NDArray[np.intp]"  # of a topic's columns; a slice ta
 
 @dataclass(frozen=True)
 class Samples:
-    """One topic's messages on the alignment clock, in its order."""
+    """Messages of one topic on the alignment clock, in its order."""
 
     stamp_ns: Ints  # (N,) ascending
     row: NDArray[np.intp]  # (N,) of the topic's columns
 
     def hold(self, tick_ns: Ints, max_age_s: float | None) -> LatestMessages:
-        """At each tick (T,) ascending or not, the latest sample at or before it."""
+        """Return the latest sample at or before each tick (T,), ascending or not."""
         at = np.searchsorted(self.stamp_ns, tick_ns, "right") - 1
         known = at >= 0
         if not len(self.stamp_ns):
@@ -85,7 +85,7 @@ class LatestMessages:
 
     @classmethod
     def join(cls, parts: Sequence[LatestMessages]) -> LatestMessages:
-        """Those of several clock segments, one after the other."""
+        """Concatenate the latest messages of several clock segments."""
         names = ("row", "age_ns", "known", "fresh")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -100,7 +100,7 @@ class ClockSegment:
 
 @dataclass
 class ClockReport:
-    """What was seen of the clocks; kept with the recording's counts."""
+    """Findings about the clocks; kept with the recording's counts."""
 
     alignment: str
     offset_ns: int = 0  # of the first segment
@@ -158,9 +158,11 @@ def align(
 
 
 def _laps(topics: Mapping[str, TopicColumns]) -> list[dict[str, NDArray[np.intp]]]:
-    """Split each topic's messages where the recorder's clock was set back: log time goes back on
-    every frequent topic, by about as much, and over what was recorded. Returns one empty part if it
-    was not."""
+    """Split each topic's messages at the points where the recorder's clock was set back.
+
+    There log time goes back on every frequent topic, by about as much, and over what was recorded.
+    Returns one empty part if it was not set back.
+    """
     laps = {name: one.laps() for name, one in topics.items() if len(one) >= OFTEN}
     if not laps or len(set(laps.values())) > 1 or not max(laps.values()):
         return [{}]
@@ -239,7 +241,7 @@ def _align(
 
 
 def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool:
-    """Whether the stamps of the topic with most of them run at another pace than log time."""
+    """Return whether stamps of the busiest stamped topic run at another pace than log time."""
     stamped = stamped_topics(topics, frozenset())
     reference = max(stamped.values(), key=len, default=None)
     if reference is None:
@@ -250,8 +252,11 @@ def clock_drifts(topics: Mapping[str, TopicColumns], tolerance_s: float) -> bool
 def stamped_topics(
     topics: Mapping[str, TopicColumns], besides: frozenset[str]
 ) -> dict[str, TopicColumns]:
-    """Every topic with header stamps and messages, but those `besides`. Drivers that do not fill
-    stamps in leave them at zero: such a topic does not say what time it is."""
+    """Return every topic with header stamps and messages, except those `besides`.
+
+    Drivers that do not fill stamps in leave them at zero: such a topic does not say what time it
+    is.
+    """
     return {
         name: columns
         for name, columns in topics.items()
@@ -262,8 +267,10 @@ def stamped_topics(
 
 
 def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
-    """Find the topics stamped after their reception, and by how many ns, if others are stamped by
-    the recorder's clock; none if all are ahead (the recorder's clock is behind)."""
+    """Find the topics stamped after their reception, and by how many ns.
+
+    Only if others are stamped by the recorder's clock: if all are ahead, that clock is behind.
+    """
     medians = {name: median(delay_ns(columns)) for name, columns in stamped.items()}
     limit = round(IMPOSSIBLE_S * NS)
     if not any(-limit < each < LATENCY_S * NS for each in medians.values()):
@@ -272,13 +279,15 @@ def _stamped_ahead(stamped: Mapping[str, TopicColumns]) -> dict[str, int]:
 
 
 def delay_ns(columns: TopicColumns, rows: Rows = slice(None)) -> Ints:
-    """Log time - header stamp, (N,), of messages of a stamped topic. Worked out where it is
-    needed: that of all topics would be half as large as all their times."""
+    """Return log time - header stamp, (N,), of messages of a stamped topic.
+
+    Computed where it is needed: that of all topics would be half as large as all their times.
+    """
     return columns.log_time_ns[rows] - np.asarray(columns.fields[STAMP], np.int64)[rows]
 
 
 def ticks_of(command: Samples, clock: Clock, period_s: float, end_ns: int) -> tuple[Ints, int]:
-    """The ticks (T,) of the control clock in a segment, and how many commands got none.
+    """Return a segment's ticks (T,) of the control clock, and how many commands got none.
 
     `steps = "command"`: one tick a command, but none closer than 3/4 of the period to the last.
     `steps = "rate"`: every period, from the first command to `end_ns`.
@@ -326,21 +335,23 @@ def refuse_still_log_time(topic: str, columns: TopicColumns) -> None:
 
 
 def _edges(columns: TopicColumns, jump_ns: int) -> Ints:
-    """The log times (K,) at which segments begin, ascending; each segment has a message of the
-    topic. Messages of one log time cannot be told apart by it, so they share a segment."""
+    """Return the log times (K,) at which segments begin; each segment has a message of the topic.
+
+    They ascend. Messages of one log time cannot be told apart by it, so they share a segment.
+    """
     edges = np.unique(jumps(columns.log_time_ns, delay_ns(columns), jump_ns))
     return np.asarray(edges[edges > columns.log_time_ns.min()], np.int64)
 
 
 def _during(edges: Ints, index: int, columns: TopicColumns) -> Rows:
-    """The messages of a topic that were received in a segment."""
+    """Return which messages of a topic were received in a segment."""
     if not len(edges):
         return slice(0, len(columns))
     return np.flatnonzero(np.searchsorted(edges, columns.log_time_ns, "right") == index)
 
 
 def _ordered(stamp_ns: Ints, row: NDArray[np.intp]) -> Samples:
-    """Samples in the order of their stamps: over the same memory where that is theirs already."""
+    """Return samples in stamp order, sharing memory if they are in that order already."""
     if (stamp_ns[1:] < stamp_ns[:-1]).any():
         order = np.argsort(stamp_ns, kind="stable")  # of equal stamps the last received wins
         stamp_ns, row = stamp_ns[order], row[order]
@@ -365,7 +376,7 @@ class _Drifts:
         edges: Ints,
         index: int,
     ) -> tuple[ClockMap, int]:
-        """The map of one segment, and the median delay of the reference topic in it."""
+        """Return the map of one segment, and the reference topic's median delay in it."""
         jump_ns, rows = round(self.clock.jump_s * NS), inside[reference]
         log = stamped[reference].log_time_ns[rows]
         late = delay_ns(stamped[reference], rows)
@@ -471,7 +482,7 @@ def _segment(
 
 
 def _carry_latched(segments: list[ClockSegment], latched: frozenset[str]) -> None:
-    """The latest message of a latched topic still holds at the start of the next segment."""
+    """Carry each latched topic's latest message to the start of the next segment."""
     for index in range(1, len(segments)):
         topics = dict(segments[index].topics)
         start = min(int(samples.stamp_ns[0]) for samples in topics.values() if len(samples.row))

@@ -60,7 +60,7 @@ class AlignedInputs:
     notes: Sequence[str] = ()  # what is odd about the frames, and left out of commands
 
     def at(self, tick: int, stamp_ns: int) -> AlignedInputs | None:
-        """The same inputs at one tick alone, or None where that tick is at another time."""
+        """Return the inputs at one tick alone, or None if that tick is at another time."""
         ends = np.cumsum([len(stamps) for stamps in self.ticks])
         segment = int(np.searchsorted(ends, tick, "right"))
         stamps = np.concatenate(self.ticks)[tick : tick + 1]
@@ -70,7 +70,7 @@ class AlignedInputs:
         return replace(self, ticks=ticks)
 
     def latest(self, name: str) -> LatestMessages:
-        """The latest message of an input at each tick; its age is below 0 where it comes later.
+        """Return an input's latest message at each tick; its age is negative if it comes later.
 
         What the robot knew lies at or before the tick. The command of a fixed rate, and what only
         says where a row comes from, may come a moment later.
@@ -93,7 +93,7 @@ class AlignedInputs:
         lead_ns: int = 0,
         keep: Bools | None = None,
     ) -> LatestMessages:
-        """The latest message of a topic at each tick (or a lead after it); of those to `keep`."""
+        """Return a topic's latest message (of those to `keep`) at each tick, or a lead after it."""
         parts = []
         for segment, stamps in zip(self.segments, self.ticks, strict=True):
             samples = segment.topics[topic]
@@ -104,7 +104,7 @@ class AlignedInputs:
         return LatestMessages.join(parts)
 
     def camera_frames(self) -> dict[str, CameraFrames]:
-        """The frames of each camera that the recording has, and those in force at the ticks."""
+        """Return the frames of each recorded camera, and those in force at the ticks."""
         found: dict[str, CameraFrames] = {}
         for name, camera in self.profile.cameras.items():
             columns = self.inputs.topics.get(camera.topic)
@@ -124,7 +124,7 @@ class AlignedInputs:
         return found
 
     def commanded_by(self) -> list[str | None]:
-        """At each tick the source whose command is the one in force, or None.
+        """Return the source whose command is the one in force at each tick, or None.
 
         It is looked for at the command itself, among what had come up to then: of the sources
         whose last command is the same the one that said so last, else one that is pressed. A
@@ -182,7 +182,7 @@ class AlignedInputs:
         return poses_along(self.tree)
 
     def _lead_s(self, name: str) -> float:
-        """How much after a tick an input's message may be measured."""
+        """Return how much later than a tick an input's message may be measured."""
         half_s, by_rate = self.profile.task.control_period_s / 2, self.profile.clock.steps == "rate"
         leads = {
             # At a fixed rate a command lands anywhere in the interval: the one in force for most
@@ -197,7 +197,7 @@ class AlignedInputs:
 
 
 def align_inputs(profile: Profile, topics: Mapping[str, TopicColumns]) -> AlignedInputs:
-    """The inputs in a recording's columns (those `wanted_fields` asks for) on one clock.
+    """Align a recording's columns (those `wanted_fields` asks for) to one clock.
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or log time
@@ -251,7 +251,7 @@ def _command_topics(inputs: InputColumns) -> frozenset[str]:
 
 
 def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict[str, str]:
-    """Inputs and signals that this recording does not fill -> what is used instead of each."""
+    """Return what replaces each input and signal that this recording does not fill."""
     absent = {
         name: FALLBACKS.get(name, POSE_FALLBACK)
         for name, source in profile.inputs.items()
@@ -268,8 +268,11 @@ def fallbacks_used(profile: Profile, topics: Mapping[str, TopicColumns]) -> dict
 
 
 def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
-    """These topics but those of which only images are taken: whether frames are kept changes
-    nothing about rows, so cameras say neither what time it is nor when a recording ends."""
+    """Return these topics except those of which only images are taken.
+
+    Keeping frames must change nothing about rows, so cameras affect neither the clock nor a
+    recording's end.
+    """
     named = {source.topic for source in profile.sources.values()}
     named |= {signal.topic for signal in profile.signals.values()}
     beside = {camera.topic for camera in profile.cameras.values()} - named
@@ -277,7 +280,7 @@ def without_cameras(profile: Profile, topics: Mapping[str, T]) -> dict[str, T]:
 
 
 def transforms_of(profile: Profile, inputs: InputColumns) -> Edges:
-    """The transforms that the pose, goals and plans need; none where the profile has no frames.
+    """Return the transforms that pose, goals and plans need; none if the profile has no frames.
 
     Raises:
         RecordingError: the pose is to come from them, and none of them joins its two frames.
@@ -316,7 +319,7 @@ def place_messages(inputs: InputColumns, tree: Tree, segments: Sequence[ClockSeg
 
 
 def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[str]:
-    """What is odd about the frames of a recording."""
+    """Describe what is odd about the frames of a recording."""
     notes = []
     if profile.origin_m is not None:
         x, y = profile.origin_m
@@ -338,13 +341,13 @@ def frame_notes(profile: Profile, inputs: InputColumns, edges: Edges) -> list[st
 
 
 def sideways_path(source: Input) -> str:
-    """Where a command's speed to the left stands, beside that ahead; "": it has none."""
+    """Return the path of a command's speed to the left, beside that ahead; "" if it has none."""
     path = source.fields.get("speed_mps", "")
     return path[:-1] + "y" if path.split(".")[-2:] == ["linear", "x"] else ""
 
 
 def sideways_notes(source: Input, fields: Mapping[str, FieldColumn]) -> list[str]:
-    """How many commands also ask for a speed sideways, which no action has."""
+    """Count the commands that also ask for a speed sideways, which no action has."""
     aside = np.asarray(fields.get(sideways_path(source), np.zeros(0)), np.float64)
     count = int((np.abs(aside) > SIDEWAYS_MPS).sum())
     if not count:

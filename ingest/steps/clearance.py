@@ -29,7 +29,7 @@ _TURNS_RAD = 4 * np.pi  # angles beyond two turns are not in radians
 
 
 def scan_reduction(task: Task, source: Input) -> Reduction:
-    """What makes SECTORS, BEAMS, CLOSE, BLIND and UNAIMED of the scans of a profile's input.
+    """Build the reduction of an input's scans to SECTORS, BEAMS, CLOSE, BLIND and UNAIMED.
 
     Its `apply` raises RecordingError where an angle is not one number a message.
     """
@@ -38,14 +38,16 @@ def scan_reduction(task: Task, source: Input) -> Reduction:
 
 
 def angle_keys(fields: Mapping[str, str]) -> tuple[str, str]:
-    """The fields that say at which angles a scan's beams are, as `beam_angles` takes them."""
+    """Return the fields that define the angles of a scan's beams, as `beam_angles` takes them."""
     last = "angle_max_rad" if "angle_max_rad" in fields else "angle_increment_rad"
     return "angle_min_rad", last
 
 
 def beam_angles(source: Input, first: F64, last: F64, beams: Ints) -> tuple[F64, F64]:
-    """The angle of the first beam (N,) and from each to the next (N,), counter-clockwise as seen
-    from above: as scans say, or by the angle of the last of so many beams."""
+    """Return the angle of the first beam and the step to the next, (N,), counter-clockwise.
+
+    As seen from above, either as the scans have them or by the angle of the last beam.
+    """
     increment = last
     if "angle_max_rad" in source.fields:
         with np.errstate(invalid="ignore", over="ignore"):

@@ -27,7 +27,7 @@ WIDE_NS = 100_000_000  # a spread of (log time - stamp) that is worth a look
 
 @dataclass(frozen=True)
 class TopicClock:
-    """What was seen of one topic's clocks. None: its messages carry no header stamp."""
+    """Comparison of one topic's clocks. None: its messages carry no header stamp."""
 
     topic: str
     messages: int
@@ -77,7 +77,7 @@ def topic_clock(topic: str, columns: TopicColumns, jump_s: float) -> TopicClock:
 
 
 def odd(row: Mapping[str, Any]) -> str:
-    """What of a topic's clocks is worth a look, in words; "" for nothing."""
+    """Describe what is unusual about a topic's clocks; "" if nothing is."""
     words = {
         "jumps": "jump",
         "log_backsteps": "log time backstep",
@@ -102,13 +102,13 @@ def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[Topi
 
 
 def median(delay_ns: Ints) -> int:
-    """The (upper) median; in integers, for float64 holds a time of day to 256 ns only."""
+    """Return the (upper) median in integers, as float64 holds a time of day to 256 ns only."""
     middle = len(delay_ns) // 2
     return int(np.partition(delay_ns, middle)[middle])
 
 
 def smoothed(delay_ns: Ints) -> Ints:
-    """The running median of five delays (N,): single bad stamps are gone."""
+    """Return the running median of five delays (N,), without single bad stamps."""
     if len(delay_ns) < 5:
         return delay_ns
     smooth = delay_ns.copy()
@@ -122,7 +122,7 @@ def smoothed(delay_ns: Ints) -> Ints:
 
 
 def jumps(log_time_ns: Ints, delay_ns: Ints, jump_ns: int) -> Ints:
-    """The log times at which a topic's clock jumps, single bad stamps aside."""
+    """Return the log times at which a topic's clock jumps, ignoring single bad stamps."""
     change_ns = np.diff(delay_ns)
     if not (np.abs(change_ns, out=change_ns) > jump_ns).any():
         return np.zeros(0, np.int64)  # medians of neighbours differ by no more than neighbours do
@@ -184,7 +184,7 @@ class ClockMap:
         return ClockMap(self.stamp_ns[last], self.log_ns[last]).stamped(stamp_ns)
 
     def ahead_by(self, shift_ns: int) -> ClockMap:
-        """The same map with stamps that much later."""
+        """Return the same map with stamps that much later."""
         return ClockMap(self.log_ns, self.stamp_ns + shift_ns)
 
     @property
@@ -204,7 +204,7 @@ class ClockMap:
 
 
 def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
-    """By how much the delays (N,) of a topic drift over a recording, jitter aside.
+    """Return by how much a topic's delays (N,) drift over a recording, without jitter.
 
     Latency only ever adds to the clocks' offset, so each second's least delay shows the offset;
     the drift is from the 5th to the 95th percentile of those.
@@ -224,7 +224,7 @@ def drift_ns(log_ns: Ints, delay_ns: Ints) -> int:
 
 
 def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
-    """How far messages (N,) that carry both times are from a map through their neighbours.
+    """Return how far messages (N,) with both times are from a map through their neighbours.
 
     Each half is put on a map through the other half, so the spread says how well a message
     between two knots is placed. Empty for fewer than 4 messages.
@@ -241,7 +241,7 @@ def residual_ns(log_ns: Ints, stamp_ns: Ints) -> Ints:
 
 
 def spread_ns(values_ns: Iterable[int] | Ints) -> int:
-    """From the 1st to the 99th percentile; 0 for no values."""
+    """Return the span from the 1st to the 99th percentile; 0 for no values."""
     values = np.asarray(values_ns, np.int64)
     if not len(values):
         return 0

@@ -137,8 +137,10 @@ def findings_of(
 
 
 def clock_findings(clock: ClockReport, steps: int) -> list[Finding]:
-    """Find where the recorder's clock was set back, and the topics whose stamps are of another
-    clock than the others', and were not used."""
+    """Find where the recorder's clock was set back, and the topics stamped by another clock.
+
+    Stamps of another clock than the others' were not used.
+    """
     found = []
     if clock.set_back:
         what = (
@@ -312,8 +314,10 @@ def _scans(
 
 
 def _turned(sectors: F64) -> F64:
-    """Return the angle (T,) by which a robot turned since the step before, by clearance (T, K)
-    around it: the turn of the one that fits the other best, over their lowest harmonics."""
+    """Return the angle (T,) by which a robot turned since the step before, by clearance (T, K).
+
+    It is the turn of the one that fits the other best, over their lowest harmonics.
+    """
     near = np.fft.rfft(np.log(np.maximum(sectors, 0.05)), axis=1)[:, HARMONICS]
     product = near * np.roll(near, 1, axis=0).conj()  # (T, H)
     turns = np.linspace(-0.6, 0.6, 61)

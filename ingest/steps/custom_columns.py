@@ -47,18 +47,18 @@ class CustomColumn:
 
     @property
     def of_other_length(self) -> int:
-        """How many messages hold a vector of another length."""
+        """Count the messages that hold a vector of another length."""
         return 0 if self.signal.length is None else int((~self.whole).sum())
 
     @property
     def found(self) -> int:
-        """How many messages have it, as a number or a list of them."""
+        """Count the messages that have it, as a number or a list of them."""
         if self.signal.is_list:
             return int(self.whole.sum())
         return int(np.isfinite(np.asarray(self.values.values, np.float64)).sum())
 
     def take(self, message: NDArray[np.intp], known: NDArray[np.bool_]) -> pa.Array:
-        """The values of these messages (T,), null where not `known` or not finite."""
+        """Return the values of these messages (T,), null if not `known` or not finite."""
         if not len(self.values):
             return pa.nulls(len(message), LIST if self.signal.is_list else NUMBER)
         if not self.signal.is_list:
@@ -78,8 +78,10 @@ class CustomColumn:
 
 
 def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] = ()) -> Reduction:
-    """What makes the columns of these signals, all of one topic whose messages have the fields
-    `has`, of its messages' fields."""
+    """Build the reduction that makes these signals' columns, all of one topic.
+
+    Its messages have the fields `has`.
+    """
     fields = [path for signal in signals.values() for path in signal.wanted()]
     for signal in signals.values():
         for rule in conventions_of(signal.type, signal.path, has):
@@ -95,7 +97,7 @@ def custom_reduction(signals: Mapping[str, CustomSignal], has: Collection[str] =
 
 
 def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, FieldColumn]:
-    """A signal's values in N messages, and the texts among them that are no number.
+    """Return a signal's values in N messages, and the texts among them that are not numbers.
 
     Raises:
         RecordingError: it is not a number a message, or a list of numbers.
@@ -139,13 +141,13 @@ def _per_message(name: str, signal: CustomSignal, columns: Fields) -> dict[str, 
 
 
 def _measured(rule: Convention, columns: Fields, read: PathValues) -> PathValues:
-    """The same with NaN for what messages say was not measured."""
+    """Replace values that messages declare as not measured by NaN."""
     said = (said_in(columns, path)[read.message] for path in rule.said_by)
     return PathValues(read.message, rule.read(np.asarray(read.values, np.float64), *said))
 
 
 def _key(name: str) -> str:
-    """A signal among the columns of its topic; names of fields hold no space."""
+    """Name a signal among its topic's columns; names of fields hold no space."""
     return f"signal {name}"
 
 
@@ -174,7 +176,7 @@ def _texts(values: NDArray[Any]) -> list[str]:
 
 
 def _reduced(read: PathValues, how: Reduce | None) -> PathValues:
-    """The finite elements of each message as one number; a message without any has none."""
+    """Reduce the finite elements of each message to one number; without any it has none."""
     finite = np.isfinite(read.values)
     values, owner = np.asarray(read.values[finite], np.float64), read.message[finite]
     message, start, counts = np.unique(owner, return_index=True, return_counts=True)
@@ -196,7 +198,7 @@ class Custom:
 
     @property
     def notes(self) -> list[str]:
-        """What of them could not be used, in words."""
+        """Describe what of the signals could not be used."""
         return (
             [
                 f"signals.{name}: {len(column.unread):,} of {len(column.values):,} messages have"
@@ -219,7 +221,7 @@ class Custom:
         )
 
     def rows(self) -> list[dict[str, Any]]:
-        """What came of each, as `recordings.signals` holds it."""
+        """Return the counts of each signal, as `recordings.signals` holds them."""
         rows = []
         for column in self.table.schema:
             about = {key.decode(): text.decode() for key, text in (column.metadata or {}).items()}
@@ -241,7 +243,7 @@ class Custom:
         return rows
 
     def take(self, ticks: NDArray[np.int64]) -> pa.Table:
-        """The columns at these ticks."""
+        """Return the columns at these ticks."""
         return self.table.take(pa.array(ticks))
 
 
@@ -266,13 +268,13 @@ def custom_signals(aligned: AlignedInputs) -> Custom:
 
 
 def latest_samples(aligned: AlignedInputs, column: CustomColumn) -> LatestMessages:
-    """The latest message that has a custom signal, at every tick."""
+    """Return the latest message that has a custom signal, at every tick."""
     signal = column.signal
     return aligned.latest_of(signal.topic, signal.max_age_s, keep=column.samples)
 
 
 def column_of(name: str, signal: CustomSignal, topic: TopicColumns) -> CustomColumn:
-    """A signal's values in its topic's columns."""
+    """Return a signal's values from its topic's columns."""
     fields: Fields = topic.fields
     if _key(name) not in fields:  # columns of whole messages, as no recording's reader gives them
         fields = custom_reduction({name: signal}).apply(fields)

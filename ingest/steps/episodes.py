@@ -44,7 +44,7 @@ class EpisodeSpan:
 
 @dataclass(frozen=True)
 class Split:
-    """All episodes of a recording, and the ticks that are in none, by reason.
+    """Episodes of a recording, and the ticks that are in none, by reason.
 
     ticks = transitions + episode ends that are not shared + dropped.
     """
@@ -63,7 +63,7 @@ class Split:
 
 
 def split(task: Task, steps: Steps) -> Split:
-    """The episodes of a recording's steps."""
+    """Split a recording's steps into episodes."""
     changed, routing = changed_route(steps), steps.routing
     old_route = np.zeros(len(steps), np.bool_)
     if len(changed):  # seen with the goal and plan of the tick before
@@ -99,7 +99,7 @@ def changed_route(steps: Steps) -> Ints:
 
 
 def with_route(task: Task, steps: Steps, ticks: Ints, goal: Ints, plan: Ints) -> Signals:
-    """The signals at these ticks as they are with this goal and plan in force."""
+    """Return the signals at these ticks as if this goal and plan were in force."""
     now = {name: column[ticks] for name, column in steps.signals.items()}
     return now | steps.routing.signals(task, goal, plan, now)
 
@@ -139,7 +139,7 @@ class _Walk:
         return Split(self.episodes, dict(self.dropped))
 
     def _goes_on(self, tick: int, first: int, follows: bool) -> bool:
-        """Whether the open episode uses this tick up; closes it if it ends here or before."""
+        """Return whether the open episode uses this tick; close it if it ends here or before."""
         if not follows:
             self._close(tick - 1, self.steps.problem[tick] or self.steps.break_reason[tick])
             return False

@@ -124,7 +124,7 @@ class Filling:
         return np.asarray(self.break_reason == "", np.bool_)
 
     def behaviour(self) -> list[tuple[str, str | None, float | None]]:
-        """Who acted at each tick: policy, version, probability of the action."""
+        """Return who acted at each tick: policy, version, probability of the action."""
         default, by = self.profile.behaviour_policy, self.aligned.commanded_by()
         found = [
             (source or default, None, None) if text is None else parse_policy(text)
@@ -142,7 +142,7 @@ class Filling:
         ]
 
     def texts(self, name: str) -> list[str | None]:
-        """The latest text of an input at each tick, or None."""
+        """Return the latest text of an input at each tick, or None."""
         if name not in self.inputs.by_name:
             return [None] * len(self.tick_ns)
         texts, latest = self.inputs.texts(name), self.aligned.latest(name)
@@ -150,7 +150,7 @@ class Filling:
         return [texts[row] if fresh else None for row, fresh in rows]
 
     def perturbed(self) -> Perturbed:
-        """The simulator's parameters in force at each tick, and what could not be read."""
+        """Return the simulator's parameters in force at each tick, and what could not be read."""
         if "perturbation" not in self.inputs.by_name:
             return Perturbed.unknown(len(self.tick_ns))
         latest = self.aligned.latest("perturbation")
@@ -219,7 +219,7 @@ class Filling:
         self.signals[signal] = np.where(sane & known, values, 0.0)
 
     def _wheels(self) -> F64 | None:
-        """The wheels' speeds; where they come from poses, the speed sideways (T,) as well."""
+        """Return the wheels' speeds, and the speed sideways (T,) if they come from poses."""
         motion = self.profile.motion
         if motion is None:
             speeds = {"speed_mps": "wheel_speed_mps", "yaw_rate_radps": "wheel_yaw_rate_radps"}
@@ -260,9 +260,11 @@ class Filling:
         self.signals["pose_stamp_ns"] = at.stamp_ns
 
     def _scans(self) -> None:
-        """Clearance by the scans: of several lidars, the nearest of any. A robot without a lidar
-        has none, and what has one may not go without: recordings without scans are read by
-        `as_recorded`, of a task without sectors."""
+        """Return clearance by the scans: with several lidars, the nearest of any.
+
+        A robot without a lidar has none, and one that has a lidar may not go without: recordings
+        without scans are read by `as_recorded`, with a task without sectors.
+        """
         count = len(self.tick_ns)
         sectors = np.full((count, self.task.sectors), np.nan)
         if "scan" not in self.inputs.by_name and self.task.lidar:
@@ -311,7 +313,7 @@ class Filling:
         self.signals["bumped"] = np.concatenate(bumped)
 
     def _nav_command(self) -> None:
-        """What navigation proposes; a tick at which that is not known stays usable."""
+        """Return what navigation proposes; a tick at which that is unknown stays usable."""
         count, name = len(self.tick_ns), "nav_command"
         unknown = np.full(count, np.nan)
         source = self.inputs.by_name.get(name)
@@ -377,7 +379,7 @@ class Filling:
 
 
 def _chunks(steps: int) -> Iterator[Ints]:
-    """Steps, some at a time: what is made of scans takes memory."""
+    """Yield the steps some at a time: what is made of scans takes memory."""
     for start in range(0, steps, _CHUNK):
         yield np.arange(start, min(start + _CHUNK, steps))
 
@@ -394,7 +396,7 @@ def _with_earlier(
 
 
 def pressed_since(bumper: Samples, pressed: Bools, tick_ns: Ints) -> Bools:
-    """Whether the bumper was pressed since the tick before (or is), (T,)."""
+    """Return whether the bumper was pressed since the tick before (or is), (T,)."""
     if not len(bumper.row) or not len(tick_ns):
         return np.zeros(len(tick_ns), np.bool_)
     counts = np.concatenate([[0], np.cumsum(pressed[bumper.row])])

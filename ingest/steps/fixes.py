@@ -46,7 +46,7 @@ class Fixes:
     yaw_rad: F64 | None = None  # of an IMU at each; NaN: not known. None: by the track
 
     def std_m(self) -> F64:
-        """The standard deviation that each gives, of east or north; NaN where it does not say."""
+        """Return the standard deviation of east or north that each reports; NaN if it does not."""
         std = np.full(len(self.time_ns), np.nan)
         if self.covariance_m2 is not None:
             variance = self.covariance_m2[:, [0, 4]].max(axis=1)
@@ -101,7 +101,7 @@ class Fixes:
 
 
 def fixes_of(columns: TopicColumns, fields: Mapping[str, str], yaw: F64 | None = None) -> Fixes:
-    """The fixes of a topic, by the `fields` of the profile's input; with a heading at each."""
+    """Read a topic's fixes by the `fields` of the profile's input, with a heading at each."""
     named = {}
     for key, path in fields.items():
         column = columns.fields.get(path)
@@ -154,7 +154,7 @@ def _earth_centred_m(latitude_deg: F64, longitude_deg: F64) -> F64:
 
 
 def track_yaw(x_m: F64, y_m: F64, track_m: float) -> F64:
-    """The direction (N,) of the last `track_m` up to each position, in the order they came.
+    """Return the direction (N,) of the last `track_m` up to each position, in the order they came.
 
     From the latest earlier position that is so far away; where the robot has not been so far from
     where it is since, the direction before is held. NaN until it has driven so far.
@@ -199,7 +199,7 @@ class _Track:
             reach = reach[: len(reach) // 2 * 2].reshape(-1, 2, _SIDES).max(axis=1)
 
     def latest_far(self, here: int, first: int) -> int | None:
-        """The latest of `first` to `here` that is `far_m` or more away from it; None: none is."""
+        """Return the latest of `first` to `here` that is at least `far_m` away; None if none is."""
         block = here // _BLOCK
         found = self._far_within(block * _BLOCK, here + 1, here, first)
         while found is None and block * _BLOCK > first:  # the blocks before it are left

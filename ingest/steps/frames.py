@@ -44,7 +44,7 @@ FRAME_IDS = (FRAME_ID, "frame_id")  # of ROS's messages, and of Foxglove's
 
 
 def frame_path(source: Input, fields: Container[str]) -> str | None:
-    """The field that says in which frame an input's point is: of the innermost header around it."""
+    """Return the field with the frame of an input's point: its innermost header's."""
     around = source.fields["x_m"].split(".")[:-1] if "x_m" in source.fields else []
     for count in range(len(around), -1, -1):
         path = ".".join([*around[:count], FRAME_ID])
@@ -54,12 +54,12 @@ def frame_path(source: Input, fields: Container[str]) -> str | None:
 
 
 def frame_id_path(fields: Container[str]) -> str | None:
-    """The field that says in which frame a message is."""
+    """Return the field that says in which frame a message is."""
     return next((path for path in FRAME_IDS if path in fields), None)
 
 
 def transform_fields(fields: Collection[str]) -> tuple[str, ...] | None:
-    """The fields that transforms are in, in the order of `FIELDS`; None where there are none."""
+    """Return the fields of transforms in the order of `FIELDS`; None if there are none."""
     return next((layout for layout in _LAYOUTS if set(layout) <= set(fields)), None)
 
 
@@ -74,7 +74,7 @@ class Edges:
 
     @classmethod
     def of(cls, frames: Frames, topics: Mapping[str, TopicColumns]) -> Edges:
-        """The transforms in these topics' columns (their `transform_fields`)."""
+        """Read the transforms from these topics' columns (their `transform_fields`)."""
         edges: dict[str, TopicColumns] = {}
         static, parents, changes = set(), dict[str, list[str]](), 0
         for topic in (frames.static_topic, frames.topic):
@@ -115,12 +115,12 @@ class Edges:
 
 
 def plain(frame: str) -> str:
-    """A frame's name as ROS 2 writes it: without the slash that ROS 1 put before it."""
+    """Return a frame's name as ROS 2 writes it, without the leading slash of ROS 1."""
     return frame.strip("/")
 
 
 def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
-    """The transforms of a topic, by the frame that they place."""
+    """Group a topic's transforms by the frame that they place."""
     layout = transform_fields(topic.fields)
     assert layout is not None
     columns = [topic.fields[path] for path in layout]
@@ -153,7 +153,7 @@ def _by_child(topic: TopicColumns) -> dict[str, TopicColumns]:
 
 
 def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
-    """Which of the plain names, sorted, each of these frames (N,) has; and the names."""
+    """Return which of the plain names, sorted, each of these frames (N,) has; and the names."""
     place: dict[str, int] = {}  # of each name as it is written, in the order they are met
     observed = [place.setdefault(name, len(place)) for name in frames.tolist()]
     each = [plain(name) for name in place]
@@ -163,7 +163,7 @@ def _plain_codes(frames: NDArray[Any]) -> tuple[Ints, list[str]]:
 
 
 def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
-    """A frame and all that are ever above it."""
+    """Return a frame and all frames that are ever above it."""
     reached, open_ = set[str](), {frame}
     while open_:
         here = open_.pop()
@@ -174,7 +174,7 @@ def upward(frame: str, parents: Mapping[str, Sequence[str]]) -> set[str]:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a frame is in the fixed frame, at each of T times."""
+    """Pose of a frame in the fixed frame, at each of T times."""
 
     rotation: F64  # (T, 3, 3)
     translation_m: F64  # (T, 3)
@@ -183,7 +183,7 @@ class Placement:
 
     @classmethod
     def nowhere(cls, count: int) -> Placement:
-        """In the fixed frame itself, until `fill` says otherwise."""
+        """Return the fixed frame itself, until `fill` sets another pose."""
         return cls(
             np.tile(np.eye(3), (count, 1, 1)),
             np.zeros((count, 3)),
@@ -227,7 +227,7 @@ class Tree:
     _numbers: dict[str, int] = field(default_factory=dict)  # frame -> its number
 
     def place(self, frame: str, times: Sequence[Ints]) -> Placement:
-        """Where `frame` is in the fixed frame at these times of each segment."""
+        """Return the pose of `frame` in the fixed frame at these times of each segment."""
         source, fixed = self._number(frame), self._number(self.frames.fixed)
         count = sum(map(len, times))
         out = Placement.nowhere(count)
@@ -256,7 +256,7 @@ class Tree:
         ]
 
     def way(self, frame: str, time: Sequence[Ints]) -> list[tuple[str, str, int, int]]:
-        """The transforms from `frame` to the fixed frame at one time.
+        """Return the transforms from `frame` to the fixed frame at one time.
 
         Each by its topic, the frame that it places, its row in `edges.topics["TOPIC FRAME"]` and
         its stamp (ns).
@@ -280,7 +280,7 @@ class Tree:
         ]
 
     def _hold_above(self, frame: str, times: Sequence[Ints]) -> dict[int, _Transform]:
-        """The transforms of all frames above this one and the fixed one, by their numbers."""
+        """Hold the transforms of all frames above this one and the fixed one, by their numbers."""
         children = sorted(self.edges.only({frame, self.frames.fixed}).parents)
         return {self._number(child): self._hold(child, times) for child in children}
 
@@ -314,7 +314,7 @@ class Tree:
     def _compose(
         self, out: Placement, rows: Ints, transforms: dict[int, _Transform], way: list[int]
     ) -> tuple[F64, F64]:
-        """The transforms along a way as one: rotation (N, 3, 3) and translation (N, 3)."""
+        """Compose the transforms along a way: rotation (N, 3, 3) and translation (N, 3)."""
         rotation, translation = np.tile(np.eye(3), (len(rows), 1, 1)), np.zeros((len(rows), 3))
         for frame in way:
             one = transforms[frame]
@@ -332,7 +332,7 @@ class Tree:
         return f"no transform from {self._name(other[-1])} to {self._name(up[-1])} yet"
 
     def _hold(self, child: str, times: Sequence[Ints]) -> _Transform:
-        """A frame's transform at these times: of `/tf` where there is one, else the static."""
+        """Hold a frame's transform at these times: that of `/tf` if there is one, else static."""
         moving = self._of(f"{self.frames.topic} {child}", times, self.frames.max_age_s)
         still = self._of(f"{self.frames.static_topic} {child}", times, None)
         if moving is None or still is None:
@@ -391,7 +391,7 @@ def rotations(x: F64, y: F64, z: F64, w: F64) -> F64:
 
 
 def _way(frame: int, parent: Mapping[int, int]) -> list[int]:
-    """From a frame up to the top; a loop ends where it closes."""
+    """Return the frames from this one up to the top; a loop ends where it closes."""
     way = [frame]
     while way[-1] in parent and parent[way[-1]] not in way:
         way.append(parent[way[-1]])

@@ -41,14 +41,14 @@ class InputColumns:
         }
 
     def column(self, name: str, key: str) -> FieldColumn:
-        """A field of an input as it was read."""
+        """Return a field of an input as it was read."""
         source = self.by_name[name]
         fields = self.topics[source.topic].fields
         path, place = element_of(source.fields[key])
         return fields[path] if place is None else said_in(fields, source.fields[key])
 
     def numbers(self, name: str, key: str) -> F64:
-        """A field of an input, one number a message (N,)."""
+        """Return a field of an input, one number a message (N,)."""
         if name == "pose" and key in ("x_m", "y_m"):
             return self._numbers(name, key) - float(self.origin_m["xy".index(key[0])])
         return self._numbers(name, key)
@@ -86,7 +86,7 @@ class InputColumns:
         return np.asarray(found, np.float64)
 
     def no_estimate(self, name: str, key: str) -> Bools:
-        """Which messages (N,) say themselves that they have no estimate of this field."""
+        """Return which messages (N,) report that they have no estimate of this field."""
         source = self.by_name[name]
         columns = self.topics[source.topic]
         none = np.zeros(len(columns), np.bool_)
@@ -95,8 +95,7 @@ class InputColumns:
         return none
 
     def unestimated(self) -> Iterator[tuple[str, str, int, str]]:
-        """Of each input that has messages without an estimate: its name, the field, how many
-        messages, and how they say so."""
+        """List inputs that have messages without an estimate: name, field, count, and how."""
         for name, source in self.by_name.items():
             columns = self.topics[source.topic]
             rules = (rule for path in source.fields.values() for rule in _said_of(source, path))
@@ -105,7 +104,7 @@ class InputColumns:
                     yield name, rule.values[0], count, rule.words
 
     def texts(self, name: str) -> list[str]:
-        """The text of an input, one a message."""
+        """Return the text of an input, one a message."""
         return [str(text) for text in np.asarray(self.column(name, "text"), object)]
 
     @cached_property
@@ -121,7 +120,7 @@ class InputColumns:
         return fixes.poses(source.origin_deg, source.max_std_m, source.track_m)
 
     def _heading_at(self, time_ns: Ints) -> F64:
-        """The heading (N,) received last at these log times; NaN where none is known."""
+        """Return the heading (N,) received last at these log times; NaN if none is known."""
         source = self.by_name["heading"]
         said_ns, yaw = self.topics[source.topic].log_time_ns, self.numbers("heading", "yaw_rad")
         order = np.argsort(said_ns, kind="stable")
@@ -159,7 +158,7 @@ class InputColumns:
         return np.asarray(turned + at.translation_m[:, :2] - self.origin_m)
 
     def frames_of(self, name: str) -> list[str]:
-        """The frame that each message of an input is in; empty where messages do not say."""
+        """Return the frame of each message of an input; empty if messages do not say."""
         source = self.by_name.get(name)
         fields = {} if source is None else self.topics[source.topic].fields
         path = None if source is None else frame_path(source, fields)
@@ -180,8 +179,10 @@ class InputColumns:
 
 
 def estimate_reduction(sources: Iterable[Input], fields: Collection[str]) -> Reduction | None:
-    """Return what makes of a topic's messages whether they have an estimate of what these inputs
-    take from them; None if messages with these fields never say so."""
+    """Build the reduction that finds messages without an estimate of what these inputs take.
+
+    None if messages with these fields never say so.
+    """
     rules = list(
         dict.fromkeys(
             rule
@@ -205,7 +206,7 @@ def _said_of(source: Input, path: str) -> list[Convention]:
 
 
 def _key(rule: Convention) -> str:
-    """A convention among the columns of its topic; names of fields hold no space."""
+    """Name a convention among its topic's columns; names of fields hold no space."""
     return f"no estimate of {rule.values[0]}"
 
 

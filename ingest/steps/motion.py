@@ -37,7 +37,7 @@ class PoseSeries:
 
     @classmethod
     def of(cls, stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> PoseSeries:
-        """Those that are finite; of equal stamps the last."""
+        """Keep the finite poses; of equal stamps the last."""
         keep = np.isfinite(x_m) & np.isfinite(y_m) & np.isfinite(yaw_rad)
         keep[:-1] &= np.diff(stamp_ns) > 0
         return cls(stamp_ns[keep], x_m[keep], y_m[keep], yaw_rad[keep])
@@ -83,7 +83,7 @@ def motion_at(
     max_jump_m: float,
     fastest_mps: float = math.inf,
 ) -> Motion:
-    """The motion at ticks (T,) by the poses of the `window_s` before each tick's latest one.
+    """Compute the motion at ticks (T,) by the poses of the `window_s` before each one's latest.
 
     A step of more than `max_jump_m` is a jump, and so is one that a robot of `fastest_mps` does not
     drive in the time of the step and a window more: stamps jitter, and it may be faster than asked.
@@ -119,7 +119,7 @@ def motion_at(
 
 
 def _fill(out: Motion, rows: Ints, poses: PoseSeries, heading: F64, begin: Ints, end: Ints) -> None:
-    """The slopes of the poses from `begin` to before `end`, into these rows."""
+    """Fit the slopes of the poses from `begin` to before `end`, into these rows."""
     most = int((end - begin).max())
     at = begin[:, None] + np.arange(most)  # (R, P)
     inside: Bools = at < end[:, None]

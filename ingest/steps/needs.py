@@ -1,4 +1,4 @@
-"""What a profile needs of a recording: fields to read, and why a recording does not fit."""
+"""Needs of a profile: the fields that it reads, and why a recording does not fit."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OTHER_FIELDS = (
 def read_topics(
     recording: Recording, profile: Profile, *, reduced: bool = True
 ) -> dict[str, TopicColumns]:
-    """The columns that a profile needs of a recording.
+    """Read the columns that a profile needs of a recording.
 
     Where header stamps run at another pace than log time, `/clock` is read too: it says which.
     `reduced`: scans as clearance, messages as custom signals and images as their layout alone,
@@ -72,7 +72,7 @@ def read_topics(
 
 
 def _told(profile: Profile, available: Mapping[str, Any]) -> str:
-    """The topics of a recording; of very many, those that the profile could use."""
+    """List a recording's topics; of very many, only those that the profile could use."""
     types = {source.type for source in profile.sources.values()}
     usable = [topic for topic in sorted(available) if available[topic].type in types]
     topics = sorted(available) if len(available) <= MAX_TOLD else usable[:MAX_TOLD]
@@ -82,9 +82,11 @@ def _told(profile: Profile, available: Mapping[str, Any]) -> str:
 
 
 def as_recorded(profile: Profile, available: Mapping[str, Any]) -> Profile:
-    """The profile as a recording with these topics is read by it, `available` as `wanted_fields`
-    has it: without a lidar where its scan is optional and no message of it can be read, so that
-    rows with and without clearance are never of one task."""
+    """Return the profile as it reads a recording with these topics.
+
+    `available` is as in `wanted_fields`. It has no lidar if its scan is optional and no message of
+    it can be read, so that rows with and without clearance never share a task.
+    """
     scan = profile.inputs.scan
     if scan is None or not scan.optional:
         return profile
@@ -146,8 +148,10 @@ def wanted_fields(
 def reductions(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> dict[str, Reduction]:
-    """topic -> what is made of its messages as they are read: clearance, custom signals, what a
-    camera's images are, and which messages say that they have no estimate."""
+    """Map each topic to the reduction of its messages as they are read.
+
+    Reductions make clearance, custom signals, images' layouts, and which messages have no estimate.
+    """
     parts: dict[str, list[Reduction]] = {}
     has = {topic: {leaf.path.removesuffix("[]") for leaf in some} for topic, some in leaves.items()}
     inputs: dict[str, list[Input]] = {}
@@ -183,7 +187,7 @@ def _both(parts: Sequence[Reduction]) -> Reduction:
 
 
 def field_paths(source: Input) -> list[str]:
-    """The field paths that an input reads."""
+    """Return the field paths that an input reads."""
     paths: list[str] = []
     for key, field in source.fields.items():
         if key == "pressed":
@@ -239,8 +243,10 @@ def input_problems(
 
 
 def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
-    """The optional inputs without their topic where a topic of their type is not used: of one
-    robot, or after an update, it may have another name. Plain texts and numbers may be anything.
+    """Note optional inputs without their topic if an unused topic has their type.
+
+    On one robot, or after an update, it may have another name. Plain texts and numbers may be
+    anything.
     """
     used = profile.topics
     found = []
@@ -254,8 +260,10 @@ def renamed_inputs(profile: Profile, available: Mapping[str, Any]) -> list[str]:
 
 
 def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> str:
-    """A question about a topic that may be the one that is missing, or "": one that is spelled
-    nearly like it, or the one of its type, `kind`, that is spelled most like it."""
+    """Ask about a topic that may be the missing one, or return "".
+
+    It is spelled nearly like it, or is the one of its type, `kind`, that is spelled most like it.
+    """
     if topic in available:
         return ""
     alike = [name for name, info in available.items() if kind is not None and info.type == kind]
@@ -266,7 +274,7 @@ def near(topic: str, available: Mapping[str, Any], kind: str | None = None) -> s
 
 
 def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Leaf]) -> list[str]:
-    """The fields of an input or signal that its topic does not have, and what it has."""
+    """Describe the fields that an input's or signal's topic lacks, and those that it has."""
     if isinstance(source, CustomSignal):
         problem = source.problem(leaves)
         return [f"`{name}.path`: {source.topic}: {problem}"] if problem else []
@@ -282,7 +290,7 @@ def _field_problems(name: str, source: Input | CustomSignal, leaves: Sequence[Le
 def _transform_problems(
     profile: Profile, available: Mapping[str, Any], leaves: Mapping[str, Sequence[Leaf]]
 ) -> list[str]:
-    """Whether there are transforms at all, where the pose is to come from them."""
+    """Describe missing transforms if the pose is to come from them."""
     pose, frames = profile.inputs.pose, profile.frames
     if frames is None:
         return []

@@ -1,4 +1,4 @@
-"""Which goal and which plan are in force at each tick, and the signals that follow from them."""
+"""Goal and plan in force at each tick, and the signals that follow from them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Routing:
 
     @classmethod
     def none(cls, ticks: int) -> Routing:
-        """No goal and no plan, ever."""
+        """Return a routing without any goal or plan."""
         nowhere = np.full(ticks, -1, np.int64)
         return cls(np.zeros((0, 2)), [], nowhere, nowhere, nowhere)
 
@@ -58,7 +58,7 @@ class Routing:
         return RouteView(ahead, remaining, offset)
 
     def signals(self, task: Task, goal: Ints, plan: Ints, now: Signals) -> Signals:
-        """The route's signals for N steps that have `goal[i]` and `plan[i]` in force."""
+        """Compute the route's signals for N steps with `goal[i]` and `plan[i]` in force."""
         seen = self.view(task, plan, now)
         distance = np.zeros(len(goal))
         aimed = np.flatnonzero(goal >= 0)
@@ -80,8 +80,10 @@ class Routing:
         }
 
     def progress_m(self, task: Task, plan: Ints, now: Signals, after: Signals) -> F64:
-        """How much shorter plan `plan[i]` became from `now` to `after`; without one, how far
-        the robot moved forward (along the mean of its two headings)."""
+        """Return how much shorter plan `plan[i]` became from `now` to `after`.
+
+        Without a plan, how far the robot moved forward (along the mean of its two headings).
+        """
         shorter: F64 = now["route_remaining_m"] - self.view(task, plan, after).remaining_m
         turn = after["pose_yaw_rad"] - now["pose_yaw_rad"]
         heading = now["pose_yaw_rad"] + ((turn + np.pi) % (2 * np.pi) - np.pi) / 2
@@ -100,7 +102,7 @@ def same_goals(goals_m: F64, moved_m: float) -> Ints:
 
 
 def plan_problems(plans_m: Sequence[F64]) -> list[str]:
-    """What is wrong with each plan by itself, or ""."""
+    """Describe what is wrong with each plan by itself; "" if nothing is."""
     problems = []
     for plan in plans_m:
         if not len(plan):
@@ -112,7 +114,7 @@ def plan_problems(plans_m: Sequence[F64]) -> list[str]:
 
 
 def plan_ends(plans_m: Sequence[F64]) -> F64:
-    """The last point of each plan (P, 2); NaN where it has none."""
+    """Return the last point of each plan (P, 2); NaN if it has none."""
     ends = np.full((len(plans_m), 2), np.nan)
     for index, plan in enumerate(plans_m):
         if len(plan):

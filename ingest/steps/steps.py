@@ -56,8 +56,7 @@ class Steps:
         return len(self.segment)
 
     def without_values(self) -> Steps:
-        """What is known of the recording as a whole: what is known at each tick, most of the
-        memory, is gone."""
+        """Keep what is known of the whole recording, and free what is known per tick."""
         ticks, flags = np.zeros(0, np.int64), np.zeros(0, np.bool_)
         return replace(
             self,
@@ -81,7 +80,7 @@ class Steps:
 
 
 def steps_of(profile: Profile, topics: Mapping[str, TopicColumns]) -> Steps:
-    """All steps of a recording from its topics' columns (those `wanted_fields` asks for).
+    """Make all steps of a recording from its topics' columns (those `wanted_fields` asks for).
 
     Raises:
         RecordingError: the alignment clock is `header.stamp` and no topic has one, or a field is

@@ -41,7 +41,7 @@ _SETTINGS = ("kind", "timing", "priority", "uncertain")
 def shipped(
     constants: Mapping[str, float] | None = None, kind: Kind = "outcome"
 ) -> dict[str, Condition]:
-    """The conditions of a kind that come with Restock, by name: `ingest/task/conditions/*.sql`.
+    """Read the conditions of a kind that come with Restock: `ingest/task/conditions/*.sql`.
 
     `constants` are `Profile.constants` of the robot whose steps they label; None: of the stand-in,
     with a profile's default noise.
@@ -60,7 +60,7 @@ def shipped(
 
 
 def settings_of(text: str) -> dict[str, Any]:
-    """`sql`, `doc`, and what else of `let`, `probability`, `kind`, `timing`, `priority`, …"""
+    """Parse `sql`, `doc` and the other settings of a condition's file."""
     settings: dict[str, Any] = {}
     doc: list[str] = []
     parts: dict[str, list[str]] = {}
@@ -90,7 +90,7 @@ def settings_of(text: str) -> dict[str, Any]:
 
 
 def _value(text: str) -> str | int | list[str | float]:
-    """A whole number, `0.2 to 0.8`, or a word; what is none, the type check refuses by its key."""
+    """Parse a whole number, `0.2 to 0.8`, or a word; the type check refuses others by key."""
     if text.lstrip("-").isdigit():
         return int(text)
     if " to " not in text:
@@ -100,7 +100,7 @@ def _value(text: str) -> str | int | list[str | float]:
 
 
 def with_files(document: dict[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """A profile's TOML with the text of each `[[condition]] file = "…"` in place of its name.
+    """Replace each `[[condition]] file = "…"` of a profile's TOML by the text of that file.
 
     A file may say `-- timing: pre` and `-- priority: 45` in comments, as the shipped ones do;
     what the TOML says goes first. Its name must stay in the profile's folder: profiles are

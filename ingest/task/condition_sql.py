@@ -1,4 +1,4 @@
-"""What the SQL of a condition may say: an expression over the steps of its episode, nothing else.
+"""Check of a condition's SQL: an expression over the steps of its episode, and nothing else.
 
 Profiles are passed between strangers, so a condition is read before it is run: no query inside,
 no other table, no function that looks outside the row's data (files, settings, time, chance) or
@@ -62,14 +62,16 @@ _BACKWARD = {
 
 
 def select_of(columns: str, source: str = "steps") -> str:
-    """The query that computes such columns over the table `steps`, or over what is made of it."""
+    """Build the query that computes columns over the table `steps`, or over what is made of it."""
     return f"SELECT {columns} FROM {source} {WINDOW} ORDER BY row_"
 
 
 @cache
 def sandbox() -> duckdb.DuckDBPyConnection:
-    """A database for all conditions, of which each use takes a `cursor`: opening one takes longer
-    than the labels of an episode."""
+    """Return the database of all conditions, of which each use takes a `cursor`.
+
+    Opening one takes longer than the labels of an episode.
+    """
     atexit.register(sandbox.cache_clear)  # nanobind complains of what outlives its module
     connection = duckdb.connect(config=SANDBOX)
     connection.execute("SET TimeZone = 'UTC'").fetchall()  # not the machine's
@@ -109,7 +111,7 @@ def _read(parsed: dict[str, Any], timing: str) -> str | None:
 
 
 def _plain_query(node: dict[str, Any]) -> bool:
-    """Whether the query around the expression is still the one that we wrote."""
+    """Return whether the query around the expression is still the one that we wrote."""
     source = node["from_table"]
     return (
         source["type"] == "BASE_TABLE"
@@ -182,7 +184,7 @@ def _column(part: dict[str, Any]) -> str:
 
 
 def _constant(part: dict[str, Any] | None) -> bool:
-    """Whether it is a number that is not below zero."""
+    """Return whether it is a number that is not negative."""
     if part is None or part["class"] != "CONSTANT":
         return False
     return str(part["literal"]["text"]).isdigit()
@@ -239,7 +241,7 @@ def not_an_expression(sql: str) -> str | None:
 
 @lru_cache(maxsize=1024)
 def not_repeatable(sql: str) -> str | None:
-    """What in an expression may come out otherwise on the same rows, or None.
+    """Say what in an expression may differ between runs on the same rows, or return None.
 
     SQL that cannot be read is `not_an_expression`'s to refuse.
     """
@@ -261,7 +263,7 @@ def not_repeatable(sql: str) -> str | None:
 
 
 def _follows_order(window: dict[str, Any]) -> bool:
-    """Whether a window without ORDER BY gives what the order of the rows makes of it."""
+    """Return whether a window without ORDER BY depends on the order of the rows."""
     if any(window[edge].endswith("_ROWS") for edge in ("start", "end")):
         return True
     of_order = window["type"] != "WINDOW_AGGREGATE" or window["function_name"].lower() in _OF_ORDER

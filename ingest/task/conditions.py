@@ -79,7 +79,7 @@ class Condition(Checked, frozen=True):
     kind: Kind = "outcome"  # "exposure": a situation, whatever the outcome
 
     def with_constants(self, constants: Mapping[str, float]) -> Condition:
-        """The condition of one robot: with those of the constants that its SQL names; its own win.
+        """Return the condition of one robot, with the constants that its SQL names; its own win.
 
         Where they are a robot's, times such as `{1.6 s}`, and ways such as `{0.2 m}` at its highest
         speed, become numbers of steps.
@@ -122,19 +122,19 @@ class Condition(Checked, frozen=True):
 
 
 def in_steps(sql: str, constants: Mapping[str, float]) -> str:
-    """SQL with times, and ways at the robot's highest speed, as numbers of its steps, 1 or more."""
+    """Convert times, and ways at the robot's highest speed, in SQL to steps, at least 1."""
     period_s = constants["control_period_s"]
     a_step = {"s": period_s, "m": period_s * constants["fastest_mps"]}
     return _LENGTH.sub(lambda found: str(max(round(float(found[1]) / a_step[found[2]]), 1)), sql)
 
 
 def of_kind(conditions: Iterable[Condition], kind: Kind) -> list[Condition]:
-    """The conditions of one kind, in their order."""
+    """Select the conditions of one kind, in their order."""
     return [condition for condition in conditions if condition.kind == kind]
 
 
 def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Condition]:
-    """The conditions of a kind of a manifest row; no exposures in one of an older Restock.
+    """Read a kind's conditions from a manifest row; one of an older Restock has no exposures.
 
     Raises:
         msgspec.MsgspecError: a newer Restock wrote them.
@@ -147,8 +147,9 @@ def stored(manifest: Mapping[str, Any], kind: Kind = "outcome") -> list[Conditio
 def unseen(
     conditions: Iterable[Condition], signals: Collection[str] = LIDAR_SIGNALS
 ) -> dict[str, list[str]]:
-    """The conditions that no step can be told by where these signals are not known, and which of
-    them each names: by default of a robot without a lidar.
+    """Return the conditions that need signals that are unknown, and which each names.
+
+    By default those of a robot without a lidar.
 
     A condition that names one is null at every step, whatever its SQL makes of a null.
     """
@@ -159,7 +160,7 @@ def unseen(
 def unknown_rows(
     conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
 ) -> list[dict[str, Any]]:
-    """What a robot's steps do not tell, as manifests hold it.
+    """Return what a robot's steps do not show, as manifests hold it.
 
     Without a lidar, or with the path that was driven as their plan, as goals in hindsight have it.
     """
@@ -187,7 +188,7 @@ def unknown_rows(
 def reported(
     conditions: Iterable[Condition], *, lidar: bool, driven_plan: bool = False
 ) -> list[Condition]:
-    """The conditions that such steps can be told by."""
+    """Return the conditions that such steps can show."""
     conditions = list(conditions)
     rows = unknown_rows(conditions, lidar=lidar, driven_plan=driven_plan)
     lost = {row["condition"] for row in rows}
@@ -221,7 +222,7 @@ def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
 
 
 def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, F32]:
-    """The probability of every condition that has a rule for it, over steps as `label` takes them.
+    """Compute the probability of every condition with a rule for it, over steps as in `label`.
 
     NaN where the rule gives null.
 
@@ -234,7 +235,7 @@ def probabilities(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str,
 def label_with_probabilities(
     steps: pa.Table, conditions: Sequence[Condition]
 ) -> tuple[dict[str, Bools], dict[str, F32]]:
-    """What `label` and `probabilities` give, their common parts worked out once.
+    """Compute `label` and `probabilities` together, their common parts once.
 
     Raises:
         ConfigError: as they do.
@@ -272,7 +273,7 @@ def _probabilities(columns: Columns, conditions: Sequence[Condition]) -> dict[st
 
 
 def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
-    """What every `let` of a condition gives at each step, (N,): what a rule goes by; NaN for null.
+    """Compute every `let` of a condition at each step, (N,); NaN for null.
 
     Raises:
         ConfigError: its SQL does not run, or gives other than numbers.
@@ -295,7 +296,7 @@ def let_values(steps: pa.Table, condition: Condition) -> dict[str, F64]:
 def too_near_to_call(
     probable: Mapping[str, F32], conditions: Sequence[Condition]
 ) -> dict[str, Bools]:
-    """Where the probability of each condition that has one lies within its `uncertain` band."""
+    """Return where each condition's probability lies within its `uncertain` band."""
     bands = {condition.name: condition.uncertain for condition in conditions}
     return {
         name: (values >= bands[name][0]) & (values <= bands[name][1])
@@ -306,7 +307,7 @@ def too_near_to_call(
 def _evaluate(
     steps: pa.Table, conditions: Sequence[Condition], which: Sequence[Expression]
 ) -> Columns:
-    """These expressions of each condition, of those it has, over the steps."""
+    """Evaluate these expressions over the steps, for each condition that has them."""
     requested = [(c, part) for c in conditions for part in which if part == "sql" or c.probability]
     together: dict[str, list[tuple[Condition, Expression]]] = {}  # that select from the same table
     for condition, part in requested:
@@ -360,7 +361,7 @@ def _say_why(error: duckdb.Error, steps: pa.Table, where: str, limit_s: float) -
 
 
 def _refuse(condition: Condition, which: Expression, columns: Sequence[str]) -> None:
-    """Raises ConfigError where its SQL says what no condition may."""
+    """Raise ConfigError if its SQL contains what no condition may."""
     taken = {"row_", *(name.lower() for name in columns)}
     for name in (*condition.constants, *condition.let):
         if name.lower() in taken:
@@ -382,7 +383,7 @@ def _where(condition: Condition, which: Expression) -> str:
 
 
 def _source(condition: Condition) -> str:
-    """What its expressions select from: the steps, its constants, and its `let`s one by one."""
+    """Build what its expressions select from: the steps, constants, and `let`s one by one."""
     source = "steps"
     if condition.constants:
         named = (f'{float(value)!r}::DOUBLE AS "{n}"' for n, value in condition.constants.items())
@@ -393,7 +394,7 @@ def _source(condition: Condition) -> str:
 
 
 def runnable(steps: pa.Table, conditions: Sequence[Condition]) -> list[Condition]:
-    """The conditions whose SQL runs over steps with these columns; `label` says why another not."""
+    """Return the conditions whose SQL runs over steps with these columns."""
     run = []
     for condition in conditions:
         with suppress(ConfigError):
@@ -448,7 +449,7 @@ def _interrupted_after(connection: duckdb.DuckDBPyConnection, limit_s: float) ->
 
 
 def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[str]:
-    """The one condition of each row: the outcome of lowest priority number, or `nominal`."""
+    """Return each row's one condition: the outcome of lowest priority number, or `nominal`."""
     outcomes = of_kind(conditions, "outcome")
     ordered = sorted(outcomes, key=lambda condition: (condition.priority, condition.name))
     if not ordered:
@@ -460,7 +461,7 @@ def primary(labels: dict[str, Bools], conditions: Sequence[Condition]) -> list[s
 
 
 def held(column: pa.ChunkedArray, names: Sequence[str]) -> dict[str, Bools]:
-    """Which rows (N,) of a column of lists name each of these; a null names none."""
+    """Return which rows (N,) of a column of lists name each of these; a null names none."""
     import pyarrow.compute as pc  # slow to import
 
     lists = column.combine_chunks()

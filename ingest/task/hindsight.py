@@ -47,7 +47,7 @@ class GoalRules(Checked, frozen=True):
     longest_m: Annotated[float, Meta(gt=0)] = 10.0  # from start to goal
 
     def at_least_m(self, task: Task) -> float:
-        """How far a goal must be from where its mission starts."""
+        """Return how far a goal must be from where its mission starts."""
         return self.shortest_m or _SHORTEST * task.goal_radius_m
 
 
@@ -87,7 +87,7 @@ class Missions:
 def missions(
     rules: GoalRules, task: Task, xy_m: F64, stamp_ns: Ints, located: Bools, leg: Ints
 ) -> Missions:
-    """The missions of a drive.
+    """Split a drive into missions.
 
     Args:
         rules: how long, how far.
@@ -181,7 +181,7 @@ class _Cutting:
             start = self._add(start, goal, why, last=goal == stop)
 
     def _way_point(self, start: int, away: F64) -> tuple[int, str]:
-        """Where to end a drive that goes on: the most visited place, or as far as it may go."""
+        """Return where to end a drive that goes on: the most visited place, or the limit."""
         visits = self.visits[start : start + len(away)]
         visits = np.where(away >= max(self.shortest_m, away.max() / 2), visits, 0)
         most = int(visits.max())
@@ -207,7 +207,7 @@ class _Cutting:
         return end if last else max(arrival, start + 1)
 
     def _place(self, goal: F64) -> F64:
-        """The goal, or one of an earlier mission that is the same place."""
+        """Return the goal, or the goal of an earlier mission at the same place."""
         if self.goals:
             gap = np.hypot(*(np.array(self.goals) - goal).T)
             if gap.min() <= self.radius_m / 2:
@@ -232,7 +232,7 @@ class _Cutting:
         return np.cumsum(edges)[:count] > 0
 
     def _visits(self) -> Ints:
-        """How often (T,) the robot came to the place that it is at, in the whole recording."""
+        """Count how often (T,) the robot came to its current place in the whole recording."""
         cell = np.floor(self.xy_m / (2 * self.radius_m)).astype(np.int64)
         _, place = np.unique(cell, axis=0, return_inverse=True)
         order = np.lexsort([np.arange(len(place)), place])
@@ -244,7 +244,7 @@ class _Cutting:
 
 
 def driven_m(xy_m: F64, leg: Ints, band_m: float) -> F64:
-    """How far the robot has driven (N,), in steps of more than `band_m`: noise drives nowhere."""
+    """Return the distance driven (N,), counting only steps of more than `band_m`, not noise."""
     arc, driven, here = 0.0, [], (math.nan, math.nan, -1)
     for x, y, number in zip(xy_m[:, 0].tolist(), xy_m[:, 1].tolist(), leg.tolist(), strict=True):
         step = math.hypot(x - here[0], y - here[1])
@@ -264,7 +264,7 @@ def _weights(chosen: Bools, order: Ints) -> F64:
 
 
 def route_of(driven_m: F64, goal_m: F64, spacing_m: float) -> F64:
-    """The driven way (N, 2) as a route (P, 2): points about `spacing_m` apart, no loops, the goal.
+    """Return the driven way (N, 2) as a route (P, 2): about `spacing_m` apart, without loops.
 
     Where the way comes back to a point, what lies between is left out.
     """

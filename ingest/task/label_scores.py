@@ -25,18 +25,18 @@ PRIMARY = ("recovery", "near_collision", "wheel_slip", "blocked_aisle")
 
 
 def truth_text(names: Iterable[str]) -> str:
-    """The true conditions of a step as one text: sorted, commas between; "nominal" for none."""
+    """Join a step's true conditions to one text: sorted, commas between; "nominal" for none."""
     return ",".join(sorted(set(names))) or NOMINAL
 
 
 def true_names(text: str) -> frozenset[str]:
-    """The true conditions that a text names: none for "nominal"."""
+    """Return the true conditions that a text names: none for "nominal"."""
     named = frozenset(part.strip() for part in text.split(","))
     return named - {NOMINAL, ""}
 
 
 def primary_of(text: str) -> str:
-    """The one condition of a text that names all, for a reader that needs one; or "nominal"."""
+    """Return the one condition of a text that names all, for readers that need one."""
     named = true_names(text)
     for name in (*PRIMARY, *sorted(named)):
         if name in named:
@@ -46,7 +46,7 @@ def primary_of(text: str) -> str:
 
 @dataclass(frozen=True)
 class LabelScore:
-    """One label against the truth, over the transitions whose truth is known: counts."""
+    """Counts of one label against the truth, over the transitions whose truth is known."""
 
     condition: str
     known: int  # transitions whose truth is known
@@ -60,27 +60,27 @@ class LabelScore:
 
     @property
     def precision(self) -> float | None:
-        """Of the transitions labelled, those that truly were; None: the label was never given."""
+        """Return the share of labelled transitions that truly were; None without a label."""
         return _share(self.agreed, self.labelled)
 
     @property
     def recall(self) -> float | None:
-        """Of the transitions that truly were, those labelled; None: it was never true."""
+        """Return the share of true transitions that were labelled; None if it was never true."""
         return _share(self.agreed, self.support)
 
     @property
     def event_precision(self) -> float | None:
-        """Of the events of the label, those that are right; None: there is none."""
+        """Return the share of the label's events that are right; None if there is none."""
         return _share(self.event_right, self.event_labelled)
 
     @property
     def event_recall(self) -> float | None:
-        """Of the true events, those that are found; None: there is none."""
+        """Return the share of true events that are found; None if there is none."""
         return _share(self.event_found, self.event_support)
 
     @property
     def shortfall(self) -> str:
-        """By how much it falls short of .8, and from how many rows; "" where it does not."""
+        """Say by how much it falls short of .8, and from how many rows; "" if it does not."""
         short = [
             f"{name} {GOOD - value:.2f} short of {GOOD}"
             for name, value in (("precision", self.precision), ("recall", self.recall))
@@ -142,7 +142,7 @@ def score(
 
 
 def events(holds: Bools, joined: Bools) -> Ints:
-    """The maximal runs of consecutive steps that hold, (E, 2): first step and the one after last.
+    """Find maximal runs of consecutive steps that hold, (E, 2): first step and one after last.
 
     `joined` (N,) says which steps follow the one before in the same episode.
     """
@@ -152,7 +152,7 @@ def events(holds: Bools, joined: Bools) -> Ints:
 
 
 def widened(holds: Bools, joined: Bools, reach: int) -> Bools:
-    """Whether it holds within `reach` steps of each step, in the same stretch of steps, (N,)."""
+    """Return whether it holds within `reach` steps of each step, in the same stretch, (N,)."""
     wide = holds.copy()
     for _ in range(reach):
         ahead, behind = np.zeros_like(wide), np.zeros_like(wide)
@@ -163,13 +163,13 @@ def widened(holds: Bools, joined: Bools, reach: int) -> Bools:
 
 
 def touched(runs: Ints, holds: Bools) -> Bools:
-    """Which runs (E, 2) have a step that holds, (E,)."""
+    """Return which runs (E, 2) have a step that holds, (E,)."""
     total = np.concatenate([[0], np.cumsum(holds)])
     return np.asarray(total[runs[:, 1]] > total[runs[:, 0]], np.bool_)
 
 
 def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[LabelScore]:
-    """How well every condition of each transition agrees with the true ones, for these labels.
+    """Score how well each transition's conditions agree with the true ones, for these labels.
 
     `names` are of outcomes; the exposures that a row or the truth names are scored too.
     """
@@ -186,7 +186,7 @@ def label_scores(rows: pa.Table, names: Iterable[str], period_s: float) -> list[
 
 
 def exposures_named(rows: pa.Table) -> list[str]:
-    """The exposures that labels or truth of rows name, sorted; none in rows of an older store."""
+    """Return the exposures that labels or truth of rows name, sorted; none in older rows."""
     if not {"exposures", "true_exposure"} <= set(rows.column_names):
         return []
     labelled = set(rows["exposures"].combine_chunks().flatten().unique().to_pylist())
@@ -195,7 +195,7 @@ def exposures_named(rows: pa.Table) -> list[str]:
 
 
 def pooled(scores: Iterable[LabelScore]) -> list[LabelScore]:
-    """The scores of several recordings as those of one, by condition."""
+    """Add up the scores of several recordings, by condition."""
     sums: dict[str, list[int]] = {}
     for one in scores:
         name, *counts = astuple(one)

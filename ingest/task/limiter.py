@@ -69,7 +69,7 @@ class Limits:
 
     @classmethod
     def of(cls, task: Task, robot: Robot | None = None, given: Limiter | None = None) -> Limits:
-        """The limits of a robot: what is `given`, and the rest from its task and `[robot]`."""
+        """Return a robot's limits: what is `given`, and the rest from its task and `[robot]`."""
         given, robot = given or Limiter(), robot or Robot()
         largest = np.abs(np.asarray(task.actions)).max(axis=0).tolist()
         accel = robot.max_accel_mps2, robot.max_yaw_accel_radps2
@@ -104,13 +104,13 @@ class Limits:
 
     @property
     def reach_m(self) -> float:
-        """From what the robot turns about to the farthest corner of its outline."""
+        """Return the distance from the turning point to the farthest corner of the outline."""
         ahead = self.body.length_m / 2 + abs(self.axle_x_m)
         return float(np.hypot(ahead, self.body.width_m / 2))
 
     @property
     def way_m(self) -> float:
-        """As far as it looks along an arc, as the outline's fastest point drives."""
+        """Return how far it looks along an arc, as the outline's fastest point drives."""
         fast = self.fastest[0] + self.fastest[1] * self.reach_m
         stand_s = max(self.fastest[0] / self.brake[0], self.fastest[1] / self.brake[1])
         return self.stop_m + fast * (self.reaction_s + stand_s / 2)
@@ -118,7 +118,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Limited:
-    """What may be driven, and the rule that made it so."""
+    """Allowed commands, and the rule that limited each."""
 
     command: F64  # (N, 2): speed m/s, yaw rate rad/s
     rule: Ints  # (N,) of RULES
@@ -136,7 +136,7 @@ def limit(
     previous: F64,
     unknown: Bools | None = None,
 ) -> Limited:
-    """What of the proposed commands may be driven.
+    """Limit the proposed commands to what may be driven.
 
     No speed and no yaw rate grows or changes its sign by it. The nearer something is, the slower;
     what was allowed is allowed again as it is.
@@ -173,7 +173,7 @@ def _lower(command: F64, allowed: F64, rule: Ints, by: int) -> tuple[F64, Ints]:
 
 
 def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
-    """The share (N,) of each command that can come to a stand in time."""
+    """Return the share (N,) of each command at which the robot can stop in time."""
     factor = np.ones(len(command))
     if not limits.sectors:
         return factor
@@ -197,7 +197,7 @@ def _factor(limits: Limits, command: F64, clearance_m: F64) -> F64:
 
 
 def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
-    """How far (N,) the outline's fastest point may go until the outline meets a return, in m.
+    """Return how far (N,) the outline's fastest point may go until the outline meets a return, m.
 
     At most `limits.way_m`, in steps of 2.5 cm. A return is met where the outline, from here to
     there, reaches farther along its bearing than it is: what lies behind it counts as occupied.
@@ -220,7 +220,7 @@ def free_way(limits: Limits, direction: F64, clearance_m: F64) -> F64:
 
 @lru_cache(maxsize=1024)
 def _swept(limits: Limits, ahead: float, turn: float) -> F64:
-    """How much clearance (M, K) the outline needs in each sector, at each step along an arc.
+    """Return the clearance (M, K) that the outline needs in each sector, at each step of an arc.
 
     `ahead` (m) and `turn` (rad) are for each metre of the outline's fastest point.
     """

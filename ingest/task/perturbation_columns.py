@@ -21,7 +21,7 @@ VALUES = pa.map_(pa.string(), pa.float64())
 
 @dataclass(frozen=True)
 class Perturbed:
-    """Which of a few sets of parameters was in force at each of T places; -1: not known."""
+    """Sets of parameters, and which was in force at each of T places; -1: not known."""
 
     sets: Sequence[tuple[str, Mapping[str, float]] | None]  # name, values; None: unreadable
     row: Ints  # (T,) of `sets`
@@ -29,12 +29,12 @@ class Perturbed:
 
     @classmethod
     def unknown(cls, count: int) -> Perturbed:
-        """As for hardware: its friction is unknown."""
+        """Return unknown parameters, as hardware has: its friction is unknown."""
         return cls([], np.full(count, -1, np.int64))
 
     @classmethod
     def read(cls, texts: Sequence[str], row: Ints) -> Perturbed:
-        """From messages `{"name", "values": {field: number}}`, and which is held where."""
+        """Parse messages `{"name", "values": {field: number}}`, and keep which holds where."""
         sets = [parse_perturbation(text) for text in texts]
         unread = sum(item is None for item in sets)
         many = "message is" if unread == 1 else "messages are"

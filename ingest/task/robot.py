@@ -89,18 +89,18 @@ class Robot(Checked, frozen=True):
 
     @property
     def outline_guessed(self) -> bool:
-        """Whether nobody measured the outline."""
+        """Return whether nobody measured the outline."""
         return self.origin.get(OUTLINE) == "default"
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Of the circle that the pose describes at full steering; 0: it turns on the spot."""
+        """Return the radius of the pose's circle at full steering; 0 if it turns on the spot."""
         if self.drive != "ackermann" or self.wheelbase_m is None:
             return 0.0
         return self.wheelbase_m / math.tan(self.max_steering_rad or USUAL_STEERING_RAD)
 
     def origin_of(self, name: str) -> Origin:
-        """Where a value is from, by its key, such as `mass_kg` or `lidar.beams`."""
+        """Return the source of a value, by its key, such as `mass_kg` or `lidar.beams`."""
         if name in self.origin:
             return self.origin[name]
         value = getattr(self.lidar, name[6:]) if name.startswith("lidar.") else getattr(self, name)
@@ -108,7 +108,7 @@ class Robot(Checked, frozen=True):
 
 
 def beyond_limits(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str | None:
-    """What is wrong with the first of the actions (m/s, rad/s) that this robot cannot drive."""
+    """Describe the first action (m/s, rad/s) that this robot cannot drive."""
     for speed, turn in actions:
         for value, most, name, unit in (
             (speed, robot.max_speed_mps, "max_speed_mps", "m/s"),
@@ -122,7 +122,7 @@ def beyond_limits(robot: Robot, actions: tuple[tuple[float, float], ...]) -> str
 def refuse_beyond_steering(
     robot: Robot | None, actions: tuple[tuple[float, float], ...], *, where: str
 ) -> None:
-    """Raises ConfigError for an action (m/s, rad/s) whose turn a robot that steers cannot drive."""
+    """Raise ConfigError if an action (m/s, rad/s) turns tighter than this robot can steer."""
     if robot is not None and (problem := _beyond_steering(robot, actions)):
         raise ConfigError(
             f"`task.actions`: {problem}",

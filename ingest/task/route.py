@@ -1,4 +1,4 @@
-"""Where along its plan a robot is: look-ahead points and what remains, for logs and twin alike.
+"""Position of a robot along its plan: look-ahead points and what remains, for logs and twin.
 
 A plan is a polyline in the map frame, as a navigation stack publishes it (`nav_msgs/Path`), from
 somewhere near the robot to its goal. Plans are padded to a common length by repeating their last
@@ -22,7 +22,7 @@ ROUNDING = 1e-13  # of squared distances, relative; near 0 a tenth of it in m^2
 
 @dataclass(frozen=True)
 class RouteView:
-    """What a robot at a pose sees of its plan."""
+    """View of its plan for a robot at a pose."""
 
     look_ahead_m: F64  # (N, L, 2) look-ahead points in the body frame (x forward, y left)
     remaining_m: F64  # (N,) arc length from the nearest point on the plan to its end

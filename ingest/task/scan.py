@@ -28,7 +28,7 @@ UNSEEN_SECTORS = 3  # at most, that are taken to lie behind what is beside them
 
 @dataclass(frozen=True)
 class SectorMap:
-    """Which beam belongs to which sector, and how far the body reaches along each beam.
+    """Map of beams to sectors, and how far the body reaches along each beam.
 
     Sector 0 starts straight behind (-pi) and sectors go counter-clockwise, so that the robot's
     forward axis lies between sectors K/2 - 1 and K/2. Built once per lidar geometry.
@@ -75,8 +75,10 @@ class SectorMap:
 
 @dataclass(frozen=True)
 class MovedMap:
-    """The same of a lidar that is not where the body has its own: where its beams end is seen from
-    there, so the sector of a beam depends on its range."""
+    """Map of beams to sectors for a lidar that is not where the body has its own.
+
+    Where its beams end is seen from the body's place, so a beam's sector depends on its range.
+    """
 
     sectors: int
     body: Body
@@ -94,8 +96,10 @@ class MovedMap:
     def clearance(
         self, ranges_m: NDArray[Any], range_min_m: float, range_max_m: float
     ) -> NDArray[np.float64]:
-        """As `SectorMap.clearance`, but NaN for sectors in which no beam ends (`with_unseen`);
-        `range_min_m` is from this lidar, `range_max_m` from the body's own."""
+        """Compute `SectorMap.clearance`, but NaN for sectors in which no beam ends (`with_unseen`).
+
+        `range_min_m` is from this lidar, `range_max_m` from the body's own.
+        """
         with np.errstate(invalid="ignore"):
             ranges = np.asarray(ranges_m, np.float64)
         farthest_m = range_max_m + float(np.hypot(*self.from_m))
@@ -149,7 +153,7 @@ def with_unseen(clearance_m: NDArray[np.float64], range_max_m: float) -> NDArray
 
 
 def outline_reach(bearings_rad: NDArray[np.float64], body: Body) -> NDArray[np.float64]:
-    """From the lidar to the body's outline along each bearing (B,), in metres."""
+    """Return the distance from the lidar to the outline along each bearing (B,), in metres."""
     cos, sin = np.cos(bearings_rad), np.sin(bearings_rad)
     ahead = np.where(
         cos >= 0, body.length_m / 2 - body.lidar_x_m, body.length_m / 2 + body.lidar_x_m

@@ -20,14 +20,14 @@ STEP_BITS = 25
 
 
 def transition_ids(recording_id: str, tick: Ints) -> Ints:
-    """The ids of a recording's steps (N,) by their places on its control clock."""
+    """Return the ids of a recording's steps (N,) by their places on its control clock."""
     number = int(recording_id, 16) >> (64 - (63 - STEP_BITS))
     return (number << STEP_BITS) + tick
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of the table. `observation` types get their length from the task."""
+    """A column of the table. `observation` types get their length from the task."""
 
     name: str
     type: pa.DataType
@@ -163,7 +163,7 @@ def signal_arrays(signals: Signals) -> dict[str, pa.Array]:
 
 
 def signal_columns(signals: Signals, rows: Ints | slice = slice(None)) -> dict[str, pa.Array]:
-    """The stored signals (of some rows) as columns of the table."""
+    """Convert the stored signals (of some rows) to columns of the table."""
     arrays = signal_arrays({column.name: signals[column.name][rows] for column in SIGNAL_COLUMNS})
     return {
         column.name: arrays[column.name].cast(column.type, safe=False) for column in SIGNAL_COLUMNS
@@ -171,14 +171,14 @@ def signal_columns(signals: Signals, rows: Ints | slice = slice(None)) -> dict[s
 
 
 def steps_schema(custom: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The steps as conditions see them: the stored signals, and a profile's custom ones."""
+    """Return the schema of steps as conditions see them: stored signals, and custom ones."""
     keys = [("episode_index", pa.int64()), ("step_index", pa.int64())]
     signals = [(column.name, column.type) for column in SIGNAL_COLUMNS]
     return pa.schema([*(pa.field(*field) for field in keys + signals), *custom])
 
 
 def transition_schema(observation_size: int, custom: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The Arrow schema of rows whose observations have `observation_size` entries.
+    """Return the Arrow schema of rows whose observations have `observation_size` entries.
 
     `custom` are the columns of a profile's own signals; they come last.
     """
@@ -382,12 +382,12 @@ FRAME_COLUMNS: tuple[Column, ...] = (
 
 
 def frame_schema() -> pa.Schema:
-    """The Arrow schema of a recording's frames."""
+    """Return the Arrow schema of a recording's frames."""
     return pa.schema([pa.field(one.name, one.type, nullable=False) for one in FRAME_COLUMNS])
 
 
 def recording_schema() -> pa.Schema:
-    """The Arrow schema of the `recordings` table."""
+    """Return the Arrow schema of the `recordings` table."""
     return pa.schema(
         [pa.field(column.name, column.type, column.nullable) for column in RECORDING_COLUMNS]
     )
@@ -419,8 +419,10 @@ def duckdb_type(kind: pa.DataType) -> str:
 
 
 def with_columns(sql: str) -> str:
-    """Replace `/* nulls: transitions */` and `/* nulls: recordings */` in SQL by a select list of
-    null for each nullable column of that table."""
+    """Fill in `/* nulls: transitions */` and `/* nulls: recordings */` in SQL.
+
+    Each becomes a select list of null for each nullable column of that table.
+    """
     for table, columns in (("transitions", COLUMNS), ("recordings", RECORDING_COLUMNS)):
         nulls = ", ".join(
             f"NULL::{duckdb_type(column.type)} AS {column.name}"

@@ -25,7 +25,7 @@ Signals = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Signal:
-    """One column: its name (which ends in its unit), shape per step, type and meaning."""
+    """A column: its name (which ends in its unit), shape per step, type and meaning."""
 
     name: str
     meaning: str
@@ -119,7 +119,7 @@ def localised_velocity(
 
 
 def wrap_angle(angle_rad: NDArray[Any]) -> NDArray[Any]:
-    """The same angle in [-pi, pi)."""
+    """Return the same angle in [-pi, pi)."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 

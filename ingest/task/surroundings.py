@@ -1,4 +1,4 @@
-"""What two scans say of the surroundings: who came nearer, and what lies on the plan.
+"""Surroundings by two scans: who came nearer, and what lies on the plan.
 
 Of every sector the nearest return is taken as a point on the sector's middle bearing: with 36
 sectors it is within .17 m of where it is at 2 m. For logs and twin alike.
@@ -34,12 +34,12 @@ _ROUNDING_M = 1e-6  # of a range that is the lidar's longest: nothing came back
 
 
 def steps_remembered(task: Task) -> int:
-    """How many steps before its own `came_nearer` looks at."""
+    """Return how many earlier steps `came_nearer` looks at."""
     return max(round(REMEMBERED_S / task.control_period_s), 1)
 
 
 def came_nearer(task: Task, now: Signals, earlier: Sequence[Signals]) -> F64:
-    """How far (m) something came nearer since the step before, (N,); 0 where nothing did.
+    """Return how far (m) something came nearer since the step before, (N,); 0 if nothing did.
 
     A return of now within NEAR_M is put where the robot was at each of the steps before, by the
     localised and the gyroscope's motion. Where the lidar saw farther at all of them, in that sector
@@ -105,8 +105,10 @@ def _came_by_numpy(task: Task, clearance: F64, before: F64, motions: F64, walked
 
 
 def _motions(scans: Sequence[Signals]) -> F64:
-    """Of steps, the last one first: from each one's body frame to that of the step before, as x, y,
-    cosine and sine of the turn, (steps - 1, 4, N)."""
+    """Return the motion from each step's body frame to that of the step before, last step first.
+
+    As x, y, cosine and sine of the turn, (steps - 1, 4, N).
+    """
     stamp_ns, rate, forward, left = (np.array([scan[name] for scan in scans]) for name in _MOTION)
     elapsed_s = (stamp_ns[:-1] - stamp_ns[1:]) * 1e-9
     turn = elapsed_s * (rate[:-1] + rate[1:]) / 2
@@ -120,7 +122,7 @@ def _motions(scans: Sequence[Signals]) -> F64:
 
 
 def plan_distances_m(task: Task) -> tuple[float, ...]:
-    """Where along the plan it is looked at for returns, from the point nearest to the robot on."""
+    """Return the distances along the plan, from its nearest point, searched for returns."""
     parts = [part / PLAN_PARTS for part in range(1, PLAN_PARTS)]
     near = (task.near_m * part for part in parts)
     beyond = (task.near_m + (task.far_m - task.near_m) * part for part in parts)
@@ -128,7 +130,7 @@ def plan_distances_m(task: Task) -> tuple[float, ...]:
 
 
 def returns_on_plan(task: Task, clearance_m: F64, plan_m: F64) -> tuple[F64, F64]:
-    """What lies on the plan and how far off its middle, of points of it `plan_m` (N, L, 2).
+    """Find what lies on the plan and how far off its middle, by its points `plan_m` (N, L, 2).
 
     The points are those at `plan_distances_m`, in the body frame, and the plan the line over them.
 
@@ -204,8 +206,10 @@ def _sectors(count: int, body: Body) -> _Sectors:
 
 
 def _turned(x: F64, y: F64) -> F64:
-    """What grows with the bearing of points as that does, from -2 behind the robot to 2, and is
-    rounded alike wherever it is computed."""
+    """Return a value that grows with the bearing of points, from -2 behind the robot to 2.
+
+    It is rounded alike wherever it is computed.
+    """
     far = np.abs(x) + np.abs(y)
     part = y / np.where(far > 0, far, 1.0)
     return np.where(x >= 0, part, np.where(y >= 0, 2.0 - part, -2.0 - part))

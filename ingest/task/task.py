@@ -30,7 +30,7 @@ SLIP_MPS = 0.15  # wheels against the world: slip, of a robot of 1 m/s or faster
 
 
 class Rewards(Checked, frozen=True):
-    """What each event of a step is worth."""
+    """Reward of each event of a step."""
 
     progress_per_m: float = 1.0  # along the plan in force at t, clipped to +-1 m per step
     step: float = -0.02
@@ -74,7 +74,7 @@ class Task(Checked, frozen=True):
 
     @property
     def lidar(self) -> bool:
-        """Whether the robot has one: else clearance is not known, and no part of what it sees."""
+        """Return whether the robot has a lidar: else clearance is unknown, and not observed."""
         return self.sectors > 0
 
     @property
@@ -107,7 +107,7 @@ class Task(Checked, frozen=True):
 
     @property
     def slip_limit_mps(self) -> float:
-        """How fast wheels move over the floor that slip."""
+        """Return the speed over the floor at which wheels count as slipping."""
         return SLIP_MPS * min(self._fastest_mps, 1.0)
 
     @property
@@ -116,7 +116,7 @@ class Task(Checked, frozen=True):
 
     @property
     def condition_limits(self) -> dict[str, float]:
-        """What the SQL of conditions may name of the robot's task."""
+        """Return the constants of the robot's task that the SQL of conditions may name."""
         return {
             "tight_clearance_m": self.rewards.tight_clearance_m,
             "body_width_m": self.body.width_m,
@@ -154,7 +154,7 @@ class Mirror:
 
     @classmethod
     def of(cls, task: Task) -> Mirror:
-        """Raises ValueError where an action turns one way, and none turns as fast the other way."""
+        """Build the mirror image; raise ValueError if an action has no equal turn the other way."""
         table = np.asarray(task.actions, np.float64)
         gap = np.abs(table[:, None] - table[None] * (1, -1)).max(axis=2)
         opposite = gap.argmin(axis=1)
@@ -173,17 +173,17 @@ class Mirror:
         return cls(source, sign, opposite)
 
     def observation(self, observation: F32) -> F32:
-        """What would be observed, (..., D), where all is mirrored."""
+        """Return what would be observed, (..., D), if everything were mirrored."""
         mirrored: F32 = observation[..., self.source] * self.sign
         return mirrored
 
     def action(self, action: Ints) -> Ints:
-        """The actions (N,) that do the same there; what is negative, for none, stays."""
+        """Return the mirrored actions (N,); negative ones, which stand for none, stay."""
         return np.where(action < 0, action, self.opposite[action])
 
 
 def observe(task: Task, now: Signals, before: Signals, previous_action: Ints) -> F32:
-    """The observation at t, (N, D) float32, from signals at t and t - 1 and the action before t.
+    """Compute the observation at t, (N, D) float32, by signals at t, t - 1 and the last action.
 
     Of the signals at t - 1 it takes `sector_clearance_m` alone.
     """
@@ -229,7 +229,7 @@ def nearest_action(
 
 
 def reached_goal(task: Task, after: Signals) -> Bools:
-    """Whether the robot is within the goal radius at t + 1, (N,)."""
+    """Return whether the robot is within the goal radius at t + 1, (N,)."""
     if task.goal == "none":
         return np.zeros(len(after["goal_distance_m"]), np.bool_)
     reached: Bools = after["goal_distance_m"] <= task.goal_radius_m
@@ -237,7 +237,7 @@ def reached_goal(task: Task, after: Signals) -> Bools:
 
 
 def terminated(task: Task, after: Signals) -> Bools:
-    """Whether the episode terminates at t + 1, (N,): no value is to be bootstrapped there."""
+    """Return whether the episode terminates at t + 1, (N,): no value is bootstrapped there."""
     terminates = reached_goal(task, after)
     if task.bump_terminates:
         terminates = terminates | after["bumped"].astype(np.bool_)
@@ -252,7 +252,7 @@ def reward(
     action: Ints,
     previous_action: Ints,
 ) -> F32:
-    """The reward of [t, t + 1), (N,) float32.
+    """Compute the reward of [t, t + 1), (N,) float32.
 
     `progress_m` (N,) is how much shorter the plan in force at t became (with a goal), or how far
     the robot moved forward (without one).
@@ -269,7 +269,7 @@ def reward_parts(
     action: Ints,
     previous_action: Ints,
 ) -> dict[str, NDArray[Any]]:
-    """What each event of [t, t + 1) was worth, (N,) each, by the names of `Rewards`.
+    """Compute the reward of each event of [t, t + 1), (N,) each, by the names of `Rewards`.
 
     Where clearance is not known (NaN, of a robot without lidar) nothing is `tight`: 0.
     """
@@ -292,8 +292,10 @@ def reward_parts(
 def clearance_ahead(
     task: Task, sector_clearance_m: NDArray[Any], waypoint_x_m: Any, waypoint_y_m: Any
 ) -> NDArray[np.float64]:
-    """The smallest clearance (N,) of the three sectors around the bearing of the near waypoint;
-    NaN without a lidar."""
+    """Return the smallest clearance (N,) of the three sectors around the near waypoint's bearing.
+
+    NaN without a lidar.
+    """
     if not task.sectors:
         return np.full(len(sector_clearance_m), np.nan)
     bearing = np.arctan2(waypoint_y_m, waypoint_x_m)
@@ -304,7 +306,7 @@ def clearance_ahead(
 
 
 def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
-    """What the navigation stack proposes, (N, 3): whether it is known, speed and yaw rate.
+    """Return what the navigation stack proposes, (N, 3): whether it is known, speed, yaw rate.
 
     In units of the fastest action on each axis, up to twice that; all 0 where it is not known.
     """
@@ -315,7 +317,7 @@ def _proposed(task: Task, now: Signals) -> NDArray[np.float64]:
 
 
 def _fastest(task: Task) -> NDArray[np.float64]:
-    """The largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
+    """Return the largest speed (m/s) and yaw rate (rad/s) among the actions, (2,)."""
     largest = np.abs(np.asarray(task.actions, np.float64)).max(axis=0)
     return np.asarray(np.maximum(largest, 1e-9), np.float64)
 
@@ -326,7 +328,7 @@ def _nearness(clearance_m: NDArray[Any], range_max_m: float) -> NDArray[Any]:
 
 
 def nearness_of(task: Task, observation: NDArray[Any]) -> F64:
-    """The clearance entries (N, K) of observations (N, D), in [0, 1], by rising bearing."""
+    """Return the clearance entries (N, K) of observations (N, D), in [0, 1], by rising bearing."""
     names = enumerate(task.observation_names)
     first = next((place for place, name in names if name.startswith("clearance_")), 0)
     nearness: F64 = observation[:, first : first + task.sectors].astype(np.float64)
@@ -334,12 +336,12 @@ def nearness_of(task: Task, observation: NDArray[Any]) -> F64:
 
 
 def clearances_of(task: Task, observation: NDArray[Any]) -> F64:
-    """The clearance of each sector (N, K), in metres, by observations (N, D)."""
+    """Return the clearance of each sector (N, K), in metres, by observations (N, D)."""
     return nearness_of(task, observation) ** 2 * task.range_max_m
 
 
 def _action_name(speed_mps: float, yaw_rate_radps: float) -> str:
-    """As the view `actions` of a store makes it, in replay/store/views.sql."""
+    """Name an action as the view `actions` of a store does, in replay/store/views.sql."""
     if speed_mps == 0 and yaw_rate_radps == 0:
         return "stop"
     turn = f"{'left' if yaw_rate_radps > 0 else 'right'} {_three_places(yaw_rate_radps)}"

@@ -135,7 +135,7 @@ class ChunkReader:
     def read(
         self, groups: Iterable[list[Chunk]], wanted: set[int], *, ahead: bool = False
     ) -> Iterator[tuple[int, MessageBatch]]:
-        """The messages of these channels, group by group; a batch is valid until the next.
+        """Yield the messages of these channels, group by group; a batch is valid until the next.
 
         With `ahead`, another thread reads and decompresses the next group meanwhile; what is wrong
         with it is noted, or raised, in its turn.
@@ -164,7 +164,7 @@ class ChunkReader:
         buffer: NDArray[np.uint8],
         wanted: set[int],
     ) -> dict[int, Messages] | None:
-        """Where the messages of some chunks are, by their indexes; None where one is wrong."""
+        """Find the messages of some chunks by their indexes; None if one index is wrong."""
         entries: dict[int, list[Indexed]] = {}
         for chunk, base, size in parts:
             if not chunk.index or chunk.at in self.walked:
@@ -183,7 +183,7 @@ class ChunkReader:
         return located
 
     def _plausible(self, group: list[Chunk]) -> tuple[list[_Room], list[_Outcome]]:
-        """The room that these chunks need, and which are refused."""
+        """Return the room that these chunks need, and which are refused."""
         rooms: list[_Room] = []
         refused: list[_Outcome] = []
         for chunk in group:
@@ -200,7 +200,7 @@ class ChunkReader:
         return rooms, refused
 
     def _inflate_group(self, rooms: list[_Room], refused: list[_Outcome], place: int) -> _Inflated:
-        """What these chunks hold, in one of the memories that are used again; without bad ones."""
+        """Decompress these chunks into one of the reused memories, leaving out bad ones."""
         needed = sum(size for _, size, _ in rooms)
         if len(self._scratch[place]) < needed:
             self._scratch[place] = np.empty(needed, np.uint8)
@@ -227,7 +227,7 @@ class ChunkReader:
     def _locate(
         self, part: _Part, buffer: NDArray[np.uint8], wanted: set[int]
     ) -> dict[int, Messages]:
-        """Where a chunk's messages are: by its index, or by walking it where that is wrong."""
+        """Find a chunk's messages by its index, or by walking it if that is wrong."""
         located = self._by_index([part], buffer, wanted)
         if located is not None:
             return located
@@ -336,7 +336,7 @@ class McapFile:
             self._contents.chunks.append(self._contents.cut_chunk)
 
     def _metadata(self) -> list[Metadata]:
-        """What its metadata records say, rosbag2's own included."""
+        """Return the entries of its metadata records, rosbag2's own included."""
         kept, left_out = self._contents.metadata, self._contents.left_out
         try:
             custom, more = custom_data(self._contents.rosbag2, self.path.name, kept)
@@ -350,8 +350,10 @@ class McapFile:
     # -- contents ---------------------------------------------------------------------
 
     def _count(self) -> dict[int, int]:
-        """By the statistics where there are any, else by walking chunks: of a message index that is
-        missing nothing else would tell."""
+        """Count messages by the statistics if there are any, else by walking chunks.
+
+        Nothing else would reveal a missing message index.
+        """
         contents = self._contents
         claimed = contents.claimed_counts()
         counts = contents.indexed_counts()
@@ -372,8 +374,10 @@ class McapFile:
         return counts
 
     def _channels(self) -> dict[int, Channel]:
-        """Return the channels as the data section defines them: the summary's copies count only
-        for what it does not define."""
+        """Return the channels as the data section defines them.
+
+        The summary's copies count only for what it does not define.
+        """
         contents = self._contents
         needed = {channel for channel, count in self.counts.items() if count}
         own = self._compared(contents.definitions, contents.data_end[1] > 0)
@@ -403,8 +407,10 @@ class McapFile:
         return self._compared(mcap_chunk.definitions_in(records), chunk.crc > 0)
 
     def _compared(self, found: Definitions, checked: bool) -> Definitions:
-        """Compare definitions of the data section with the summary's copies, and note differences
-        as damage. What no CRC checks gives way to copies that one confirms."""
+        """Compare the data section's definitions with the summary's copies; differences are damage.
+
+        What no CRC checks gives way to copies that one confirms.
+        """
         copies = self._contents.copies
         trusted = "summary" if self._contents.summary_proven and not checked else "data"
         for what in found.differing(copies):
