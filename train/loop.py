@@ -299,7 +299,7 @@ def _note(
     )
     value = float(loss.value.detach())
     _check_loss(session, batch, loss, value, phase)
-    session.batches.learnt(batch, loss.td)
+    session.batches.note_errors(batch, loss.td)
     interval.updates += 1
     interval.loss += value
 

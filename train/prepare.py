@@ -135,7 +135,7 @@ class Prepared:
         episodes: list[EpisodeSpec] | None,
     ) -> Session:
         profile = self.profile
-        conditions, exposures = told_in_twin(profile)
+        conditions, exposures = conditions_of_twin(profile)
         session = open_session(
             run,
             self.config,
@@ -291,7 +291,7 @@ def prepare_resumed(
     return Prepared(path, config, profile, panel, run.document, run, from_env_steps)
 
 
-def told_in_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
+def conditions_of_twin(profile: Profile) -> tuple[list[Condition], list[Condition]]:
     """Return the conditions and exposures of a profile that can be evaluated on fresh rows."""
     conditions, exposures = (
         conditions_in_twin(kind, profile.signals, lidar=profile.task.lidar)[0]
@@ -375,7 +375,7 @@ def _document(config: TrainConfig, profile: Profile, panel: Panel | None) -> dic
     if panel is not None:
         fresh = None
         if config.env.twin:
-            conditions, exposures = told_in_twin(profile)
+            conditions, exposures = conditions_of_twin(profile)
             strata = FreshStrata.of(panel, [*conditions, *exposures])
             fresh = strata.known & ~_never_driven(strata.names, config)
         planned = planned_draws(config)

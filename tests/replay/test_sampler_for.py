@@ -111,7 +111,7 @@ def by_batches(panel: Panel) -> Iterator[Drawn]:
         np.testing.assert_array_equal(batch.rows.numpy(), panel.rows[batch.log_rows])
         yield Drawn(batch.log_rows, batch.log_stratum)
         td = learn(None, batch.log_rows, batch.log_stratum)
-        batches.learnt(batch, torch.from_numpy(td))
+        batches.note_errors(batch, torch.from_numpy(td))
 
 
 def by_library(reported: bool) -> Way:

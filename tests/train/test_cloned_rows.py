@@ -22,7 +22,7 @@ from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
 from restock.replay.store.store import Store
 from restock.train.dqn.config import TeacherConfig
-from restock.train.feed.imitation import cloned, of_policies, of_successes
+from restock.train.feed.imitation import cloned, rows_of_policies, rows_of_successes
 from restock.train.feed.logs import Coded
 from restock.train.prepare import prepare_new
 
@@ -56,18 +56,18 @@ def rows_of_episodes() -> tuple[Coded, Coded, np.ndarray, np.ndarray]:
 
 def test_successes_are_whole_episodes_without_the_teacher() -> None:
     policy, episode, reward, discount = rows_of_episodes()
-    found = of_successes(policy, episode, reward, discount, ["operator"])
+    found = rows_of_successes(policy, episode, reward, discount, ["operator"])
     assert {episode.name(row) for row in np.flatnonzero(found)} == {"planner's own", "another's"}
     assert found.sum() == 5
-    everyone = of_successes(policy, episode, reward, discount, ["operator", "teleop"])
+    everyone = rows_of_successes(policy, episode, reward, discount, ["operator", "teleop"])
     assert {episode.name(row) for row in np.flatnonzero(everyone)} == {"planner's own"}
-    assert not (found & of_policies(policy, ["operator"])).any()
-    assert not of_policies(policy, ["nobody", "unknown"]).any()
+    assert not (found & rows_of_policies(policy, ["operator"])).any()
+    assert not rows_of_policies(policy, ["nobody", "unknown"]).any()
 
 
 def test_rows_of_no_known_episode_are_nobodys_success() -> None:
     policy = coded(["planner"] * 2)
-    found = of_successes(policy, coded([None, None]), np.ones(2, np.float32), np.zeros(2), [])
+    found = rows_of_successes(policy, coded([None, None]), np.ones(2, np.float32), np.zeros(2), [])
     assert not found.any()
 
 

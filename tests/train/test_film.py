@@ -17,7 +17,7 @@ from restock.report.run.films import films_section
 from restock.train.evaluation import film
 from restock.train.evaluation.eval_run import drive_evaluation
 from restock.train.evaluation.evaluation_plan import EvaluationPlan, make_policy, plan_evaluation
-from restock.train.evaluation.film import RESCUE, WORST, drive_again, scenes, unlike
+from restock.train.evaluation.film import RESCUE, WORST, differing_fields, drive_again, scenes
 from restock.train.run.kept_evaluations import FILE, read_evaluations
 from restock.train.twin.env.interface import Policy
 
@@ -64,7 +64,7 @@ def test_an_episode_driven_again_is_the_recorded_one(run: Path) -> None:
     plan = plan_evaluation(run, policies=("agent",), episodes=KINDS)
     for recorded in read_evaluations(run).to_pylist()[:2]:
         result, frames, states = drive_again(plan, recorded)
-        assert unlike(recorded, result) == []
+        assert differing_fields(recorded, result) == []
         assert result.undiscounted_return == pytest.approx(recorded["return"], abs=1e-4)
         assert len(frames) == len(states) == round(recorded["time_s"] / 0.2) + 1
         end = states[-1]["robot"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from restock.train.feed import interval_tables
-from restock.train.feed.interval_tables import GreedyRows, SourceRows, one_of_each
+from restock.train.feed.interval_tables import GreedyRows, SourceRows, first_places
 
 STRATA, CONDITIONS, ACTIONS = (
     ("easy", "rare", "unmet"),
@@ -27,7 +27,7 @@ STRATA, CONDITIONS, ACTIONS = (
 )
 def test_one_place_of_each_value_however_far_apart_they_are(values: list[int], first: int) -> None:
     key = np.array(values, np.int64) + first
-    places = one_of_each(key)
+    places = first_places(key)
     assert key[places].tolist() == sorted(set(key.tolist()))
 
 

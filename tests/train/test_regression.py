@@ -13,8 +13,8 @@ from restock.cli import main
 from restock.errors import RunError
 from restock.files import write_table
 from restock.train.evaluation.regression import (
-    of_baseline,
-    of_run,
+    read_baseline,
+    read_run_evaluation,
     regressed,
     regression,
     save_baseline,
@@ -85,7 +85,7 @@ def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path)
     other = evaluated(
         tmp_path / "b", {"nominal": 1.0, "wheel_slip": 0.2, "blocked_aisle": 0.9}, shuffle=3
     )
-    rows = regression(of_run(baseline), of_run(other))
+    rows = regression(read_run_evaluation(baseline), read_run_evaluation(other))
     assert verdicts(rows) == {
         "blocked_aisle (full)": "better",
         "blocked_aisle (partial)": "better",
@@ -105,7 +105,7 @@ def test_regression_is_worse_better_or_left_open(baseline: Path, tmp_path: Path)
 
 
 def test_a_run_against_itself_shows_no_difference(baseline: Path) -> None:
-    rows = regression(of_run(baseline), of_run(baseline))
+    rows = regression(read_run_evaluation(baseline), read_run_evaluation(baseline))
     assert {row["verdict"] for row in rows} == {"no difference shown"}
     assert {row["improvement"] for row in rows} == {0.5}
     assert not regressed(rows)
@@ -115,9 +115,11 @@ def test_pairing_tells_what_unpaired_shares_would_not(tmp_path: Path) -> None:
     """Six of sixty fell and none rose: paired that is sure, for two shares it is not."""
     first = evaluated(tmp_path / "a", GOOD)
     second = evaluated(tmp_path / "b", {**GOOD, "wheel_slip": 0.5})
-    slip = verdicts(regression(of_run(first), of_run(second)))["wheel_slip"]
+    slip = verdicts(regression(read_run_evaluation(first), read_run_evaluation(second)))[
+        "wheel_slip"
+    ]
     assert slip == "worse"
-    tolerant = regression(of_run(first), of_run(second), margin=0.2)
+    tolerant = regression(read_run_evaluation(first), read_run_evaluation(second), margin=0.2)
     assert verdicts(tolerant)["wheel_slip"] == "no difference shown"
 
 
@@ -127,7 +129,7 @@ def test_few_episodes_say_nothing_of_better_or_worse(
     """One episode that fell is no regression: values, without interval and verdict, and exit 0."""
     good = evaluated(tmp_path / "a", dict.fromkeys(CONDITIONS, 1.0), episodes=9)
     bad = evaluated(tmp_path / "b", dict.fromkeys(CONDITIONS, 0.0), episodes=9)
-    rows = regression(of_run(good), of_run(bad))
+    rows = regression(read_run_evaluation(good), read_run_evaluation(bad))
     few = {row["condition"]: row for row in rows if row["perturbation"] == "none"}
     assert {few[name]["verdict"] for name in ("nominal", "wheel_slip")} == {"inconclusive"}
     assert (few["nominal"]["difference"], few["nominal"]["difference_low"]) == (-1.0, None)
@@ -160,7 +162,7 @@ def test_few_episodes_say_nothing_of_better_or_worse(
 )
 def test_other_episodes_are_refused(baseline: Path, tmp_path: Path, changes: dict) -> None:
     other = evaluated(tmp_path / "b", GOOD, **changes)
-    rows = regression(of_run(baseline), of_run(other))
+    rows = regression(read_run_evaluation(baseline), read_run_evaluation(other))
     refused = [row for row in rows if row["verdict"] == "refused"]
     assert refused
     assert all("not the same episodes" in row["reason"] for row in refused)
@@ -172,7 +174,7 @@ def test_other_episodes_are_refused(baseline: Path, tmp_path: Path, changes: dic
 def test_another_task_is_refused(baseline: Path, tmp_path: Path) -> None:
     other = evaluated(tmp_path / "b", GOOD, task_hash="u")
     with pytest.raises(RunError, match="is of task u, the baseline"):
-        regression(of_run(baseline), of_run(other))
+        regression(read_run_evaluation(baseline), read_run_evaluation(other))
 
 
 def test_a_saved_baseline_outlives_its_run(
@@ -181,18 +183,18 @@ def test_a_saved_baseline_outlives_its_run(
     monkeypatch.chdir(tmp_path)
     file = save_baseline(baseline, "main")
     assert file == Path("baselines/main.parquet")
-    before = of_run(baseline)
+    before = read_run_evaluation(baseline)
     baseline.rename(tmp_path / "gone")
-    kept = of_baseline("main")
+    kept = read_baseline("main")
     assert kept.cells == before.cells
     assert kept.task_hash == "t"
     assert kept.name == "main (good)"
-    assert of_baseline(str(file)).cells == before.cells
+    assert read_baseline(str(file)).cells == before.cells
     with pytest.raises(RunError, match="there are main in"):
-        of_baseline("mian")
+        read_baseline("mian")
     Path("baselines/text.parquet").write_text("hello")
     with pytest.raises(RunError, match="is not a baseline"):
-        of_baseline("text")
+        read_baseline("text")
 
 
 def test_the_verb_is_fit_for_a_pipeline(

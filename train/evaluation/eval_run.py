@@ -135,7 +135,7 @@ def drive_evaluation(
     return added
 
 
-def recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
+def read_recorded(run: Path) -> tuple[list[dict[str, Any]], str]:
     """Return the episodes of a run's last evaluation, and a text that says which they are.
 
     Raises:

@@ -129,7 +129,7 @@ def film_evaluation(
         result, frames, states = drive_again(plan, scene.row)
         if progress is not None:
             progress(1)
-        if differing := unlike(scene.row, result):
+        if differing := differing_fields(scene.row, result):
             missing.append(f"{scene.name}: driven again it has another {', '.join(differing)}")
             continue
         if scene.other is not None:
@@ -138,7 +138,7 @@ def film_evaluation(
                 other = scene.other["policy"]
                 missing.append(f"{scene.name}: {other}, which cannot be driven as it was")
             else:
-                frames = _beside(before, frames, [_told(scene.other), _told(scene.row)])
+                frames = _beside(before, frames, [_caption(scene.other), _caption(scene.row)])
         file = folder / f"{scene.name}.webp"
         write_bytes(file, _animation(frames))
         paths.append(file)
@@ -157,7 +157,7 @@ def _failure(plan: EvaluationPlan, row: dict[str, Any]) -> list[NDArray[np.uint8
         result, frames, _ = drive_again(plan, row)
     except RestockError:
         return None
-    return None if unlike(row, result) else frames
+    return None if differing_fields(row, result) else frames
 
 
 def drive_again(
@@ -174,7 +174,7 @@ def drive_again(
     def watched(env: WarehouseVectorEnv) -> Stepper:
         def look() -> None:
             frames.append(draw_map(env, 0))
-            states.append(everything(env, len(states) * env.task.control_period_s))
+            states.append(scene_state(env, len(states) * env.task.control_period_s))
 
         def step(_: F32, action: Ints) -> Step:
             if not frames:
@@ -221,7 +221,7 @@ def drive_row(
     return result
 
 
-def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
+def differing_fields(row: dict[str, Any], result: EpisodeResult) -> list[str]:
     """List the fields in which an episode driven again differs from the recorded one."""
     now = {**result.row, "failure": result.failure}
     differing = [name for name in _SAME if now[name] != row[name]]
@@ -229,7 +229,7 @@ def unlike(row: dict[str, Any], result: EpisodeResult) -> list[str]:
     return differing + (["end"] if float(np.abs(ends).max()) > 1e-3 else [])
 
 
-def everything(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
+def scene_state(env: WarehouseVectorEnv, time_s: float) -> dict[str, Any]:
     """Return where everything is: robot, people, forklifts, pallets, patches, plan and goal.
 
     In metres and radians in the map frame, rounded to millimetres.
@@ -284,7 +284,7 @@ def _document(scene: Scene, file: str, states: list[dict[str, Any]]) -> dict[str
     }
 
 
-def _told(row: dict[str, Any]) -> str:
+def _caption(row: dict[str, Any]) -> str:
     """Say who drove and how it ended, in words that fit above a picture."""
     ended = "arrives" if row["success"] else row["failure"]
     who = policy_words([row["policy"]])[row["policy"]]
@@ -333,8 +333,8 @@ __all__ = [
     "Scene",
     "drive_again",
     "drive_row",
-    "everything",
+    "scene_state",
     "film_evaluation",
     "scenes",
-    "unlike",
+    "differing_fields",
 ]

@@ -47,7 +47,7 @@ class Evaluated:
     cells: dict[tuple[str, str], _Episodes]  # by perturbation and condition (with its block)
 
 
-def of_run(path: Path, policy: str = AGENT) -> Evaluated:
+def read_run_evaluation(path: Path, policy: str = AGENT) -> Evaluated:
     """Read what `restock eval` wrote of a run's own policy, or of another that it drove beside it.
 
     Raises:
@@ -64,7 +64,7 @@ def check_margin(margin: float) -> None:
         raise ConfigError(f"must be from 0 to 1, got {margin}", where="--margin")
 
 
-def of_baseline(name: str) -> Evaluated:
+def read_baseline(name: str) -> Evaluated:
     """Read a baseline by the directory of a run, a file, or the name that it was saved under.
 
     Raises:
@@ -72,7 +72,7 @@ def of_baseline(name: str) -> Evaluated:
     """
     path = Path(name)
     if path.is_dir():
-        return of_run(path)
+        return read_run_evaluation(path)
     file = baseline_file(name)
     if not file.is_file():
         known = ", ".join(sorted(path.stem for path in FOLDER.glob("*.parquet")))
@@ -161,7 +161,9 @@ def compare_with_baseline(
     Raises:
         RunError: one of them was not evaluated, or is not there.
     """
-    return regression(of_baseline(baseline), of_run(Path(run)), margin=margin, seed=seed)
+    return regression(
+        read_baseline(baseline), read_run_evaluation(Path(run)), margin=margin, seed=seed
+    )
 
 
 def regressed(rows: Sequence[dict[str, Any]]) -> bool:
@@ -268,8 +270,8 @@ def _cells(table: pa.Table) -> dict[tuple[str, str], _Episodes]:
 __all__ = [
     "Evaluated",
     "compare_with_baseline",
-    "of_baseline",
-    "of_run",
+    "read_baseline",
+    "read_run_evaluation",
     "regressed",
     "regression",
     "save_baseline",

@@ -36,10 +36,10 @@ from restock.train.feed.sampled_rows import (
     EpisodeLabels,
     HeldInterval,
     SampledRows,
+    add_names,
     fresh_audit,
     keep_rows,
     logged_audit,
-    named,
     row_hashes,
 )
 from restock.train.run.run import Run
@@ -270,7 +270,7 @@ class FeedRecord(Stateful):
         if len(interval.rows["td"]):
             self._write(self._of_ring(interval), interval.clocks, interval.phase)
         for audit in interval.audits:
-            columns = named(audit, self.ring.conditions, self.ring.strata, UNLABELLED)
+            columns = add_names(audit, self.ring.conditions, self.ring.strata, UNLABELLED)
             self.run.append_columns("audit", columns)
         if interval.quotas is not None and self.quotas is not None:
             steps = {**interval.clocks, "phase": interval.phase}

@@ -186,7 +186,7 @@ class Batches(Stateful):
             slots = np.concatenate([slots, self._sample_fresh(rest, env_steps)])
         return slots
 
-    def learnt(self, batch: ReplayBatch, td: Tensor) -> None:
+    def note_errors(self, batch: ReplayBatch, td: Tensor) -> None:
         """Update priorities and shares by the TD errors (B,) of a batch that was learnt from."""
         if self._draws is not None and self._draws.needs_td and batch.logged:
             td_abs = td[: batch.logged].detach().abs().cpu().numpy()

@@ -221,8 +221,8 @@ class Collector(Stateful):
         if info["invalid"].any():
             self._drop(keys, info["invalid"])
         if self.log is not None:
-            self.log.began(self._steps, self.observation, acting_step)
-            self.log.took(
+            self.log.begin_step(self._steps, self.observation, acting_step)
+            self.log.end_step(
                 self._steps,
                 action=action,
                 probability=probability,
@@ -270,7 +270,7 @@ class Collector(Stateful):
                 )
             )
             if self.log is not None:
-                self.log.ended(
+                self.log.end_episode(
                     int(place),
                     finished[-1],
                     next_observation[place],
@@ -319,7 +319,7 @@ class Collector(Stateful):
         held = label(steps_table(waiting), [*self.conditions, *exposures])
         labels = {condition.name: held[condition.name] for condition in self.conditions}
         if self.log is not None:
-            self.log.labelled(waiting, labels)
+            self.log.keep_labelled(waiting, labels)
         names = primary(labels, self.conditions)
         codes = np.array([self._codes[name] for name in names] or [], np.int64)
         rows, begin = [], 0

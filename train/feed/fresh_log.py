@@ -83,19 +83,21 @@ class FreshLog(Stateful):
         self.parts = 0  # files written
         self.dropped_steps = 0  # whose physics blew up
 
-    def began(self, at: NDArray[np.int64], observation: NDArray[np.float32], version: int) -> None:
-        """Before a step: the observations (N, D) it starts from, `at` (N,) in their episodes."""
+    def begin_step(
+        self, at: NDArray[np.int64], observation: NDArray[np.float32], version: int
+    ) -> None:
+        """Keep the observations (N, D) before a step, `at` (N,) in their episodes."""
         first = at == 0
         self._whole |= first
         self._version[first] = version
         self._observation[np.arange(len(at)), at] = observation
 
-    def took(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
-        """After it: action, probability, reward, progress_m, truth and exposure (N,)."""
+    def end_step(self, at: NDArray[np.int64], **values: NDArray[Any]) -> None:
+        """Keep a step: action, probability, reward, progress_m, truth and exposure, (N,) each."""
         for name, value in values.items():
             self._steps[name][np.arange(len(at)), at] = value
 
-    def ended(
+    def end_episode(
         self,
         env: int,
         episode: EndedEpisode,
@@ -127,7 +129,7 @@ class FreshLog(Stateful):
             **of_steps,
         )
 
-    def labelled(self, episodes: Sequence[EndedEpisode], labels: Mapping[str, Bools]) -> None:
+    def keep_labelled(self, episodes: Sequence[EndedEpisode], labels: Mapping[str, Bools]) -> None:
         """Keep ended episodes; `labels` are over their steps, (steps + 1) each, end to end."""
         kept: list[FreshEpisode] = []
         begin = 0

@@ -36,13 +36,13 @@ from restock.train.feed.logs import Coded, Logs
 _MEASURED = 128  # rows a condition
 
 
-def of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
+def rows_of_policies(policy: Coded, policies: Sequence[str]) -> Bools:
     """Select the rows (n,) of these behaviour policies."""
     codes = [policy.names.index(name) for name in policies if name in policy.names[:-1]]
     return np.isin(policy.codes, codes)
 
 
-def of_successes(
+def rows_of_successes(
     policy: Coded, episode: Coded, reward: F32, discount: F32, policies: Sequence[str]
 ) -> Bools:
     """Select the rows (n,) of episodes that reached their goal without any of `policies`.
@@ -52,7 +52,7 @@ def of_successes(
     well = (discount == 0.0) & (reward > 0.0)
     count = len(episode.names)
     ended = np.bincount(episode.codes[well], minlength=count) > 0
-    helped = np.bincount(episode.codes[of_policies(policy, policies)], minlength=count) > 0
+    helped = np.bincount(episode.codes[rows_of_policies(policy, policies)], minlength=count) > 0
     ended[-1] = False  # no episode is known
     return np.asarray((ended & ~helped)[episode.codes], np.bool_)
 
@@ -63,13 +63,13 @@ def packed_successes(policy: Coded, episode: Coded, packed: F32, policies: Seque
     reward, discount = (
         np.asarray(packed[:, columns[name]]).ravel() for name in ("reward", "discount")
     )
-    return of_successes(policy, episode, reward, discount, policies)
+    return rows_of_successes(policy, episode, reward, discount, policies)
 
 
 def cloned(panel: Panel, teacher: TeacherConfig) -> Bools:
     """Select the rows (n,) of a panel that are cloned before the first environment step."""
     policy = Coded.of(panel.meta["behaviour_policy"])
-    rows = of_policies(policy, teacher.policies)
+    rows = rows_of_policies(policy, teacher.policies)
     if teacher.successes:
         episode = Coded.of(panel.meta["episode_id"])
         rows |= packed_successes(policy, episode, panel.rows, teacher.policies)
@@ -104,7 +104,7 @@ class Imitation(Stateful):
         self._rng = np.random.default_rng([seed, 7])
         self._offline = self._online = _Drawn(np.empty(0, np.int64), np.empty(0))
         if logs is not None:
-            by_teacher = of_policies(logs.behaviour_policy, config.policies)
+            by_teacher = rows_of_policies(logs.behaviour_policy, config.policies)
             every = by_teacher
             if config.successes:
                 every = by_teacher | packed_successes(

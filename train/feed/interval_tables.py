@@ -65,7 +65,7 @@ class SourceRows:
     @cached_property
     def unique(self) -> Ints:
         """Different rows by cell (S, C, A)."""
-        return self._by_cell(one_of_each(self.row * len(self.strata) + self.stratum))
+        return self._by_cell(first_places(self.row * len(self.strata) + self.stratum))
 
     def summed(self, values: NDArray[Any]) -> F64:
         """Sum `values` (n,) by stratum and condition, (S, C)."""
@@ -91,7 +91,7 @@ class SourceRows:
         return np.bincount(cell, minlength=self.pairs * self.action_count).reshape(shape)
 
 
-def one_of_each(key: Ints) -> Ints:
+def first_places(key: Ints) -> Ints:
     """Return the place of one row for each distinct value of `key` (n,), ordered by value.
 
     Keys of rows are dense enough to be marked in place, which takes a thirtieth of sorting them.
@@ -283,7 +283,7 @@ __all__ = [
     "ages",
     "conditions",
     "fed",
-    "one_of_each",
+    "first_places",
     "policies",
     "sampled_episodes",
     "strata",

@@ -236,7 +236,7 @@ def fresh_audit(
     ring: FreshRing,
     perturbations: FreshPerturbations | None = None,
 ) -> Columns:
-    """Return the audit's columns of fresh rows, without names of conditions: `named` adds those."""
+    """Return the audit's columns of fresh rows, without the names that `add_names` adds."""
     keys = rows["episode"]
     return {
         "source": "fresh",
@@ -258,7 +258,7 @@ def fresh_audit(
     }
 
 
-def named(
+def add_names(
     audit: Columns, conditions: Sequence[str], strata: Sequence[str], unlabelled: str
 ) -> Columns:
     """Add names to the columns of `fresh_audit`; `unlabelled` is the stratum of the others."""
@@ -385,5 +385,5 @@ __all__ = [
     "fresh_audit",
     "keep_rows",
     "logged_audit",
-    "named",
+    "add_names",
 ]

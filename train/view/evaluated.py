@@ -23,7 +23,7 @@ from restock.train.evaluation.evaluation_plan import (
     make_policy,
     plan_evaluation,
 )
-from restock.train.evaluation.film import drive_row, everything, unlike
+from restock.train.evaluation.film import differing_fields, drive_row, scene_state
 from restock.train.run.kept_evaluations import read_evaluations
 from restock.train.run.run_profile import profile_of_run
 from restock.train.twin.env.interface import Step
@@ -84,7 +84,7 @@ def evaluated_moment(run: Path, name: str, *, begins_ns: int) -> Evaluated:
             plans.append(plans[-1] if same else np.array(way, np.float64))
             known = bool(np.isfinite(goal).all())
             goals.append((float(goal[0]), float(goal[1])) if known else None)
-            others.append(everything(env, len(others) * task.control_period_s))
+            others.append(scene_state(env, len(others) * task.control_period_s))
             if not racks:
                 racks.extend((r.x_min, r.y_min, r.x_max, r.y_max) for r in env.floor_of(0).racks)
             made = env.step(action)
@@ -107,7 +107,7 @@ def evaluated_moment(run: Path, name: str, *, begins_ns: int) -> Evaluated:
         return step
 
     result = drive_row(plan, row, watched)
-    if differing := unlike(row, result):
+    if differing := differing_fields(row, result):
         raise RunError(
             f"episode {name} driven again has another {', '.join(differing)} than recorded",
             where=str(run),

@@ -102,12 +102,12 @@ class EvalCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, progress, say
         from restock.errors import ExitCode
-        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation, recorded
+        from restock.train.evaluation.eval_run import clones_driven, drive_evaluation, read_recorded
         from restock.train.evaluation.evaluation_plan import plan_evaluation, settings
         from restock.train.evaluation.regression import (
             check_margin,
-            of_baseline,
-            of_run,
+            read_baseline,
+            read_run_evaluation,
             regressed,
             regression,
         )
@@ -128,7 +128,7 @@ class EvalCommand:
         beside = self.baseline if self.baseline in _names(self.policies) else None
         baseline = None
         if self.baseline is not None and beside is None:
-            baseline = of_baseline(self.baseline)
+            baseline = read_baseline(self.baseline)
         plan = plan_evaluation(
             self.run_path,
             policies=_names(self.policies),
@@ -157,7 +157,7 @@ class EvalCommand:
             clones = [{**asdict(one), "text": one.text} for one in clones_driven(plan)]
             document = {**settings(plan), "results": rows, "clones": clones}
         elif self.baseline is None and self.save_as_baseline is None and not self.video:
-            shown, text = recorded(self.run_path)
+            shown, text = read_recorded(self.run_path)
             document = {"results": summary_rows(shown), "recorded": text}
         if self.video:
             from restock.train.evaluation.film import film_evaluation
@@ -167,9 +167,9 @@ class EvalCommand:
             document |= {"films": [str(path) for path in films], "not_filmed": missing}
         compared = None
         if beside is not None:
-            baseline = of_run(self.run_path, beside)
+            baseline = read_run_evaluation(self.run_path, beside)
         if baseline is not None:
-            compared = regression(baseline, of_run(self.run_path), margin=self.margin)
+            compared = regression(baseline, read_run_evaluation(self.run_path), margin=self.margin)
             document |= {"baseline": baseline.name, "margin": self.margin, "regression": compared}
         if self.save_as_baseline is not None:
             document["saved"] = str(save(self.run_path, self.save_as_baseline))

@@ -12,7 +12,7 @@ from restock.report.look.blocks import Rows, span, words
 from restock.report.run import logs_alone
 from restock.report.run.facts import Facts, mean_success
 from restock.report.run.twin_gap import find_gap
-from restock.train.evaluation.regression import EVERY, of_run, regression
+from restock.train.evaluation.regression import EVERY, read_run_evaluation, regression
 from restock.train.twin.calibration.twin_gap import TRUSTED
 
 BASELINES = {
@@ -81,7 +81,7 @@ def compared(facts: Facts, name: str | None = None) -> Rows:
         return []
     if name not in facts.compared:
         try:
-            rows = regression(of_run(facts.run, name), of_run(facts.run))
+            rows = regression(read_run_evaluation(facts.run, name), read_run_evaluation(facts.run))
         except RunError:  # the episodes have no success that can be compared
             rows = []
         facts.compared[name] = [row for row in rows if row["condition"] != EVERY]
