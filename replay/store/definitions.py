@@ -78,9 +78,10 @@ _VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 
 class Definitions:
-    """The views and macros of one connection over `stored_transitions`, `stored_recordings` and
-    `stored_ingests`: which ingests there are, so that no row is scanned for it. They last for as
-    long as the object does.
+    """The views and macros of one connection; they last for as long as this object does.
+
+    They are over `stored_transitions`, `stored_recordings` and `stored_ingests`, which lists the
+    ingests so that no row is scanned for them.
 
     Args:
         connection: that of a store.
@@ -155,8 +156,10 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Have the rows of these in memory, as tables of these names; a view waits under another
-        as it is, which need not be how it was made here."""
+        """Keep the rows of these views in memory, as tables of the same names.
+
+        A view is renamed as it is: the query before may have made it anew.
+        """
         self._make(views)
         for view in views:
             self._connection.execute(
@@ -192,7 +195,7 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Views of a store as tables in memory, for as long as these queries follow."""
+    """Keep views of a store in memory as tables while these queries run."""
     made = _of(connection)
     if made is None:
         yield
@@ -211,7 +214,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
-    """What is held of a store of this size."""
+    """Return the views to keep in memory for a store of this size."""
     rows = _rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
@@ -243,7 +246,7 @@ def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str)
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
-    """The text of these SQL files, with the type that observations are cast to."""
+    """Return the text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
     whole = with_columns(with_included("\n".join(text), folder))
@@ -264,7 +267,7 @@ def _of_store(observation_type: str, names: Sequence[str]) -> str:
 
 
 def made_by(name: str) -> list[str]:
-    """The views and macros of one of these files."""
+    """Return the names of the views and macros of one of these files."""
     return list(_statements(definitions(names=[name])))
 
 
@@ -279,7 +282,7 @@ def _statements(text: str) -> Mapping[str, str]:
 
 @cache
 def _named_in(statement: str) -> frozenset[str]:
-    """What a statement reads, calls, or has in quotes: there are macros of a view's name."""
+    """Return the names that a statement reads, calls, or quotes (macros take a view's name)."""
     sql = re.sub(r"--.*", "", statement)
     found = re.findall(r"\b(?:FROM|JOIN)\s+(\w+)|\b(\w+)\(|'(\w+)'", sql)
     return frozenset(name for names in found for name in names)
