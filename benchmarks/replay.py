@@ -45,8 +45,7 @@ from restock.native import is_used
 from restock.replay.mixture.packed_row import row_width
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.priorities import Lap, Per, PrioritySampler
-from restock.replay.sampling.sampler import uniform_sampler
+from restock.replay.sampling.sampler import QuotaSampler, uniform_sampler
 
 MANY_WIDTH = 16  # floats in a row, of ten million
 RECORD_TARGET = 0.06
@@ -93,17 +92,16 @@ def sampling(quick: bool) -> dict[str, Any]:
     gc.collect()  # the peers' copies of the rows: those for PER come next
     errors = np.random.default_rng(2).exponential(size=count).astype(np.float32)
 
-    def by_priority(rule: Per | Lap, parts: list[np.ndarray], shares: Any) -> Prioritised:
+    def by_priority(parts: list[np.ndarray], shares: Any) -> Prioritised:
         rng = np.random.default_rng(0)
-        return Prioritised(rows, PrioritySampler(parts, shares, BATCH, rng, rule=rule), errors)
+        return Prioritised(rows, QuotaSampler(parts, shares, BATCH, rng, within="per"), errors)
 
     everything = [np.arange(count)]
     peers, more_left_out = installed(contenders.prioritised(columns, BATCH, errors))
     us |= measure(
         {
-            "per": by_priority(Per(), everything, [1.0]),
-            "lap": by_priority(Lap(), everything, [1.0]),
-            "per_within_quotas": by_priority(Per(), stratum_rows, SHARES),
+            "per": by_priority(everything, [1.0]),
+            "per_within_quotas": by_priority(stratum_rows, SHARES),
             **peers,
         },
         *_turns(quick),

@@ -106,7 +106,8 @@ def strata(count: int) -> list[np.ndarray]:
 
 def quota_sampler(stratum_rows: list[np.ndarray], *, replacement: bool = True) -> QuotaSampler:
     rng = np.random.default_rng(0)
-    return QuotaSampler(stratum_rows, SHARES, BATCH, rng, replacement=replacement)
+    within = "uniform" if replacement else "without_replacement"
+    return QuotaSampler(stratum_rows, SHARES, BATCH, rng, within=within)
 
 
 class Columns:

@@ -50,7 +50,10 @@ def list_names() -> Iterator[str]:
         module = importlib.import_module(face)
         yield f"## {face}\n\n{module.__doc__}\n"
         for name in module.__all__:
-            home = getattr(module, name).__module__
+            value = getattr(module, name)
+            if not callable(value):  # a table
+                continue
+            home = value.__module__
             yield f"::: {home}.{name}\n"
 
 

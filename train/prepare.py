@@ -365,7 +365,6 @@ def _logs(panel: Panel, config: TrainConfig, document: dict[str, Any]) -> Logs:
     return Logs.of_panel(
         panel,
         planned_draws(config),
-        config.loss.huber_delta,
         as_of_ns=int(document["created_ns"]),
     )
 

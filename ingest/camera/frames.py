@@ -132,7 +132,7 @@ class CameraFrames:
 
     @property
     def problems(self) -> Counter[str]:
-        """Count messages without an image that can be kept, by reason."""
+        """Messages without an image that can be kept, by why."""
         words = np.asarray(self.columns.fields[PROBLEM], object)
         off = (words == "") & (self.stamp_ns < 0)
         counted = Counter([word for word in words if word])
@@ -220,7 +220,7 @@ def kept_frames(cameras: Mapping[str, CameraFrames], ticks: Ints) -> list[KeptFr
 
 
 def frame_rows(recording: Recording, kept: KeptFrames) -> Iterator[pa.RecordBatch]:
-    """Yield rows by `frame_schema`, some megabytes of images at a time.
+    """Rows by `frame_schema`, some megabytes of images at a time.
 
     A frame is known by its log time and its hash: a message that holds the same at the same moment
     is the same frame.

@@ -144,7 +144,7 @@ def _matched(match: Path) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """Return its recordings and what cannot be looked at: opening that costs it alone."""
+    """Its recordings, and what cannot be looked at: opening that says why, and costs it alone."""
     if is_bag(folder):
         return [folder]
     recordings = []

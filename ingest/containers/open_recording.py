@@ -101,7 +101,7 @@ class _Opening:
             raise
 
     def files(self) -> list[Path]:
-        """Return its storage files."""
+        """Its storage files."""
         return self._files()[0]
 
     def _files(self) -> tuple[list[Path], BagMetadata]:

@@ -72,7 +72,7 @@ class MessageBatch:
         return int((self.stop - self.start).sum())
 
     def payloads(self) -> list[bytes]:
-        """Return each message's bytes."""
+        """Each message's bytes."""
         view = self.buffer.data
         bounds = zip(self.start.tolist(), self.stop.tolist(), strict=True)
         return [bytes(view[start:stop]) for start, stop in bounds]

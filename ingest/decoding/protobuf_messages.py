@@ -63,7 +63,7 @@ class ProtobufType(MessageType):
 
     @property
     def message_class(self) -> Any:
-        """Return the class that parses it."""
+        """The class that parses it."""
         return GetMessageClass(self.pool.FindMessageTypeByName(self.name))
 
 

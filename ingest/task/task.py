@@ -79,7 +79,7 @@ class Task(Checked, frozen=True):
 
     @property
     def observation_names(self) -> list[str]:
-        """Return the name of every entry of the observation, in order."""
+        """The name of every entry of the observation, in order."""
         bearings = (np.arange(self.sectors) + 0.5) * (360 / max(self.sectors, 1)) - 180
         return [
             *("near_sin", "near_cos", "far_sin", "far_cos", "goal_distance"),
@@ -97,12 +97,12 @@ class Task(Checked, frozen=True):
 
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
-        """Return the actions (A, 2) in units of the fastest on each axis, as observed."""
+        """The actions (A, 2) in units of the fastest on each axis, as an observation has them."""
         return np.asarray(self.actions, np.float64) / _fastest(self)
 
     @property
     def action_names(self) -> list[str]:
-        """Return the actions' names for people, e.g. `0.8 m/s left 0.7`."""
+        """The actions for people, e.g. `0.8 m/s left 0.7`."""
         return [_action_name(*action) for action in self.actions]
 
     @property

@@ -46,7 +46,7 @@ class Drift:
         return sum(row["p"] is not None for row in self.own)
 
     def without_findings(self) -> str:
-        """Explain why no change was found: how much was tested, or what a test needs."""
+        """What it means that no change was found: how much was tested, or what a test needs."""
         short = len(self.own) - self.tested
         if self.tested:
             undecided = sum(row["verdict"] == "undecided" for row in self.own)
@@ -140,7 +140,7 @@ def measure_drift(
 
 
 def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
-    """Return notes on comparisons that had too little data."""
+    """What a reader must know of what was not, or hardly, compared."""
     notes = []
     robots = sorted({row["robot"] for row in periods})
     if "untagged" in robots:

@@ -19,7 +19,7 @@ SHARES = ("natural_share", "wanted_share", "share", "effective_share")
 
 
 def diff_panels(first: Panel, second: Panel) -> dict[str, Any]:
-    """Compare two panels: return what `restock coverage diff --json` prints.
+    """What is different in `second`, as plain values: what `restock coverage diff --json` prints.
 
     Raises:
         PanelError: their rows are of different tasks.

@@ -89,7 +89,7 @@ def shopping_list(
     confidence: float = 0.8,
     seed: int = 0,
 ) -> ShoppingList:
-    """Plan what fills the gaps, at the rates of the store's episodes.
+    """What fills the gaps, at the rates of the store's episodes.
 
     Args:
         unit: missions of a kind, or hours of logging; None: missions where the recordings knew the
@@ -143,7 +143,7 @@ def _may_fill(supply: Supply, gap: Gap) -> bool:
 
 
 def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
-    """Return what could fill a gap: missions of its zone and robot, if it names them."""
+    """What fills a gap best: a cell of a zone is filled by missions that come through it."""
     zone, robot = gap.cell.get("zone"), gap.cell.get("robot")
     return [
         Supply(kind, None if zone is None else str(zone), str(robot) if robot else None)
@@ -173,7 +173,7 @@ def _least(
     share: float,
     unit: Unit,
 ) -> dict[Supply, float]:
-    """Compute the least amounts that fill every gap with a known rate, with probability `share`.
+    """The least amounts that fill every gap that can be, where each alone is enough with `share`.
 
     A mission counts for a gap by what it takes of it alone: missing / the amount that is enough.
     """
@@ -208,7 +208,7 @@ def _least(
 def _forecasts(
     table: dict[tuple[int, Supply], Forecast], index: int, supply: Supply
 ) -> list[Forecast]:
-    """Return the forecasts of a supply for a gap; the worst of them counts.
+    """What is known of a supply for a gap; the worst of it counts.
 
     Of many zones the one that was luckiest looks best: where the gap is of any zone, missions
     through one are worth no more than those through all.

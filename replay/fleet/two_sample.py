@@ -1,4 +1,4 @@
-"""Two-sample tests over episodes: how far two samples are apart, and whether that is chance.
+"""Two samples of episodes: how far apart are they, and could that be chance?
 
 The unit is the episode: rows of one are alike, and as rows they would make every trifle certain.
 """

@@ -17,6 +17,8 @@ from msgspec import Meta
 from restock.errors import ConfigError
 from restock.renamed import MIXTURE_KEYS, MIXTURES
 from restock.replay.mixture.schedules import Fraction, Portion, Schedule, knots, value_at
+from restock.replay.sampling.per import Prioritised
+from restock.replay.sampling.rules import RULES
 from restock.toml import Checked, json_schema, parse_toml, read_toml, typed
 
 _SHIPPED = files("restock.replay.mixture") / "mixtures"
@@ -33,7 +35,7 @@ Shortfall = Literal["refuse", "redistribute", "shrink"]
 Unit = Literal["step", "episode"]
 Uncertain = Literal["drop", "keep", "nominal"]
 Prefer = Literal["rarest", "priority"]
-Within = Literal["uniform", "without_replacement", "per", "lap"]
+Within = Annotated[str, Meta(extra_json_schema={"enum": list(RULES)})]  # a rule of RULES
 Represents = Literal["natural", "archive"] | dict[str, Fraction]  # rates of rows, by stratum
 
 
@@ -132,6 +134,10 @@ def _require(ok: bool, message: str) -> None:
         raise ValueError(message)
 
 
+def _check_within(name: str) -> None:
+    _require(name in RULES, f"within is {name!r}: the rules are {', '.join(RULES)}")
+
+
 class PlannedUse(Checked, frozen=True):
     """How much will be drawn, as far as `restock mix` can know; a run puts its own in its place."""
 
@@ -183,29 +189,6 @@ class CorrectionRule(Checked, frozen=True):
     below_natural: Literal["refuse", "allow"] = "refuse"
 
 
-class Prioritised(Checked, frozen=True):
-    """The numbers of `within = "per"` (arXiv:1511.05952) and `"lap"` (arXiv:2007.06049)."""
-
-    per_alpha: Fraction = 0.6  # exponent of |TD|
-    per_beta: Fraction = 0.4  # exponent of the importance weights at the start
-    per_beta_batches: AtLeastOne = 100_000  # batches after which per_beta is 1
-    per_epsilon: Positive = 1e-3  # added to |TD|
-    lap_alpha: Fraction = 0.4  # exponent of max(|TD|, 1)
-
-
-class Adaptive(Checked, frozen=True):
-    """Shares that follow the TD error: group DRO (arXiv:1911.08731) over the strata of the logs."""
-
-    step_size: Positive = 0.05  # of the exponent, per step; |TD| in units of its mean
-    floor: Fraction = 0.01  # smallest share of a stratum with rows
-    ceiling: Fraction = 0.6  # largest share of a stratum
-    every_updates: AtLeastOne = 100  # updates per step
-    after_updates: Count = 1_000  # no step before: first errors depend on the network
-
-    def check(self) -> None:
-        _require(self.floor < self.ceiling, "adaptive needs floor < ceiling")
-
-
 class StratumLimits(Checked, frozen=True, kw_only=True):
     """Keys of one stratum and of all at once."""
 
@@ -222,6 +205,8 @@ class StratumLimits(Checked, frozen=True, kw_only=True):
 
     def check(self) -> None:
         name = getattr(self, "name", "each_condition")
+        if self.within is not None:
+            _check_within(self.within)
         _require(
             self.floor <= self.cap,
             f"floor of {name!r} is {self.floor:g}, above its cap of {self.cap:g}",
@@ -292,7 +277,6 @@ class Mixture(Checked, frozen=True):
     prefer: Prefer = "rarest"  # which stratum gets an episode; priority: the lowest
     max_replays_per_row: FromOne | None = None  # enforced by the run's learner
     shortfall: Shortfall = "redistribute"
-    adaptive: Adaptive | None = None
     # And how, within a stratum.
     within: Within = "without_replacement"
     prioritised: Prioritised = Prioritised()
@@ -308,6 +292,7 @@ class Mixture(Checked, frozen=True):
             bool(self.strata) or self.each_condition is not None,
             "no strata: list some under [[strata]], or give [each_condition]",
         )
+        _check_within(self.within)
         rules: list[Mixture | EachCondition | StratumRule] = [self, *self.strata]
         if self.each_condition is not None:
             rules.append(self.each_condition)
@@ -315,11 +300,6 @@ class Mixture(Checked, frozen=True):
             self.sampling == "memory"
             or all(rule.within in (None, "without_replacement") for rule in rules),
             'sampling = "chunked" shuffles by itself: within must be "without_replacement"',
-        )
-        _require(
-            self.adaptive is None
-            or all(isinstance(rule.share, int | float | str) for rule in self.strata),
-            "a stratum's share cannot follow both a schedule and [adaptive]",
         )
         names = [rule.name for rule in self.strata]
         _require(len(set(names)) == len(names), f"strata named twice: {sorted(names)}")

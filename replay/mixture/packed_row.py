@@ -11,7 +11,7 @@ n a row has. Truncation is no termination: such a row bootstraps, with the n it 
 from __future__ import annotations
 
 # Raised when packing changes, of a row or of what stands beside it; part of a panel's id.
-PACKING_VERSION = 3
+PACKING_VERSION = 4
 
 
 SCALARS = ("action", "reward", "discount")

@@ -9,7 +9,7 @@ import numpy as np
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Adaptive, Mixture, Share, Shortfall, StratumRule
+from restock.replay.mixture.mixture import Mixture, Share, Shortfall, StratumRule
 from restock.replay.mixture.schedules import value_at
 
 
@@ -107,24 +107,6 @@ def within_limits(
     got = scaled_within(granted, granted, roof)
     more = (got > granted + 1e-9) & ~short
     return SharePlan(wanted, got, 1.0, tuple(np.where(more, "took the surplus", notes).tolist()))
-
-
-def adaptive_bounds(rule: Adaptive, shares: F64, floor: F64, cap: F64) -> tuple[F64, F64]:
-    """Within what the shares (S,) of strata that are drawn may follow the TD error, (S,) each.
-
-    Raises:
-        MixtureError: floors that sum to more than 1, or ceilings to less.
-    """
-    drawn = shares > 0
-    high = np.where(drawn, np.minimum(cap, rule.ceiling), 0.0)
-    low = np.minimum(np.where(drawn, np.maximum(floor, rule.floor), 0.0), high)
-    if low.sum() > 1 + 1e-9 or high.sum() < 1 - 1e-9:
-        raise MixtureError(
-            f"adaptive: {int(drawn.sum())} strata cannot share out 1 with floors that sum to"
-            f" {low.sum():g} and ceilings that sum to {high.sum():g}",
-            remedy="lower adaptive.floor, raise adaptive.ceiling, or drop [adaptive]",
-        )
-    return low, high
 
 
 def wanted_shares(rules: Sequence[StratumRule], rows: Ints | F64, env_steps: float = 0) -> F64:

@@ -5,9 +5,8 @@
     sampler.gather(batch.rows, out)                  # (B, W) float32
     sampler.update(batch.rows, batch.strata, td_abs)  # once it was learnt from
 
-The shares follow the mixture's schedules and its [adaptive] rule, a stratum's rows are drawn by its
-`within`, weights are those of the shares in force, and no row comes more often than
-`max_replays_per_row`.
+The shares follow the mixture's schedules, a stratum's rows are drawn by its `within`, weights are
+those of the shares in force, and no row comes more often than `max_replays_per_row`.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from restock.arrays import F32, F64, Bools, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import Mixture
 from restock.replay.mixture.represented import stands_for_others
-from restock.replay.plan.plan import outcome_column
-from restock.replay.plan.strata import rules_of
-from restock.replay.plan.weights import WeightsInForce
-from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.priorities import sampler_by_rules
-from restock.replay.sampling.sampler import QuotaSampler, Sampler
-from restock.replay.sampling.share_controller import (
+from restock.replay.mixture.share_controller import (
     PlannedDraws,
     SampledStratum,
     ShareController,
 )
+from restock.replay.plan.plan import outcome_column
+from restock.replay.plan.strata import rules_of
+from restock.replay.plan.weights import WeightsInForce
+from restock.replay.sampling.chunked import ChunkedSampler
+from restock.replay.sampling.rules import follow_td
+from restock.replay.sampling.sampler import QuotaSampler, Sampler
 from restock.state import Stateful
 
 if TYPE_CHECKING:
@@ -61,7 +60,7 @@ class LoggedSampler(Stateful):
         rows: (n, W) the packed rows.
         weights: importance weights of the rows: (n,), or those that follow the shares; None: ones.
         rng: of the replacements.
-        needs_td: whether shares or priorities follow the TD errors given to `update`.
+        needs_td: whether priorities follow the TD errors given to `update`.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("sampler", "controller", "replays", "replaced", "_rng")
@@ -148,8 +147,6 @@ class LoggedSampler(Stateful):
     def update(self, rows: Ints, strata: Ints, td_abs: NDArray[Any]) -> None:
         """|TD error| (n,) of rows (n,) of these strata (n,) that were just learnt from."""
         self.sampler.update(rows, td_abs)
-        if self.controller.observe(strata, td_abs):
-            self._follow()
 
     def _follow(self) -> None:
         """The sampler and the weights take over the controller's shares."""
@@ -234,7 +231,6 @@ def sampler_for(
     seed: int | Sequence[int],
     planned: PlannedDraws | None = None,
     logs_share: float | None = None,
-    lap_floor: float = 1.0,
     fresh: Bools | None = None,
 ) -> LoggedSampler:
     """The sampler that draws from a panel as its mixture says.
@@ -245,7 +241,6 @@ def sampler_for(
         planned: what will be drawn, which `max_replays_per_row` is shared out by; default: what the
             mixture says under [planned].
         logs_share: of an online batch, in place of the mixture's.
-        lap_floor: the threshold of the Huber loss, where `within = "lap"`.
         fresh: (S,) which strata rows of a ring beside the panel can be in; None: there is no ring.
 
     Raises:
@@ -254,7 +249,6 @@ def sampler_for(
     """
     header = panel.header
     mixture, members = header.mixture, panel.stratum_rows()
-    within = [stratum.within for stratum in panel.strata]
     controller = controller_for(panel, planned or planned_by(mixture), logs_share, fresh)
     seeds = _seeds(seed)
     rng = np.random.default_rng([*seeds, 2])
@@ -262,14 +256,14 @@ def sampler_for(
     if mixture.sampling == "chunked":
         sampler = ChunkedSampler(panel.rows, members, controller.shares, batch_size, rng)
     else:
-        sampler = sampler_by_rules(
-            within,
+        sampler = QuotaSampler(
             members,
             controller.shares,
             batch_size,
             rng,
-            mixture.prioritised,
-            lap_floor=lap_floor,
+            within=[stratum.within for stratum in panel.strata],
+            prioritised=mixture.prioritised,
+            column=panel.meta_column,
         )
     return LoggedSampler(
         controller,
@@ -311,7 +305,7 @@ def sampler_by_shares(
             controller.shares,
             batch_size,
             np.random.default_rng([seed, 2]),
-            replacement=False,
+            within="without_replacement",
         ),
         rows,
         stratum_rows,
@@ -322,8 +316,7 @@ def sampler_by_shares(
 
 def needs_td(panel: Panel) -> bool:
     """Whether draws from a panel follow the TD errors of what was drawn."""
-    by_priority = any(stratum.within in ("per", "lap") for stratum in panel.strata)
-    return by_priority or panel.header.mixture.adaptive is not None
+    return follow_td(stratum.within for stratum in panel.strata)
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:

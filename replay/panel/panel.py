@@ -186,8 +186,8 @@ class Panel:
         stamp_ns, logged_ns, condition, zone, behaviour_policy, behaviour_version,
         action_probability, action, reward (of one step), terminated, truncated, perturbation,
         stratum, stratum_code (its place in `strata`), horizon, weight; where the mixture says so,
-        return_to_go and return_to_go_whole (it ran to a termination); and what adaptive shares
-        need (state_code, probability_of_…)."""
+        return_to_go and return_to_go_whole (it ran to a termination); and what weights under
+        shares that move need (state_code, probability_of_…)."""
         if self._meta is None:
             self._meta = self._read(META).unify_dictionaries()
         return self._meta
@@ -198,7 +198,10 @@ class Panel:
         Raises:
             PanelError: it has no such column.
         """
-        table = self._read(META, [name]) if self._meta is None else self._meta
+        try:
+            table = self._read(META, [name]) if self._meta is None else self._meta
+        except PanelError:  # it has no such column, or is damaged: then this raises again
+            table = self.meta
         if name not in table.column_names:
             has = ", ".join(self.meta.column_names)
             what = f"its meta has no column {name!r}"

@@ -17,7 +17,6 @@ from restock.replay.mixture.mixture import Mixture, StratumRule
 from restock.replay.mixture.schedules import knots
 from restock.replay.mixture.shares import (
     SharePlan,
-    adaptive_bounds,
     has_minimum,
     missing_rows,
     plan_shares,
@@ -124,9 +123,6 @@ def plan_source(
         f"{name} {lacking[name]}" for name in wanted if name in lacking and name not in untold
     )
     _refuse_later_shares(rules, rows if natural is None else natural)
-    if mixture.adaptive is not None:  # as a run would refuse it
-        floors, caps = (np.array([getattr(r, of) for r in rules]) for of in ("floor", "cap"))
-        adaptive_bounds(mixture.adaptive, shares.got, floors, caps)
     # A share with a schedule may begin at 0; others that are 0 are never drawn.
     scheduled = np.array([not isinstance(rule.share, int | float | str) for rule in rules])
     drawn = (shares.got > 0) | (scheduled & has_minimum(rules, rows, episodes))

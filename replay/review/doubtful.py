@@ -47,7 +47,7 @@ _COLUMNS += ["open", VERDICT]  # of a review file
 
 
 def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
-    """Return the events whose labels are most doubtful, the most doubtful first.
+    """The events whose label is most doubtful, first the one that is most so.
 
     Of a condition with a probability: those whose mean log odds speak least for the label, and
     stretches without the label that are likely enough to be a missed event. Of others: the
@@ -67,10 +67,8 @@ def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
 
 
 def opened_by(event: DoubtfulEvent, store: str) -> str:
-    """Return the command that shows an event's first step.
-
-    If the recording is at hand, the command also shows the messages behind the step.
-    """
+    """The command that shows an event's first step, with the messages that it was made of where
+    the recording is at hand."""
     words = ["restock", "trace", store, str(event.transition_id)]
     if Path(event.source_file).exists():
         words += ["--recording", event.source_file]
@@ -78,7 +76,7 @@ def opened_by(event: DoubtfulEvent, store: str) -> str:
 
 
 def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]:
-    """Return the lines of a review file, with an empty verdict in each."""
+    """The lines of a review file, with a verdict to fill in."""
     rows = []
     for event in events:
         row = asdict(event)
@@ -93,7 +91,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
 
 
 def review_csv(rows: list[dict[str, Any]]) -> str:
-    """Return the text of a review file."""
+    """A review file."""
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()

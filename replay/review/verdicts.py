@@ -85,7 +85,7 @@ class _Episode:
 
 
 def read_verdicts(path: Path | str, store: Store) -> Verdicts:
-    """Read the corrections of a review file, and check every line.
+    """The corrections that a file gives, every line of it checked.
 
     Raises:
         LabelError: the file cannot be read, a line names rows or a condition that are not there,
@@ -151,7 +151,7 @@ class _Reading:
         self.problems.append(f"line {line}: {what}")
 
     def _refuse(self) -> None:
-        """Raise LabelError if problems were found."""
+        """Raises LabelError where problems were found."""
         if not self.problems:
             return
         shown = self.problems[:_MAX_SAID]
@@ -179,7 +179,7 @@ class _Reading:
             ) from error
 
     def _check_columns(self, columns: set[str]) -> None:
-        """Raise LabelError if a column is missing."""
+        """Raises LabelError where a column is missing."""
         needed = (("condition",), ("episode_id", "recording"), ("first_step",), ("last_step",))
         missing = [
             " or ".join(names)
@@ -195,7 +195,7 @@ class _Reading:
             )
 
     def _line(self, line: int, said: Mapping[str, str]) -> Verdict | None:
-        """Read a line; None if it has no verdict, or a problem."""
+        """A line; None where it has no verdict, or a problem."""
         words = {said[name].lower() for name in (VERDICT, "value") if said.get(name)}
         if not words:
             self.left_open += 1
@@ -228,7 +228,7 @@ class _Reading:
         return None
 
     def _episodes(self, verdicts: list[Verdict]) -> dict[str, list[_Episode]]:
-        """Look up the episodes that verdicts name, by the id of an episode or a recording."""
+        """The episodes of each place that is named: one of an episode's id, or a recording's."""
         wanted = sorted({verdict.place for verdict in verdicts})
         table = self.store.connection.sql(_ROWS, params={"wanted": wanted}).to_arrow_table()
         found: dict[str, list[_Episode]] = {}
@@ -294,7 +294,7 @@ class _Reading:
         return episode
 
     def _stretches(self, verdict: Verdict, episode: _Episode) -> Iterator[tuple[bool, Ints]]:
-        """Turn a verdict into corrections of the event's own steps and of its true steps."""
+        """What is said of which rows: of the event's own steps, and of those it truly has."""
         own = _between(episode.step, verdict.first_step, verdict.last_step)
         if verdict.extent is None:
             yield verdict.value, own

@@ -25,6 +25,7 @@ from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
 from restock.replay.mixture.packed_row import row_columns, row_width
 from restock.replay.ring.slots import NONE, Reserve, StratumSlots
+from restock.replay.sampling.draws import uniform_places
 from restock.state import Stateful
 
 UNLABELLED = NONE
@@ -371,7 +372,7 @@ class FreshRing(Stateful):
             if since is not None:
                 members = members[self.meta["env_step"][members] >= since]
             if len(members):
-                found.append(members[(at[begin - count : begin] * len(members)).astype(np.int64)])
+                found.append(members[uniform_places(at[begin - count : begin], len(members))])
         slots = np.concatenate(found)
         if limit is not None:
             np.add.at(self.draws, slots, 1)

@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.sampling.quotas import Quotas
+from restock.replay.sampling.draws import StratumDraws
 from restock.replay.sampling.row_file import RowFile
-from restock.replay.sampling.sampler import another_sampler
-from restock.state import Stateful
+from restock.replay.sampling.sampler import BlockSampler, Quotas
 
 CHUNK_ROWS = 16_384
 MEMORY_BYTES = 512 << 20
 
 
-class ChunkedSampler(Stateful):
+class ChunkedSampler(BlockSampler):
     """Exact quotas per batch over strata of a panel that need not fit in memory.
 
     Args:
@@ -49,9 +48,6 @@ class ChunkedSampler(Stateful):
         PanelError: `rows` is not memory-mapped.
     """
 
-    SAME: ClassVar[tuple[str, ...]] = ("sizes",)
-    STATE: ClassVar[tuple[str, ...]] = ("quotas", "rng", "buffers")
-
     def __init__(
         self,
         rows: F32,
@@ -63,97 +59,50 @@ class ChunkedSampler(Stateful):
         chunk_rows: int = CHUNK_ROWS,
         memory_bytes: int = MEMORY_BYTES,
     ) -> None:
-        if len(stratum_rows) != len(shares):
-            raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
-        if chunk_rows < 1:
-            raise MixtureError(f"chunk_rows must be at least 1, got {chunk_rows}")
-        self.sizes: Ints = np.array([len(members) for members in stratum_rows], np.int64)
-        self.quotas = Quotas(shares, batch_size, self.sizes)
-        self.rng = rng
+        members = [np.sort(np.asarray(rows, np.int64)) for rows in stratum_rows]
+        sizes = np.array([len(rows) for rows in members], np.int64)
         self._file = RowFile(rows)
         row_bytes = 4 * self._file.width + 16  # with its number and its place in the order
-        room = _share_out(self.sizes, memory_bytes // row_bytes)
-        for stratum, (size, part) in enumerate(zip(self.sizes, room, strict=True)):
+        room = _share_out(sizes, memory_bytes // row_bytes)
+        for stratum, (size, part) in enumerate(zip(sizes, room, strict=True)):
             if part < min(size, 2 * chunk_rows):
                 raise MixtureError(
                     f"{memory_bytes:,} bytes leave stratum {stratum} a buffer of {part:,} rows,"
                     f" less than two chunks of {chunk_rows:,}",
                     remedy="give it more memory, or read in smaller chunks",
                 )
-        self.buffers = [
-            _Buffer(self._file, np.sort(np.asarray(members, np.int64)), part, chunk_rows)
-            for members, part in zip(stratum_rows, room.tolist(), strict=True)
+        self._buffers = [
+            _Buffer(self._file, numbers, part, chunk_rows)
+            for numbers, part in zip(members, room.tolist(), strict=True)
         ]
-        self._slots: list[tuple[_Buffer, Ints]] = []  # of the batch last drawn
+        super().__init__(
+            self._buffers,
+            members,
+            Quotas(shares, batch_size, sizes),
+            rng,
+            within=["chunked"] * len(members),
+            block=1,
+        )
 
-    @property
-    def batch_size(self) -> int:
-        return self.quotas.batch_size
-
-    @property
-    def shares(self) -> F64:
-        return self.quotas.shares
-
-    @property
-    def drawn_weights(self) -> F32 | None:
-        """Importance weights that the batch last drawn needs: none, its rows are drawn alike."""
-        return None
-
-    def draw(self) -> tuple[Ints, Ints]:
-        """Row numbers (B,) and the stratum of each (B,), strata in order."""
-        quota = self.quotas.next()
-        self._slots = []
-        parts = []
-        for stratum in np.flatnonzero(quota).tolist():
-            buffer, left = self.buffers[stratum], int(quota[stratum])
-            # What one stratum has of a batch may be more than lies in its buffer.
-            if left > buffer.chunk_rows:
-                raise MixtureError(
-                    f"a batch takes {left:,} rows of stratum {stratum}, more than a chunk of"
-                    f" {buffer.chunk_rows:,}",
-                    remedy="read in larger chunks",
-                )
-            slots = buffer.take(left, self.rng)
-            parts.append(buffer.numbers[slots])
-            self._slots.append((buffer, slots))
-        return np.concatenate(parts), np.repeat(np.arange(len(quota)), quota)
+    def _draw_block(self) -> None:
+        for buffer in self._buffers:
+            buffer.slots = buffer.slots[:0]
+        super()._draw_block()
 
     def gather(self, out: F32) -> None:
         """The packed rows of the batch last drawn into `out` (B, W)."""
         begin = 0
-        for buffer, slots in self._slots:
-            np.take(buffer.rows, slots, axis=0, out=out[begin : begin + len(slots)], mode="clip")
-            begin += len(slots)
-
-    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """|TD error| (n,) of rows (n,) that were just learnt from: changes nothing here."""
-
-    def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Other shares (S,) from the next batch on.
-
-        Raises:
-            MixtureError: shares that are no distribution, or a share on an empty stratum.
-        """
-        self.quotas.set_shares(shares)
-
-    def set_batch_size(self, batch_size: int) -> None:
-        """Batches of another size from the next one on."""
-        self.quotas.set_batch_size(batch_size)
+        for buffer in self._buffers:
+            end = begin + len(buffer.slots)
+            np.take(buffer.rows, buffer.slots, axis=0, out=out[begin:end], mode="clip")
+            begin = end
 
     def close(self) -> None:
         """Close the panel's file."""
         self._file.close()
 
-    def restored(self) -> None:
-        """The rows of the batch last drawn are not in the buffers any more."""
-        self._slots = []
 
-    def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state of a sampler over other strata."""
-        return another_sampler()
-
-
-class _Buffer(Stateful):
+class _Buffer(StratumDraws):
     """A stratum's shuffle buffer: `capacity` rows, filled up a chunk at a time.
 
     `order` names the slots that hold rows to be drawn, the first `filled` of it, in random order;
@@ -161,7 +110,7 @@ class _Buffer(Stateful):
     """
 
     SAME: ClassVar[tuple[str, ...]] = ("capacity", "chunk_rows")
-    STATE: ClassVar[tuple[str, ...]] = ("numbers", "_order", "_filled", "_chunks", "_loaded")
+    STATE: ClassVar[tuple[str, ...]] = ("places", "_order", "_filled", "_chunks", "_loaded")
 
     def __init__(self, file: RowFile, members: Ints, capacity: int, chunk_rows: int) -> None:
         self._file, self._members = file, members  # ascending
@@ -169,14 +118,26 @@ class _Buffer(Stateful):
         self.whole = capacity >= len(members)  # it is all in memory
         self.chunk_rows = chunk_rows
         self.rows: F32 = np.empty((capacity, file.width), np.float32)
-        self.numbers: Ints = np.full(capacity, -1, np.int64)  # of the row in each slot
+        self.places: Ints = np.full(capacity, -1, np.int64)  # in the stratum, of each slot's row
+        self.slots: Ints = np.empty(0, np.int64)  # of the batch last drawn
         self._order: Ints = np.arange(capacity)
         self._filled = 0
         self._chunks: Ints = np.empty(0, np.int64)  # of this epoch, still to be read
         self._loaded = False
 
-    def take(self, count: int, rng: np.random.Generator) -> Ints:
-        """The slots of the next rows, (count,): their rows stay there until the next `take`."""
+    def draw(self, count: int, rng: np.random.Generator, batches: int) -> tuple[Ints, None]:
+        """Draw rows that stay in their slots until the next draw."""
+        # What one stratum has of a batch may be more than lies in its buffer.
+        if count > self.chunk_rows:
+            raise MixtureError(
+                f"a batch takes {count:,} rows of a stratum, more than a chunk of"
+                f" {self.chunk_rows:,}",
+                remedy="read in larger chunks",
+            )
+        self.slots = self._take(count, rng)
+        return self.places[self.slots], None
+
+    def _take(self, count: int, rng: np.random.Generator) -> Ints:
         if self.whole:
             return self._take_whole(count, rng)
         if len(self._chunks) and self.capacity - self._filled >= self.chunk_rows:
@@ -197,7 +158,7 @@ class _Buffer(Stateful):
     def _take_whole(self, count: int, rng: np.random.Generator) -> Ints:
         if not self._loaded:
             self._file.read(self._members, self.rows)
-            self.numbers[:] = self._members
+            self.places[:] = np.arange(len(self._members))
             self._loaded = True
         parts = []
         while count:
@@ -212,22 +173,23 @@ class _Buffer(Stateful):
 
     def _fill(self, upto: int, rng: np.random.Generator) -> None:
         """Read what fits of this epoch's chunks, and shuffle all that is to be drawn."""
-        while len(self._chunks) and self._filled + len(members := self._chunk(0)) <= upto:
+        while len(self._chunks) and self._filled + len(places := self._chunk(0)) <= upto:
+            members = self._members[places]
             slots = np.sort(self._order[self._filled : self._filled + len(members)])
             staged = np.empty((len(members), self.rows.shape[1]), np.float32)
             self._file.read(members, staged)
             self.rows[slots] = staged
-            self.numbers[slots] = members
+            self.places[slots] = places
             self._order[self._filled : self._filled + len(members)] = slots
             self._filled += len(members)
             self._chunks = self._chunks[1:]
             if len(self._chunks):
-                self._file.expect(self._chunk(0))
+                self._file.expect(self._members[self._chunk(0)])
         rng.shuffle(self._order[: self._filled])
 
     def _chunk(self, index: int) -> Ints:
         begin = int(self._chunks[index]) * self.chunk_rows
-        return self._members[begin : begin + self.chunk_rows]
+        return np.arange(begin, min(begin + self.chunk_rows, len(self._members)))
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
         """Of a state of another memory, or other chunks."""
@@ -240,12 +202,12 @@ class _Buffer(Stateful):
         """Read the buffer's rows again."""
         # Rows that were drawn already need not be read again.
         waiting = np.arange(self.capacity) if self.whole else self._order[: self._filled]
-        waiting = waiting[self.numbers[waiting] >= 0]
-        waiting = waiting[np.argsort(self.numbers[waiting], kind="stable")]
+        waiting = waiting[self.places[waiting] >= 0]
+        waiting = waiting[np.argsort(self.places[waiting], kind="stable")]
         for begin in range(0, len(waiting), self.chunk_rows):
             slots = waiting[begin : begin + self.chunk_rows]
             staged = np.empty((len(slots), self.rows.shape[1]), np.float32)
-            self._file.read(self.numbers[slots], staged)
+            self._file.read(self._members[self.places[slots]], staged)
             self.rows[slots] = staged
 
 

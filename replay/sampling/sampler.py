@@ -7,7 +7,8 @@ of 12, and a share of 0.003 of a batch is met over time, because the rounding is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -15,10 +16,15 @@ from numpy.typing import NDArray
 
 from restock.arrays import F32, F64, Ints
 from restock.errors import MixtureError
-from restock.replay.sampling.quotas import Quotas
+from restock.replay.sampling.draws import StratumDraws, StratumRows
+from restock.replay.sampling.per import Prioritised
+from restock.replay.sampling.rules import RULES, follow_td
 from restock.state import Stateful
 
 BLOCK = 64  # batches drawn at a time
+# Of batches drawn ahead by rules that follow TD errors: a sixteenth of the rows, so that few come
+# again before what was learnt of them counts; many rows cost more to sum.
+MIN_BLOCK, MAX_BLOCK = 8, 128
 
 
 def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
@@ -48,7 +54,7 @@ def checked_errors(td_abs: NDArray[Any], rows: NDArray[Any]) -> F32:
 
 
 class Sampler(Protocol):
-    """What draws the rows of batches. `QuotaSampler`, `PrioritySampler` and `ChunkedSampler`."""
+    """What draws the rows of batches. `QuotaSampler` and `ChunkedSampler`."""
 
     @property
     def batch_size(self) -> int: ...
@@ -80,64 +86,153 @@ class Sampler(Protocol):
         """Puts the draws to come where `state_dict` found them."""
 
 
-class QuotaSampler(Stateful):
-    """Exact quotas per batch over strata of rows, each stratum's rows alike.
+class Quotas(Stateful):
+    """Shares to whole rows per batch by largest remainder, the rounding carried to the next.
 
-    Batches are drawn BLOCK at a time and handed out one by one, which takes the cost of a draw from
-    about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
+    Shares and batch size may change between batches; what a stratum is owed stays owed.
 
     Args:
-        stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty where
-            their share is 0.
-        shares: of each stratum, (S,), summing to 1.
-        batch_size: rows per draw.
-        rng: the generator of the draws; its state is part of `state_dict`.
-        weights: importance weight of each row number, or None for ones.
-        replacement: False goes through a stratum in shuffled order before any row repeats
-            (within it, rows differ by at most one draw); for all strata or for each, (S,).
+        sizes: rows of each stratum (S,), where a share on an empty one is to be refused.
 
     Raises:
-        MixtureError: shares that are no distribution, or a share on an empty stratum.
+        MixtureError: shares that are no distribution or on an empty stratum, or a batch of no rows.
     """
 
-    SAME: ClassVar[tuple[str, ...]] = ("sizes", "_turns")
+    STATE: ClassVar[tuple[str, ...]] = ("shares", "batch_size", "_carry")
+
+    def __init__(
+        self, shares: Sequence[float] | F64, batch_size: int, sizes: Ints | None = None
+    ) -> None:
+        self._strata = len(shares) if sizes is None else len(sizes)
+        self._empty = np.zeros(self._strata, np.bool_) if sizes is None else sizes == 0
+        self.shares: F64 = np.empty(0)
+        self.batch_size = 0
+        self._mean: list[float] = []
+        self._carry: list[float] = [0.0] * len(shares)
+        self.set_shares(shares)
+        self.set_batch_size(batch_size)
+
+    @property
+    def carry(self) -> F64:
+        """Rows that each stratum is still owed, (S,)."""
+        return np.array(self._carry)
+
+    @carry.setter
+    def carry(self, owed: F64) -> None:
+        self._carry = np.asarray(owed, np.float64).tolist()
+
+    def checked(self, shares: Sequence[float] | F64) -> F64:
+        """Shares (S,) as `set_shares` would take them, summing to 1."""
+        given = np.asarray(shares, np.float64)
+        if given.ndim != 1 or not len(given) or not np.isfinite(given).all() or (given < 0).any():
+            raise MixtureError(f"shares must be finite and not negative, got {shares!r}")
+        if abs(given.sum() - 1.0) > 1e-6:
+            raise MixtureError(f"shares must sum to 1, got {given.sum():.6g}")
+        if len(given) != self._strata:
+            raise MixtureError(f"{len(given)} shares for {self._strata} strata")
+        for stratum in np.flatnonzero((given > 0) & self._empty).tolist():
+            raise MixtureError(
+                f"stratum {stratum} has a share of {given[stratum]:g} and no rows",
+                remedy="give it share 0, or let `restock mix` redistribute it",
+            )
+        total = given.sum()
+        # Shares that were made to sum to 1 before stay the same to the last bit.
+        return given if abs(total - 1.0) < 1e-12 else np.asarray(given / total)
+
+    def set_shares(self, shares: Sequence[float] | F64) -> None:
+        """Other shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
+        self.shares = self.checked(shares)
+        self._mean = (self.shares * self.batch_size).tolist()
+        drawn = self.shares > 0
+        carry = np.where(drawn, self.carry, 0.0)
+        self._carry = (carry - np.where(drawn, carry.sum() / drawn.sum(), 0.0)).tolist()
+
+    def set_batch_size(self, batch_size: int) -> None:
+        """Another size from the next batch on."""
+        if not isinstance(batch_size, int | np.integer) or batch_size < 1:
+            raise MixtureError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
+        self.batch_size = int(batch_size)
+        self._mean = (self.shares * batch_size).tolist()
+
+    def restored(self) -> None:
+        """What follows from shares and batch size."""
+        self._mean = (self.shares * self.batch_size).tolist()
+
+    def next(self) -> Ints:
+        """Rows per stratum of the next batch, (S,); they sum to the batch size."""
+        first: Ints = self.take(1)[0]
+        return first
+
+    def take(self, batches: int) -> Ints:
+        """Rows per stratum of the next batches, (n, S); each sums to the batch size."""
+        if len(self.shares) == 1:
+            return np.full((batches, 1), self.batch_size, np.int64)
+        # Plain lists: for a handful of strata numpy's calls cost more than the work.
+        mean, size, carry = self._mean, self.batch_size, self._carry
+        strata = range(len(mean))
+        quotas = []
+        for _ in range(batches):
+            owed = list(map(operator.add, mean, carry))
+            quota = [int(part) if part > 0 else 0 for part in owed]
+            rest = list(map(operator.sub, owed, quota))
+            short = size - sum(quota)
+            if short > 0:
+                for index in sorted(strata, key=rest.__getitem__, reverse=True)[:short]:
+                    quota[index] += 1
+                    rest[index] -= 1.0
+            for _ in range(-short):  # strata in debt can leave the others owed a row too many
+                index = min((i for i, q in enumerate(quota) if q), key=rest.__getitem__)
+                quota[index] -= 1
+                rest[index] += 1.0
+            quotas.append(quota)
+            carry = rest
+        self._carry = carry
+        return np.array(quotas, np.int64)
+
+    def give_back(self, quotas: Ints) -> None:
+        """Batches that were not handed out after all, (n, S): their strata are owed them again."""
+        back = self.carry + quotas.sum(axis=0) - len(quotas) * np.array(self._mean)
+        self._carry = back.tolist()
+
+
+class BlockSampler(Stateful):
+    """Exact quotas per batch over strata, the rows of each by draws of its own.
+
+    Batches are drawn a block at a time and handed out one by one, which takes the cost of a draw
+    from about that of the gather to a tenth of it; what is drawn ahead is part of `state_dict`.
+
+    Args:
+        draws: of each stratum, (S,).
+        stratum_rows: the row numbers of each stratum, S arrays (n_s,).
+        block: batches drawn at a time.
+    """
+
+    SAME: ClassVar[tuple[str, ...]] = ("sizes", "within")
     STATE: ClassVar[tuple[str, ...]] = (
-        *("quotas", "rng", "_orders", "_cursor", "_returned"),
-        *("_ahead_rows", "_ahead_strata", "_next"),
+        *("quotas", "rng", "draws", "_batches", "_next"),
+        *("_ahead_rows", "_ahead_places", "_ahead_strata", "_ahead_weights"),
     )
-    block = BLOCK
 
     def __init__(
         self,
-        stratum_rows: Sequence[NDArray[Any]],
-        shares: Sequence[float] | F64,
-        batch_size: int,
+        draws: Sequence[StratumDraws],
+        stratum_rows: Sequence[Ints],
+        quotas: Quotas,
         rng: np.random.Generator,
         *,
-        weights: F32 | None = None,
-        replacement: bool | Sequence[bool] = True,
+        within: Sequence[str],
+        block: int,
     ) -> None:
-        if len(stratum_rows) != len(shares):
-            raise MixtureError(f"{len(stratum_rows)} strata but {len(shares)} shares")
+        self.draws, self.within, self.block = list(draws), list(within), block
+        self.quotas, self.rng = quotas, rng
+        self._rows = list(stratum_rows)
         self.sizes: Ints = np.array([len(rows) for rows in stratum_rows], np.int64)
-        self.quotas = Quotas(shares, batch_size, self.sizes)
-        self._members = [np.array(rows, np.int64) for rows in stratum_rows]
-        last = max((int(rows.max(initial=-1)) for rows in self._members), default=-1)
-        self.weights: F32 = np.ones(last + 1, np.float32) if weights is None else weights
-        self.rng = rng
-        again = replacement
-        self._again = [again] * len(shares) if isinstance(again, bool) else list(again)
-        if len(self._again) != len(shares):
-            raise MixtureError(f"{len(self._again)} rules for {len(shares)} strata")
-        self._turns = [stratum for stratum, repeats in enumerate(self._again) if not repeats]
-        self._cursor: Ints = np.zeros(len(self.sizes), np.int64)
-        for stratum in self._turns:
-            self.rng.shuffle(self._members[stratum])
-        # Rows whose turn came and that were not handed out, because the shares changed: next ones.
-        self._returned = [np.empty(0, np.int64) for _ in self._members]
-        self._ahead_rows: Ints = np.zeros((0, batch_size), np.int64)
-        self._ahead_strata: Ints = np.zeros((0, batch_size), np.int64)
+        self._batches = 0  # handed out
         self._next = 0  # of those drawn ahead
+        none: Ints = np.zeros((0, self.batch_size), np.int64)
+        self._ahead_rows, self._ahead_strata = none, none
+        self._ahead_places = none  # within their strata
+        self._ahead_weights: F32 | None = None
 
     @property
     def batch_size(self) -> int:
@@ -149,21 +244,22 @@ class QuotaSampler(Stateful):
 
     @property
     def drawn_weights(self) -> F32 | None:
-        """Importance weights that the batch last drawn needs: none, its rows are drawn alike."""
-        return None
+        """Importance weights (B,) that the batch last drawn needs; None for ones."""
+        return None if self._ahead_weights is None else self._ahead_weights[self._next - 1]
 
     def draw(self) -> tuple[Ints, Ints]:
-        """Row numbers (B,) and the stratum of each (B,), strata in order."""
+        """Return row numbers (B,) and the stratum of each (B,), strata in order."""
         if self._next == len(self._ahead_rows):
             self._draw_block()
         self._next += 1
+        self._batches += 1
         return self._ahead_rows[self._next - 1], self._ahead_strata[self._next - 1]
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
-        """|TD error| (n,) of rows (n,) that were just learnt from: changes nothing here."""
+        """Take the |TD error| (n,) of rows (n,) that were just learnt from."""
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Other shares (S,) from the next batch on; what was drawn ahead goes back.
+        """Set other shares (S,) from the next batch on; what was drawn ahead goes back.
 
         Raises:
             MixtureError: shares that are no distribution, or a share on an empty stratum.
@@ -174,80 +270,147 @@ class QuotaSampler(Stateful):
             self.quotas.set_shares(given)
 
     def set_batch_size(self, batch_size: int) -> None:
-        """Batches of another size from the next one on; what was drawn ahead goes back."""
+        """Set another size from the next batch on; what was drawn ahead goes back."""
         if batch_size != self.batch_size:
             self._hand_back()
             self.quotas.set_batch_size(batch_size)
-            self._ahead_rows = np.zeros((0, batch_size), np.int64)
-            self._ahead_strata = np.zeros((0, batch_size), np.int64)
+            none: Ints = np.zeros((0, batch_size), np.int64)
+            self._ahead_rows, self._ahead_places, self._ahead_strata = none, none, none
 
     def _draw_block(self) -> None:
-        strata = len(self.sizes)
         quota = self.quotas.take(self.block)  # (block, S)
-        stratum = np.repeat(np.tile(np.arange(strata), self.block), quota.ravel())
+        strata = np.tile(np.arange(len(self.sizes)), self.block)
         # All that a stratum gives to the block is taken at once, and dealt out in order.
-        self._take_all(quota.sum(axis=0), _by_stratum(quota))
-        self._ahead_strata = stratum.reshape(self.block, -1)  # batch by batch
+        rows, places, weights = self._take_all(quota.sum(axis=0))
+        order = _by_stratum(quota)
+        self._ahead_rows = _dealt(rows, order).reshape(self.block, -1)
+        self._ahead_places = _dealt(places, order).reshape(self.block, -1)
+        self._ahead_strata = np.repeat(strata, quota.ravel()).reshape(self.block, -1)
+        self._ahead_weights = None
+        if weights is not None:
+            self._ahead_weights = _dealt(weights, order).reshape(self.block, -1)
         self._next = 0
 
-    def _take_all(self, counts: Ints, order: Ints) -> None:
-        """Take `counts` (S,) rows of the strata; those are dealt to places `order` of the block."""
-        drawn = np.empty(len(order), np.int64)
-        taken = [self._take(stratum, count) for stratum, count in enumerate(counts.tolist())]
-        drawn[order] = np.concatenate(taken)
-        self._ahead_rows = drawn.reshape(self.block, -1)
-
-    def _take(self, stratum: int, count: int) -> Ints:
-        """The next `count` rows of a stratum."""
-        members, size = self._members[stratum], int(self.sizes[stratum])
-        if self._again[stratum]:
-            return members[(self.rng.random(count) * size).astype(np.int64)]
-        back = self._returned[stratum]
-        parts, self._returned[stratum] = [back[:count]], back[count:]
-        count -= len(parts[0])
-        while count:
-            at = int(self._cursor[stratum])
-            if at == size:  # all have had their turn
-                self.rng.shuffle(members)
-                at = 0
-            some = min(count, size - at)
-            parts.append(members[at : at + some].copy())
-            self._cursor[stratum] = at + some
-            count -= some
-        return np.concatenate(parts)
+    def _take_all(self, counts: Ints) -> tuple[Ints, Ints, F32 | None]:
+        """Take `counts` (S,) rows of the strata in turn: row numbers, places and weights."""
+        rows, places, weights = [], [], []
+        for stratum, count in enumerate(counts.tolist()):
+            if not count:
+                continue
+            drawn, weight = self.draws[stratum].draw(count, self.rng, self._batches)
+            rows.append(self._rows[stratum][drawn])
+            places.append(drawn)
+            weights.append(weight)
+        joined = None
+        if any(weight is not None for weight in weights):
+            ones = (np.ones(len(some), np.float32) for some in rows)
+            pairs = zip(weights, ones, strict=True)
+            joined = np.concatenate([one if weight is None else weight for weight, one in pairs])
+        return np.concatenate(rows), np.concatenate(places), joined
 
     def _hand_back(self) -> None:
-        """Forget what is drawn ahead: quotas are owed again, rows that had their turn are next."""
-        rows, strata = self._ahead_rows[self._next :], self._ahead_strata[self._next :]
+        """Forget what is drawn ahead: quotas are owed again, rules get their rows back."""
+        places, strata = self._ahead_places[self._next :], self._ahead_strata[self._next :]
         quota = np.stack([(strata == s).sum(axis=1) for s in range(len(self.sizes))], axis=1)
         self.quotas.give_back(quota)
-        for stratum in self._turns:
-            back = self._returned[stratum]
-            self._returned[stratum] = np.concatenate([rows[strata == stratum], back])
-        self._ahead_rows, self._ahead_strata = rows[:0], strata[:0]
+        for stratum, draws in enumerate(self.draws):
+            if quota[:, stratum].any():
+                draws.give_back(places[strata == stratum])
+        none = places[:0]
+        self._ahead_rows, self._ahead_places, self._ahead_strata = none, none, none
+        self._ahead_weights = None
         self._next = 0
 
-    @property
-    def _orders(self) -> list[Ints]:
-        """The rows of each stratum that is gone through in turns, in their order."""
-        return [self._members[stratum] for stratum in self._turns]
-
-    @_orders.setter
-    def _orders(self, orders: list[Ints]) -> None:
-        for stratum, order in zip(self._turns, orders, strict=True):
-            self._members[stratum] = order
-
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state of a sampler over other strata."""
-        return another_sampler()
+        """Return the error for the state of a sampler over other strata."""
+        return MixtureError(
+            "the saved sampler drew from other strata, or by another rule",
+            remedy="resume with the panel and the settings the run began with",
+        )
 
 
-def another_sampler() -> MixtureError:
-    """The saved state is not of this sampler."""
-    return MixtureError(
-        "the saved sampler drew from other strata, or by another rule",
-        remedy="resume with the panel and the settings the run began with",
-    )
+class QuotaSampler(BlockSampler):
+    """Exact quotas per batch over strata, the rows of each by a rule of RULES.
+
+    Args:
+        stratum_rows: the row numbers of each stratum, S arrays (n_s,). Strata may be empty if
+            their share is 0.
+        shares: of each stratum, (S,), summing to 1.
+        batch_size: rows per draw.
+        rng: the generator of the draws; its state is part of `state_dict`.
+        within: the rule of all strata or of each, (S,).
+        prioritised: numbers of the rule "per".
+        column: gives a column of the panel's `meta`, for rules that ask for one.
+        block: batches drawn at a time; None: 64, or if a rule follows TD errors as many as a
+            sixteenth of the rows make, at least 8 and at most 128. 1 draws every batch from
+            priorities as they are.
+
+    Raises:
+        MixtureError: shares that are no distribution, or a share on an empty stratum.
+    """
+
+    def __init__(
+        self,
+        stratum_rows: Sequence[NDArray[Any]],
+        shares: Sequence[float] | F64,
+        batch_size: int,
+        rng: np.random.Generator,
+        *,
+        within: str | Sequence[str] = "uniform",
+        prioritised: Prioritised | None = None,
+        column: Callable[[str], NDArray[Any]] = lambda name: np.empty(0),
+        block: int | None = None,
+    ) -> None:
+        members = [np.asarray(rows, np.int64) for rows in stratum_rows]
+        names = [within] * len(members) if isinstance(within, str) else list(within)
+        sizes = np.array([len(rows) for rows in members], np.int64)
+        quotas = Quotas(shares, batch_size, sizes)
+        self._follows_td = follow_td(names)
+        if block is None:
+            block = BLOCK
+            if self._follows_td:
+                block = min(max(int(sizes.sum()) // (16 * batch_size), MIN_BLOCK), MAX_BLOCK)
+        numbers = prioritised or Prioritised()
+        draws = [
+            RULES[name].draws(StratumRows(rows, rng, numbers, column))
+            for name, rows in zip(names, members, strict=True)
+        ]
+        super().__init__(draws, members, quotas, rng, within=names, block=block)
+        if self._follows_td:
+            self._place_rows()
+
+    def _place_rows(self) -> None:
+        """Note the stratum of each row number and its place there, for `update`."""
+        last = max((int(rows.max(initial=-1)) for rows in self._rows), default=-1)
+        self._stratum = np.zeros(last + 1, np.int16)
+        self._place = np.zeros(last + 1, np.int32)
+        for stratum, rows in enumerate(self._rows):
+            self._stratum[rows] = stratum
+            self._place[rows] = np.arange(len(rows))
+
+    def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
+        """Take the |TD error| (n,) of rows (n,) just learnt from: they count from the next block.
+
+        Raises:
+            MixtureError: a rule follows them, and one is negative or not finite, or they are not
+                one a row.
+        """
+        if not self._follows_td:
+            return
+        errors, places = checked_errors(td_abs, rows), self._place[rows]
+        if len(self.draws) == 1:
+            self.draws[0].update(places, errors)
+            return
+        stratum = self._stratum[rows]
+        for index in np.unique(stratum).tolist():
+            inside = stratum == index
+            self.draws[index].update(places[inside], errors[inside])
+
+
+def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:
+    dealt = np.empty(len(order), values.dtype)
+    dealt[order] = values
+    return dealt
 
 
 def _by_stratum(quota: Ints) -> Ints:
@@ -260,8 +423,8 @@ def _by_stratum(quota: Ints) -> Ints:
 
 
 def uniform_sampler(rows: int, batch_size: int, rng: np.random.Generator) -> QuotaSampler:
-    """Every row with the same probability: one stratum of all rows."""
+    """Return a sampler that draws every row with the same probability: one stratum of all rows."""
     return QuotaSampler([np.arange(rows)], [1.0], batch_size, rng)
 
 
-__all__ = ["BLOCK", "QuotaSampler", "Quotas", "Sampler", "another_sampler", "uniform_sampler"]
+__all__ = ["BLOCK", "BlockSampler", "QuotaSampler", "Quotas", "Sampler", "uniform_sampler"]

@@ -80,12 +80,12 @@ class Finding:
 
 
 def shipped_audits() -> list[Audit]:
-    """Read the audits that come with Restock, sorted by name."""
+    """The audits that come with Restock, by name."""
     return _load((files("restock.replay.store") / "audits").iterdir(), "restock")
 
 
 def load_audits(folder: str | Path | None = None) -> list[Audit]:
-    """Read the shipped audits and a folder's, which replace shipped ones of the same name.
+    """The shipped audits and those of a folder; one of the same name takes a shipped one's place.
 
     Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
     """
@@ -100,7 +100,7 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
 
 
 def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
-    """Read the shipped thresholds; those of a file replace them.
+    """The shipped thresholds, with those of a file in their place.
 
     Raises ConfigError for a file that is no TOML or holds anything but tables of values.
     """
@@ -170,7 +170,7 @@ def run_audits(
 
 
 def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
-    """Return schema and name of every table and view."""
+    """Schema and name of every table and view."""
     query = "SELECT table_schema, table_name FROM information_schema.tables"
     rows: list[tuple[str, str]] = connection.sql(query).fetchall()
     return rows

@@ -33,7 +33,7 @@ UNITS = (
 
 
 def view_docs() -> dict[str, str]:
-    """Return the description of each view, by name."""
+    """What each view is, by name."""
     return {name: table["doc"] for name, table in _read().items() if name != "shared"}
 
 
@@ -58,7 +58,7 @@ def column_docs() -> dict[tuple[str, str], str]:
 
 
 def unit(column: str) -> str:
-    """Return a column's unit by the ending of its name; "" if it has none."""
+    """A column's unit, from its name's ending; "" for none."""
     return next((unit for ending, unit in UNITS if column.endswith(ending)), "")
 
 
@@ -96,7 +96,7 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
-    """Return the profiles' custom signals: name, unit, meaning, topic and path."""
+    """Custom signals of the store's profiles: name, unit, meaning, topic and path."""
     has = connection.sql(
         "SELECT 1 FROM duckdb_columns() WHERE table_name = 'recordings' AND column_name = 'signals'"
     ).fetchall()

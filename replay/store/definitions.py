@@ -78,10 +78,9 @@ _VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 
 class Definitions:
-    """The views and macros of one connection; they last for as long as this object does.
-
-    They are over `stored_transitions`, `stored_recordings` and `stored_ingests`, which lists the
-    ingests so that no row is scanned for them.
+    """The views and macros of one connection over `stored_transitions`, `stored_recordings` and
+    `stored_ingests`: which ingests there are, so that no row is scanned for it. They last for as
+    long as the object does.
 
     Args:
         connection: that of a store.
@@ -156,10 +155,8 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Keep the rows of these views in memory, as tables of the same names.
-
-        A view is renamed as it is: the query before may have made it anew.
-        """
+        """Have the rows of these in memory, as tables of these names; a view waits under another
+        as it is, which need not be how it was made here."""
         self._make(views)
         for view in views:
             self._connection.execute(
@@ -195,7 +192,7 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Keep views of a store in memory as tables while these queries run."""
+    """Views of a store as tables in memory, for as long as these queries follow."""
     made = _of(connection)
     if made is None:
         yield
@@ -214,7 +211,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
-    """Return the views to keep in memory for a store of this size."""
+    """What is held of a store of this size."""
     rows = _rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
@@ -246,7 +243,7 @@ def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str)
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
-    """Return the text of these SQL files, with the type that observations are cast to."""
+    """The text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
     whole = with_columns(with_included("\n".join(text), folder))
@@ -267,7 +264,7 @@ def _of_store(observation_type: str, names: Sequence[str]) -> str:
 
 
 def made_by(name: str) -> list[str]:
-    """Return the names of the views and macros of one of these files."""
+    """The views and macros of one of these files."""
     return list(_statements(definitions(names=[name])))
 
 
@@ -282,7 +279,7 @@ def _statements(text: str) -> Mapping[str, str]:
 
 @cache
 def _named_in(statement: str) -> frozenset[str]:
-    """Return the names that a statement reads, calls, or quotes (macros take a view's name)."""
+    """What a statement reads, calls, or has in quotes: there are macros of a view's name."""
     sql = re.sub(r"--.*", "", statement)
     found = re.findall(r"\b(?:FROM|JOIN)\s+(\w+)|\b(\w+)\(|'(\w+)'", sql)
     return frozenset(name for names in found for name in names)

@@ -153,5 +153,5 @@ def _of_events(part: int, whole: int) -> ConfidenceInterval:
 
 
 def reliability(store: Store) -> pa.Table:
-    """Read the view `label_reliability`: the share of true rows by tenths of probability."""
+    """The view `label_reliability`: of rows whose probability is about p, are a share p true?"""
     return store.sql("FROM label_reliability").to_arrow_table()

@@ -1,7 +1,5 @@
-"""Views over Parquet files and Arrow tables on a DuckDB connection.
-
-What DuckDB says of a store's damaged files becomes errors that say what to do.
-"""
+"""Views over Parquet files, and Arrow tables under a name, on a DuckDB connection; and what DuckDB
+says of damaged files of a store, as errors that say what to do."""
 
 from __future__ import annotations
 
@@ -55,10 +53,8 @@ def read_parquet(
     absent: Sequence[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> None:
-    """Make a view over Parquet files.
-
-    Columns that a file lacks are null in its rows, and so are text columns that are `absent` from
-    all. If `kinds` gives the types of the columns, no file is opened.
+    """A view over Parquet files; columns that only some have are null in the others, and so are
+    text columns that are `absent` from all. With `kinds` of columns, no file is looked at.
 
     Raises:
         StoreError: one of them is missing or damaged.
@@ -84,10 +80,8 @@ def parquet_view(
     schema: str | None = None,
     absent: Sequence[str] = (),
 ) -> str:
-    """Return the statement that makes such a view.
-
-    Each query that names it opens every file to find out its columns.
-    """
+    """The statement that makes such a view; each time that a query names it, every file is opened
+    to find out its columns."""
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
     return (
@@ -104,11 +98,8 @@ def _view_of_known(
     *,
     schema: str,
 ) -> None:
-    """Make a view of columns of these types.
-
-    Files and types are variables of the connection: as part of the view they would be parsed again
-    in each query that names it.
-    """
+    """Make a view of columns of these types. Files and types are variables of the connection: as
+    part of the view they would be read again wherever a query names it."""
     fields = ", ".join(
         f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
         " default_value: NULL}"
@@ -124,10 +115,8 @@ def _view_of_known(
 
 
 def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | None:
-    """Return the error of a query if a file is damaged or missing, else None.
-
-    `where` is the place that was queried, in case DuckDB does not name the file.
-    """
+    """The error of a query, if what is wrong is a damaged or missing file; `where` is the place
+    that was asked, for damage of which DuckDB does not name the file."""
     text = str(error)
     if isinstance(error, _OTHER):
         return None

@@ -36,10 +36,8 @@ _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 def query(
     connection: duckdb.DuckDBPyConnection, text: str, *, where: str, alone: bool = False
 ) -> duckdb.DuckDBPyRelation:
-    """Run one query, the last of several statements.
-
-    It is `alone` if nothing uses the connection after it: then a query that only creates or sets
-    something is a mistake.
+    """Run one query (the last of several statements), which is `alone` where nothing is asked of
+    the connection after it: then what only creates or sets is a mistake.
 
     Raises:
         StoreError: a file of the store is damaged or missing.
@@ -107,19 +105,15 @@ def _pivots(statement: duckdb.Statement) -> bool:
 
 
 def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
-    """Return whether a query joins tables by commas.
-
-    In the written order some would be crossed, row by row: DuckDB has to choose the order.
-    """
+    """Whether tables are joined by commas: as they are written some would be crossed, row by row,
+    so DuckDB finds their order, from here on in this connection."""
     tree = connection.execute("SELECT json_serialize_sql($1::VARCHAR)", [text]).fetchall()[0][0]
     return '"ref_type":"CROSS"' in tree
 
 
 def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
-    """Run a job, and again with every view of the store if a name was not found.
-
-    A query may compose the name of a view; for a misspelt one, DuckDB suggests a similar name.
-    """
+    """Do it again with every view of a store where one is not found: a text may put the name of
+    a view together, and of a misspelt one DuckDB says which it is like."""
     try:
         return job()
     except duckdb.CatalogException:
@@ -133,7 +127,7 @@ _COUNT = re.compile(r"\s*select\s+count\(\s*\*?\s*\)\s+from\s+transitions\s*;?\s
 
 
 def _counted(connection: duckdb.DuckDBPyConnection, text: str) -> str:
-    """Rewrite a query to use the row counts of the store's files, if these answer it."""
+    """The same query, from the counts of the store's files where these answer it."""
     if not _COUNT.fullmatch(text):
         return text
     views = "SELECT view_name FROM duckdb_views() WHERE view_name IN ('transitions', $1)"
@@ -203,7 +197,7 @@ def found(
 
 
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
-    """Return the rows of a relation; times with a zone as text in UTC."""
+    """The rows of a relation; times with a zone as text in UTC."""
     if ZONED not in map(str, relation.types):
         return relation.fetchall()
     columns = [
@@ -244,7 +238,7 @@ def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
 
 
 def _message(error: duckdb.Error) -> str:
-    """Return DuckDB's message, or that of a Python function without DuckDB's words around it."""
+    """What DuckDB says, or what a function in Python said, without DuckDB's words around it."""
     text = _OWN_TABLE.sub("", str(error)).strip().expandtabs(4)
     _, of_python, cause = text.partition("occurred while executing the UDF: ")
     return cause.partition(": ")[2] if of_python else text
@@ -260,7 +254,7 @@ OF_CONDITIONS = (
 
 
 def hint(error: duckdb.Error) -> str | None:
-    """Suggest what to ask instead, if a name was not found."""
+    """What to ask instead, if a name was not found."""
     if isinstance(error, duckdb.BinderException) and _NO_CONDITION.search(str(error)):
         return OF_CONDITIONS
     if isinstance(error, duckdb.CatalogException | duckdb.BinderException):

@@ -54,7 +54,7 @@ class MovingRows:
 
 
 def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
-    """Make the table `same_drives` over the connection's `transitions`."""
+    """The table `same_drives` over the connection's `transitions`: see `same_drives`."""
     connection.register("same_drives", same_drives(_moving_rows(connection)))
 
 
@@ -127,11 +127,9 @@ def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
 def _distinctive(
     rows: MovingRows,
 ) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints, Ints]:
-    """Find the rows that are unique in their recording and may be in another one, too.
-
-    Returns recording, content and stamp of these rows (M,), sorted by content and recording; and
-    of each recording (R,) the number of its unique rows, in another one or not.
-    """
+    """Recording, content and stamp (M,) of rows whose content is their recording's only one and may
+    be another's, too, by content and recording; and how many rows of each recording (R,) have a
+    content that is its only one, another's or not."""
     observed = MetTwice(len(rows.content))
     observed.add(rows.content)
     again = observed.maybe(rows.content)

@@ -64,11 +64,9 @@ def install_shared_rows(
 
 
 class MetTwice:
-    """A filter for numbers that come more than once, which does not hold the numbers.
-
-    `add` all of them (up to `count`), then test each with `maybe`. It keeps a byte per mark, at
-    least four per number: up to a quarter of the numbers that come once may pass the test, and
-    every number that comes again passes it.
+    """Which of up to `count` numbers come more than once, without holding them: `add` all, then
+    ask for each again. Marks are bytes, at least four a number and mostly more: of numbers that
+    come once up to a quarter are taken for others, and none that comes again is missed.
     """
 
     def __init__(self, count: int) -> None:
@@ -112,7 +110,7 @@ def occurs_again(values: Ints) -> Bools:
 def _of_ingests(
     manifests: Iterable[pa.Table], recordings: Mapping[str, str]
 ) -> Iterator[tuple[list[str], pa.Array]]:
-    """Yield the recordings of the ingests that count, and the lists of their rows."""
+    """Recordings of the ingests that count, and the lists of their rows."""
     for table in manifests:
         for part in table.combine_chunks().to_batches():
             named = [recordings.get(ingest) for ingest in part.column("ingest_id").to_pylist()]

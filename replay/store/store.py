@@ -203,7 +203,7 @@ class Store:
         self._definitions.computed[names] = partial(install, self)
 
     def conditions(self) -> tuple[Condition, ...]:
-        """Return the conditions that labelled the store's rows, of the newest ingest.
+        """The conditions that labelled the store's rows, of the newest ingest.
 
         Only what the table keeps of them: name, timing, priority and SQL.
         """
@@ -220,7 +220,7 @@ class Store:
         return [*(condition.name for condition in held), NOMINAL]
 
     def exposures(self) -> tuple[Condition, ...]:
-        """Return the exposures listed beside them, of the newest ingest."""
+        """The exposures listed beside them, of the newest ingest; an older store has none."""
         rows = self.sql(
             "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
@@ -228,7 +228,7 @@ class Store:
         return tuple(msgspec.structs.replace(one, kind="exposure") for one in found)
 
     def profile_name(self, task_hash: str) -> str:
-        """Return the profile that read the rows of a task, by the newest ingest; "" if none did."""
+        """The profile that read the rows of a task, by the newest ingest; "" where none did."""
         self._definitions.make("recordings")
         profiles = profiles_of(self.bare, task_hash)
         return profiles[0].name if profiles else ""
@@ -238,7 +238,7 @@ class Store:
         return sorted(self._tasks)
 
     def task_json(self, task_hash: str | None = None) -> str:
-        """Return the task of the store's rows as JSON.
+        """The task of the store's rows as JSON.
 
         Raises StoreError where the rows are of several tasks and none, or no such, is named.
         """
@@ -256,14 +256,12 @@ class Store:
         )
 
     def task(self, task_hash: str | None = None) -> Task:
-        """Return the task of the store's rows. Raises StoreError as `task_json` does."""
+        """The task of the store's rows. Raises StoreError as `task_json` does."""
         return self._decode(self.task_json(task_hash), Task, "task")
 
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
-        """Yield each recording's id with the ends of its episodes, one row per episode.
-
-        Of these recordings, or of all if none is named.
-        """
+        """Each recording's id with the ends of its episodes, a row an episode; of these recordings,
+        or of all where none is named. An older store has none."""
         held = [
             Ingest(one["recording_id"], one["ingest_id"], one["rows"])
             for one in self._ingests.to_pylist()
@@ -272,7 +270,7 @@ class Store:
         yield from StoreReader(self.path).ends(held)
 
     def _decode(self, text: str, kind: type[T], name: str) -> T:
-        """Decode what a manifest keeps as JSON.
+        """What a manifest keeps as JSON.
 
         Raises StoreError where another Restock wrote it, or it is damaged.
         """
@@ -306,7 +304,7 @@ class Store:
         return f"FLOAT[{size}]" if size else "FLOAT[]"
 
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """Make this store's common views in a schema of another connection, beside other stores'.
+        """The common views of this store in a schema of another connection, beside other stores'.
 
         The connection's joins are done as they are written from here on.
 
@@ -321,10 +319,8 @@ class Store:
             connection.execute("USE main")
 
     def _count_changed(self, held: Sequence[StoredFile]) -> list[str]:
-        """Return the ingests whose rows may not be those that their manifests describe.
-
-        Their manifests get the number of rows that Delta's log says.
-        """
+        """The ingests whose rows are not known to be those that their manifests describe, which
+        get the number of rows that Delta's log says."""
         ids, place = self._manifests["ingest_id"], self._manifests.column_names.index("transitions")
         written = dict(zip(ids.to_pylist(), self._manifests[place].to_pylist(), strict=True))
         changed = changed_by_others(held, written)
@@ -335,10 +331,8 @@ class Store:
         return sorted(changed)
 
     def _present_summaries(self) -> bool:
-        """Make `stored_summaries` if every manifest has one and no other tool changed rows.
-
-        Otherwise return False: rows are scanned.
-        """
+        """`stored_summaries`, where every manifest has one and no other tool changed rows; else
+        rows are scanned."""
         versions = self._manifests["summary_version"].to_pylist()
         reported = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
         summarised = {ingest_id for ingest_id, version in reported if version == SUMMARY_VERSION}
@@ -370,12 +364,12 @@ class Store:
             raise (isinstance(cause, duckdb.Error) and damage(cause)) or error from error
 
     def _paths(self) -> list[str]:
-        """Return the files of rows and manifests, by their paths in the store."""
+        """The files of rows and manifests, by their paths in the store."""
         tables = (self._transitions, self._recordings)
         return [f"{table.table}/{path}" for table in tables for path in table.paths]
 
     def _frames(self) -> StoredTable:
-        """Return the camera frames that the manifests of its rows name."""
+        """The frames of cameras that the manifests of its rows name."""
         files = frame_files(self._manifests)
         if files:
             import pyarrow.compute as pc  # slow to import
@@ -400,10 +394,8 @@ class Store:
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
-    """Return the profiles that read the rows of a task, that of the newest ingest first.
-
-    The connection must have the view `recordings`.
-    """
+    """The profiles that read the rows of a task, of a connection with a view `recordings`; that of
+    the newest ingest first."""
     # Recordings of an older store carry no text: null.
     rows = connection.execute(
         "SELECT profile, profile_hash, arg_max(coalesce(profile_toml, ''), ingested_at)"
@@ -416,7 +408,7 @@ def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[S
 
 
 def corrected_versions(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
-    """Return the versions of labels that people corrected, by the view `recordings`."""
+    """The versions of labels that people corrected, of a connection with a view `recordings`."""
     rows = connection.sql(
         "SELECT DISTINCT labels_version FROM recordings WHERE contains(labels_version, '+')"
         " ORDER BY ALL"

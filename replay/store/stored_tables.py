@@ -53,7 +53,7 @@ class StoredTable:
         return [f"{folder}/{path}" for path in self.paths]
 
     def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
-        """Make the view; files on S3 are read at each query.
+        """The view; files on S3 are read at each query.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -130,10 +130,8 @@ class StoredTable:
 def manifest_tables(
     place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
 ) -> tuple[StoredTable, StoredTable]:
-    """Return the tables of these files' manifests and of their summaries.
-
-    The manifests (`stored_recordings`) have only the version of `stored_summaries`.
-    """
+    """The manifests of these files of transitions without their summaries (but for its version),
+    `stored_recordings`, and the summaries, `stored_summaries`."""
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())
     reported = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
@@ -152,7 +150,7 @@ def register(
     *,
     schema: str = "main",
 ) -> None:
-    """Register an Arrow table or data set as a view of a schema, which must exist."""
+    """An Arrow table or data set as a view of a schema, which must be there."""
     name = view if schema == "main" else f"{schema}_{view}"
     connection.register(name, rows)
     if name != view:
@@ -160,7 +158,7 @@ def register(
 
 
 def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
-    """Find the files of the manifests of these rows, those of an older version included.
+    """The files of the manifests of these rows, those of an older version included.
 
     A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
     were before, by version or because the writer was between two commits, finds it by its name.

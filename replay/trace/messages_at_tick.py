@@ -36,7 +36,7 @@ class MessageAtTick:
 def messages_at_tick(
     path: str | Path, profile: Profile, *, recording_id: str, tick: int, stamp_ns: int
 ) -> list[MessageAtTick]:
-    """Find the messages behind one tick of a recording, sorted by age.
+    """The messages that one tick of a recording was made of, by age.
 
     Of each input and custom signal the latest one, and where the pose comes from transforms, each
     transform on the way.
@@ -104,7 +104,7 @@ def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
-    """Read the value of each custom signal from its message."""
+    """What each custom signal makes of its message, by its path."""
     for name, signal in aligned.profile.signals.items():
         columns = aligned.inputs.topics.get(signal.topic)
         if columns is None:
@@ -118,7 +118,7 @@ def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
-    """List the transforms from the robot's frame to the fixed one, if they give the pose."""
+    """The transforms from the robot's frame up to the fixed one, where they give the pose."""
     tree = aligned.tree
     if tree is None or "pose" in aligned.inputs.by_name:
         return

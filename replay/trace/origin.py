@@ -103,7 +103,7 @@ def find_origin(
 
 
 def _look_up(source: StoreVersion, transition: int) -> Origin | None:
-    """Read the row at the panel's version, or at the newest if that one can no longer be read."""
+    """The row at that version, or as it is now where that version can no longer be read."""
     now = _read(StoreVersion(source.path), transition)
     if source.version is None:
         return now
@@ -121,7 +121,7 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
 
 
 def _read(source: StoreVersion, transition: int) -> Origin | None:
-    """Read a row and its surroundings; None if that version, or its files, are gone."""
+    """A row with what stands around it; None where that version, or its files, are gone."""
     try:
         with Store(source.path, version=source.version) as store:
             rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
@@ -164,7 +164,7 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
 def _frames(
     store: Store, path: str, row: Mapping[str, Any], manifest: Mapping[str, Any] | None
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Find the camera frames in force at a row and their files, and say why some are missing.
+    """The camera frames in force at a row with the file each lies in, and why some are not told.
 
     Frames are replaced with the rows of their recording: those of a later ingest are not the row's.
     """
@@ -188,7 +188,7 @@ def _frames(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return the rows of a query as dictionaries.
+    """The rows that a query gives, by column.
 
     Raises:
         StoreError: the file that it asks (its parameter `file`) cannot be read.
@@ -207,7 +207,7 @@ def rows_of(
 
 
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
-    """Describe what has happened to a row since the panel was made."""
+    """What became of a row since."""
     if now is None:
         return ["the newest version of the store no longer has this row"]
     changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
@@ -218,7 +218,7 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
 
 
 def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -> None:
-    """Describe which topics the profile read from the recording, and what they held."""
+    """What the profile says of the recording: which topics were read, and what they held."""
     manifest, row = origin.recording, origin.transition
     if manifest is None:
         return
@@ -266,7 +266,7 @@ def _utc(stamp_ns: int) -> str:
 def _reward_parts(
     row: Mapping[str, Any], near: Mapping[int, Mapping[str, Any]], task_json: str
 ) -> dict[str, float] | None:
-    """Compute the reward of each event of a step; None at an episode's last step."""
+    """What the events of a step were worth; None at an episode's last step, whose end is no row."""
     after = near.get(row["step_index"] + 1)
     if after is None:
         return None
@@ -293,10 +293,8 @@ def _reward_parts(
 
 
 def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
-    """Return the profile that read the recording.
-
-    It is the one given, else the manifest's own, else the shipped one of that name.
-    """
+    """The profile that read the recording: the one given, the manifest's own, or the shipped one
+    of that name."""
     name, text = given or manifest["profile"], manifest.get("profile_toml")
     try:
         if given is None and text:
@@ -325,5 +323,5 @@ def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -
 
 @cache
 def sql_file(name: str) -> str:
-    """Read a query of this folder."""
+    """A query of this folder."""
     return (files("restock.replay.trace") / name).read_text(encoding="utf-8")

@@ -32,7 +32,11 @@ STUDY_KEYS = {
     "space": "it was removed: call `restock train --set` from Optuna instead",
     "power": "it was removed: compute the number of seeds before the study, and leave it out",
 }
-MIXTURE_KEYS = {"held_out": _now("`evaluation_split`")}
+MIXTURE_KEYS = {
+    "adaptive": _GONE,
+    "held_out": _now("`evaluation_split`"),
+    "prioritised.lap_alpha": _GONE,
+}
 MIXTURES = {"missions": _now("'coverage'")}
 AUDITS = {  # and their thresholds
     "flattering_evaluation": _now("'evaluation_bias'"),

@@ -38,9 +38,9 @@ MAY_IMPORT = {
     "ingest/store": "containers decoding profile steps task",
     "replay": "fleet panel store ingest/store",
     "replay/store": "ingest/camera ingest/store ingest/task",
-    "replay/mixture": "",
-    "replay/sampling": "mixture",
-    "replay/ring": "mixture",
+    "replay/sampling": "",
+    "replay/mixture": "sampling",
+    "replay/ring": "mixture sampling",
     "replay/plan": "mixture store ingest/task",
     "replay/panel": "mixture plan sampling store ingest/store ingest/task",
     "replay/fleet": "mixture panel plan store ingest/task",
@@ -54,7 +54,7 @@ MAY_IMPORT = {
     ),
     "train": (
         "dqn evaluation evaluation/off_policy feed run twin/missions twin/env twin/floors"
-        " twin/physics replay/mixture replay/panel replay/ring replay/sampling"
+        " twin/physics replay/mixture replay/panel replay/ring"
         " replay/store ingest/profile ingest/task"
     ),
     "train/dqn": "twin/missions twin/env twin/physics replay/fleet replay/mixture",
@@ -79,7 +79,7 @@ MAY_IMPORT = {
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
-        " replay/ring replay/store ingest/profile ingest/task"
+        " replay/ring replay/sampling replay/store ingest/profile ingest/task"
     ),
     "train/study": "comparison dqn evaluation libraries run replay/panel twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
@@ -105,7 +105,7 @@ MAY_IMPORT = {
     "report": "look run fleet study replay/fleet replay/store train/twin/calibration",
     "report/look": "train/twin/missions",
     "report/run": (
-        "look replay/panel replay/plan replay/store train/evaluation train/run"
+        "look replay/panel replay/plan replay/sampling replay/store train/evaluation train/run"
         " train/twin/calibration train/twin/floors"
     ),
     "report/fleet": "look replay/fleet replay/store",

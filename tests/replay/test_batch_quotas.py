@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from restock.errors import MixtureError
 from restock.replay.mixture.mixture import parse_mixture
-from restock.replay.plan.strata import rules_of
-from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.share_controller import (
+from restock.replay.mixture.share_controller import (
     PlannedDraws,
     SampledStratum,
     ShareController,
 )
+from restock.replay.plan.strata import rules_of
+from restock.replay.ring.ring import FreshRing
 
 QUOTAS = (
     "max_replays_per_row = 400\n"

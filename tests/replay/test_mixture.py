@@ -19,7 +19,6 @@ from restock import cli
 from restock.errors import ConfigError, MixtureError
 from restock.ingest.task.conditions import Condition
 from restock.replay.mixture.mixture import (
-    Adaptive,
     CorrectionRule,
     EachCondition,
     EvaluationSplit,
@@ -76,21 +75,17 @@ def test_the_shipped_mixtures_load_and_fill(name: str, transitions: pa.Table) ->
             EVERY + "[sources]\nlogs = {schedule='linear', start=0, end=1, to_env_steps=0}",
             r"sources\.logs\.to_env_steps must be above from_env_steps, which is 0, got 0",
         ),
-        (EVERY + "[adaptive]\nfloor = 0.7", "floor < ceiling"),
+        (EVERY + "[adaptive]\nfloor = 0.7", "unknown key `adaptive`"),
         (
             "[[strata]]\nname = 'a'\nshare = 0.1\nfloor = 0.2",
             "share of 'a' is 0.1, below its floor",
         ),
         ("[[strata]]\nname = 'a'\nshare = 0.3\ncap = 0.2", r"\.share of 'a' is 0.3, above"),
         (EVERY + "[[strata]]\nname = ''\nwhere = 'true'", "a stratum needs a name"),
-        (
-            "[adaptive]\n[[strata]]\nname = 'a'\n"
-            "share = {schedule = 'linear', start = 0.1, end = 0.2, to_env_steps = 9}",
-            "both a schedule",
-        ),
         (EVERY + "[safety]\nleave_out = 'rows'", "unsafe"),
         ("max_rows_per_episode = 0\n" + EVERY, "max_rows_per_episode"),
-        ("within = 'rank'\n" + EVERY, "within"),
+        ("within = 'rank'\n" + EVERY, "within is 'rank': the rules are uniform"),
+        (EVERY + "within = 'rank'", "within is 'rank'"),
         ("sampling = 'chunked'\nwithin = 'per'\n" + EVERY, "without_replacement"),
         ("discount = 1.5\n" + EVERY, "discount"),
         ("seed = 'x'\n" + EVERY, "seed"),
@@ -476,20 +471,6 @@ def test_schedules_that_leave_no_room_later_are_refused_in_the_plan(
         planned(transitions, text)
 
 
-@pytest.mark.parametrize(
-    ("bounds", "message"),
-    [
-        ("floor = 0.3", r"floors that sum to 1\.5"),
-        ("ceiling = 0.15", r"ceilings that sum to 0\.75"),
-    ],
-)
-def test_adaptive_bounds_that_no_run_could_keep_are_refused_in_the_plan(
-    transitions: pa.Table, bounds: str, message: str
-) -> None:
-    with pytest.raises(MixtureError, match=message):
-        planned(transitions, NO_SPLIT + EVERY + f"[adaptive]\n{bounds}\n")
-
-
 def test_the_plan_counts_replays(transitions: pa.Table) -> None:
     plan = planned(
         transitions,
@@ -580,7 +561,7 @@ def test_the_page_explains_every_key() -> None:
             SourceShares,
             CorrectionRule,
         ),
-        *(OtherStore, Safety, Prioritised, Adaptive, Linear, Cosine, Piecewise),
+        *(OtherStore, Safety, Prioritised, Linear, Cosine, Piecewise),
     )
     for struct in structs:
         for field in msgspec.structs.fields(struct):

@@ -38,14 +38,13 @@ MIXTURES = {
     "limited, uniform": "max_replays_per_row = 3\nwithin = 'uniform'\n" + EVERY,
     "once": "max_replays_per_row = 1\nwithin = 'uniform'\n" + EVERY,
     "per": "within = 'per'\n" + EVERY,
-    "limited lap": "max_replays_per_row = 3\nwithin = 'lap'\n" + EVERY,
+    "limited per": "max_replays_per_row = 3\nwithin = 'per'\n" + EVERY,
     "chunked": "max_replays_per_row = 3\nsampling = 'chunked'\n" + EVERY,
-    "adaptive": EVERY + "[adaptive]\nstep_size = 2.0\nevery_updates = 1\nafter_updates = 0\n",
     "scheduled": EVERY + "[[strata]]\nname = 'nominal'\n"
     "share = {schedule = 'linear', start = 0.8, end = 0.2, to_env_steps = 1000}\n",
     "quota": EVERY + "[[strata]]\nname = 'wheel_slip'\nshare = 0.25\n",
 }
-FOLLOW_TD = {"per", "limited lap", "adaptive"}
+FOLLOW_TD = {"per", "limited per"}
 
 
 @dataclass(frozen=True)
@@ -226,9 +225,7 @@ def _check_shares(panel: Panel, name: str, way: str, batches: list[Drawn]) -> No
     """Every batch has the quota of every stratum, the rounding carried on."""
     size = len(panel.strata)
     quotas = np.array([np.bincount(batch.strata, minlength=size) for batch in batches])
-    if name == "adaptive":
-        assert quotas[-1, 0] > quotas[0, 0]  # the one that errs
-    elif name == "scheduled":
+    if name == "scheduled":
         nominal = [stratum.name for stratum in panel.strata].index("nominal")
         assert quotas[0, nominal] == 32
         assert quotas[-1, nominal] == (32 if way.startswith("a library") else 8)
@@ -257,7 +254,7 @@ def test_a_pass_is_not_given_twice_where_rows_may_not_be(panels: Callable[[str],
 
 
 def test_draws_of_a_panel_go_on_where_they_were_saved(panels: Callable[[str], Panel]) -> None:
-    for name in ("limited lap", "chunked", "adaptive"):
+    for name in ("limited per", "chunked"):
         panel = panels(name)
         one, other = sampler_for(panel, BATCH, seed=1), sampler_for(panel, BATCH, seed=2)
 

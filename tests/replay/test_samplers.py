@@ -17,20 +17,20 @@ from support.states import through_json
 
 from restock.errors import MixtureError
 from restock.replay.sampling.chunked import ChunkedSampler
-from restock.replay.sampling.priorities import Lap, Per, PrioritySampler, Rule
+from restock.replay.sampling.per import Prioritised
 from restock.replay.sampling.sampler import Quotas, QuotaSampler, uniform_sampler
 from restock.train.run import checkpoint
 
 STRATA = [np.arange(0, 400, 2), np.arange(1, 101, 2)]  # 200 and 50 rows
 SHARES = [0.7, 0.3]
 PARTS = st.lists(st.integers(0, 1000), min_size=1, max_size=9).filter(lambda s: sum(s) > 0)
-RULES: dict[str, dict[str, Any]] = {
-    "with replacement": {},
-    "in turns": {"replacement": False},
-    "PER": {"rule": Per(alpha=0.7)},
-    "LAP": {"rule": Lap()},
-    "in turns beside PER": {"rule": [None, Per(alpha=0.7)], "replacement": False},
+RULES = {
+    "with replacement": ["uniform", "uniform"],
+    "in turns": ["without_replacement", "without_replacement"],
+    "PER": ["per", "per"],
+    "in turns beside PER": ["without_replacement", "per"],
 }
+PER = Prioritised(per_alpha=0.7)
 WIDTH = 3  # of the rows that are read in chunks
 
 
@@ -64,7 +64,6 @@ def way(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def make(kind: str, way: str, tmp_path: Path) -> Iterator[Make]:
-    rule = RULES[way]
     if kind == "chunks" and way != "in turns":
         pytest.skip("rows read in chunks have their turns")
     opened: list[ChunkedSampler] = []
@@ -80,24 +79,19 @@ def make(kind: str, way: str, tmp_path: Path) -> Iterator[Make]:
                 )
             )
             return Drawing(opened[-1])
-        by = PrioritySampler if "rule" in rule else QuotaSampler
-        return Drawing(by(STRATA, SHARES, batch_size, rng, **rule))
+        return Drawing(
+            QuotaSampler(STRATA, SHARES, batch_size, rng, within=RULES[way], prioritised=PER)
+        )
 
     yield made
     for sampler in opened:
         sampler.close()
 
 
-def rules_of(way: str) -> list[Rule | None]:
-    rule = RULES[way].get("rule")
-    return rule if isinstance(rule, list) else [rule, rule]
-
-
 def in_turns(way: str) -> list[np.ndarray]:
-    """The strata whose rows have turns."""
-    if RULES[way].get("replacement", True):
-        return []
-    return [rows for rows, rule in zip(STRATA, rules_of(way), strict=True) if rule is None]
+    """Return the strata whose rows have turns."""
+    named = zip(STRATA, RULES[way], strict=True)
+    return [rows for rows, rule in named if rule == "without_replacement"]
 
 
 def errors() -> np.ndarray:
@@ -105,11 +99,9 @@ def errors() -> np.ndarray:
     return 10 ** np.random.default_rng(5).uniform(-2, 1, 400)
 
 
-def priority(rule: Rule | None, td_abs: np.ndarray) -> np.ndarray:
-    """As the papers have it."""
-    if isinstance(rule, Per):
-        return (td_abs + rule.epsilon) ** rule.alpha
-    return np.maximum(td_abs, rule.floor) ** rule.alpha if rule else np.ones_like(td_abs)
+def priority(rule: str, td_abs: np.ndarray) -> np.ndarray:
+    """Return priorities as the paper has them; 1 for other rules."""
+    return (td_abs + PER.per_epsilon) ** PER.per_alpha if rule == "per" else np.ones_like(td_abs)
 
 
 def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) -> None:
@@ -122,7 +114,7 @@ def test_quotas_are_exact_and_rows_drawn_as_the_rule_says(make: Make, way: str) 
         assert np.bincount(stratum).tolist() == [28, 12]
         assert ((drawn % 2 == 1) == (stratum == 1)).all()
         np.add.at(counts, drawn, 1)
-    for rows, total, rule in zip(STRATA, (112_000, 48_000), rules_of(way), strict=True):
+    for rows, total, rule in zip(STRATA, (112_000, 48_000), RULES[way], strict=True):
         assert counts[rows].sum() == total
         if any(rows is turns for turns in in_turns(way)):
             assert np.ptp(counts[rows]) <= 1
@@ -187,16 +179,13 @@ def test_a_state_of_other_strata_is_refused() -> None:
 
 
 def test_a_state_of_another_rule_is_refused() -> None:
-    def sampler(by_priority: bool) -> Any:
-        rng = np.random.default_rng(0)
-        if by_priority:
-            return PrioritySampler(STRATA, SHARES, 50, rng, rule=Lap())
-        return QuotaSampler(STRATA, SHARES, 50, rng)
+    def sampler(within: str) -> QuotaSampler:
+        return QuotaSampler(STRATA, SHARES, 50, np.random.default_rng(0), within=within)
 
     with pytest.raises(MixtureError, match="another rule"):
-        sampler(by_priority=True).load_state_dict(sampler(by_priority=False).state_dict())
+        sampler("per").load_state_dict(sampler("uniform").state_dict())
     with pytest.raises(MixtureError, match="another rule"):
-        sampler(by_priority=True).load_state_dict({})
+        sampler("per").load_state_dict({})
 
 
 @settings(max_examples=150)
@@ -243,7 +232,9 @@ def test_without_replacement_no_row_is_drawn_twice_more_than_another(
     starts = np.cumsum([0, *sizes])
     rows = [np.arange(a, b) for a, b in pairwise(starts)]
     shares = np.full(len(sizes), 1 / len(sizes))
-    sampler = QuotaSampler(rows, shares, batch_size, np.random.default_rng(seed), replacement=False)
+    sampler = QuotaSampler(
+        rows, shares, batch_size, np.random.default_rng(seed), within="without_replacement"
+    )
     counts = np.zeros(int(starts[-1]))
     for _ in range(12):
         drawn, stratum = sampler.draw()
@@ -256,16 +247,14 @@ def test_without_replacement_no_row_is_drawn_twice_more_than_another(
 @settings(max_examples=60)
 @given(
     steps=st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5), st.integers(1, 40)), max_size=8),
-    replacement=st.booleans(),
+    within=st.sampled_from(["uniform", "without_replacement"]),
     seed=st.integers(0, 2**32),
 )
 def test_what_is_owed_stays_within_rows_when_shares_change(
-    steps: list[tuple[int, int, int]], replacement: bool, seed: int
+    steps: list[tuple[int, int, int]], within: str, seed: int
 ) -> None:
     rows = [np.arange(0, 30), np.arange(30, 41), np.arange(41, 60)]
-    sampler = QuotaSampler(
-        rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), replacement=replacement
-    )
+    sampler = QuotaSampler(rows, [0.5, 0.3, 0.2], 16, np.random.default_rng(seed), within=within)
     counts, wanted, total = np.zeros(60), np.zeros(3), np.zeros(3)
     for first, second, batch_size in steps:
         shares = np.array([first, second, 1.0]) / (first + second + 1)
@@ -281,7 +270,7 @@ def test_what_is_owed_stays_within_rows_when_shares_change(
             wanted += shares * batch_size
             # A stratum whose share goes to 0 forfeits what it is owed: less than a row a change.
             assert np.abs(total - wanted).max() < 3.0 + len(steps)
-        if not replacement:  # what was drawn ahead and given back is no turn
+        if within == "without_replacement":  # what was drawn ahead and given back is no turn
             assert all(np.ptp(counts[members]) <= 1 for members in rows)
 
 

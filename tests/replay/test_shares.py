@@ -1,5 +1,5 @@
 """Shares: they sum to one, floors and caps hold, rows bear no more than they can, rows are one
-stratum's; schedules and group DRO."""
+stratum's; schedules."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Adaptive, StratumRule
+from restock.replay.mixture.mixture import StratumRule
 from restock.replay.mixture.schedules import Cosine, Linear, Piecewise, mean_over, value_at
 from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.replay.plan.strata import ResolvedStratum, assign
-from restock.replay.sampling.share_controller import GroupDro
 
 PARTS = st.integers(0, 1000).map(lambda thousandths: thousandths / 1000)
 
@@ -140,60 +139,3 @@ def test_the_mean_of_a_schedule_is_the_mean_of_its_values(portion: object) -> No
     steps = (np.arange(200_000) + 0.5) / 1000
     values = np.mean([value_at(portion, step) for step in steps])  # type: ignore[arg-type]
     assert mean_over(portion, 0, 200) == pytest.approx(values, abs=2e-4)  # type: ignore[arg-type]
-
-
-def dro(shares: list[float], **rule: float) -> GroupDro:
-    size = len(shares)
-    return GroupDro(
-        Adaptive(**{"floor": 0.0, "ceiling": 1.0, **rule}),  # type: ignore[arg-type]
-        np.array(shares),
-        np.zeros(size),
-        np.ones(size),
-    )
-
-
-def test_a_step_of_group_dro_is_the_papers() -> None:
-    groups = dro([0.5, 0.3, 0.2], step_size=0.1)
-    groups.observe(np.array([0, 0, 1, 2]), np.array([1.0, 3.0, 1.0, 3.0]))
-    error = np.array([2.0, 1.0, 3.0])
-    expected = np.array([0.5, 0.3, 0.2]) * np.exp(0.1 * error / error.mean())
-    np.testing.assert_allclose(groups.step(), expected / expected.sum(), rtol=1e-9)
-    np.testing.assert_allclose(groups.td_abs, error)
-    # With nothing seen, nothing changes.
-    before = groups.shares.copy()
-    np.testing.assert_array_equal(groups.step(), before)
-
-
-def test_group_dro_feeds_the_worst_and_starves_none() -> None:
-    groups = dro([0.9, 0.1, 0.0], step_size=0.5, floor=0.05, ceiling=0.8)
-    for _ in range(100):
-        groups.observe(np.array([0, 1]), np.array([1.0, 4.0]))
-        groups.step()
-    np.testing.assert_allclose(groups.shares, [0.2, 0.8, 0.0], atol=1e-9)
-    for _ in range(200):
-        groups.observe(np.array([0, 1]), np.array([9.0, 1.0]))
-        groups.step()
-    np.testing.assert_allclose(groups.shares, [0.8, 0.2, 0.0], atol=1e-9)
-
-
-@settings(max_examples=40)
-@given(st.data())
-def test_adaptive_shares_stay_within_floor_and_ceiling(data: st.DataObject) -> None:
-    size = data.draw(st.integers(2, 6))
-    start = np.array([data.draw(st.integers(1, 100)) for _ in range(size)], float)
-    groups = dro((start / start.sum()).tolist(), step_size=1.0, floor=0.1 / size, ceiling=0.7)
-    for _ in range(data.draw(st.integers(1, 20))):
-        stratum = np.array(data.draw(st.lists(st.integers(0, size - 1), min_size=1, max_size=9)))
-        error = np.array([data.draw(st.integers(0, 1000)) / 10 for _ in stratum])
-        groups.observe(stratum, error)
-        shares = groups.step()
-        assert shares.sum() == pytest.approx(1)
-        assert (shares >= 0.1 / size - 1e-6).all()
-        assert (shares <= 0.7 + 1e-6).all()
-
-
-def test_floors_and_ceilings_that_cannot_hold_are_refused() -> None:
-    with pytest.raises(MixtureError, match=r"2 strata cannot share out 1 .* sum to 0\.8"):
-        dro([0.5, 0.5], ceiling=0.4)
-    with pytest.raises(MixtureError, match=r"floors that sum to 1\.2"):
-        dro([0.5, 0.5], floor=0.6)

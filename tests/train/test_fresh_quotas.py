@@ -21,9 +21,9 @@ from restock.cli.learning.describe_run import describe_forecast
 from restock.errors import ConfigError
 from restock.ingest.task.conditions import held
 from restock.replay.mixture.mixture import parse_mixture
+from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.build import build_panel
 from restock.replay.panel.panel import Panel
-from restock.replay.sampling.share_controller import PlannedDraws
 from restock.replay.store.audit import load_audits, load_thresholds
 from restock.train.dqn.config import TrainConfig
 from restock.train.feed.collector import FreshStrata

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from restock import native
 from restock.arrays import F32, Ints
+from restock.replay.mixture.share_controller import ShareController
 from restock.replay.ring.ring import FreshRing
-from restock.replay.sampling.share_controller import ShareController
 from restock.state import Stateful
 from restock.train.dqn.algorithm import Loss
 from restock.train.feed import interval_tables

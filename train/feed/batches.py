@@ -2,7 +2,7 @@
 
 This module builds the half-and-half batch of online learning with logs (RLPD, arXiv:2302.02948)
 from two sources that share one packed row layout, by one gather each. The share controller
-(`restock.replay.sampling.share_controller`) decides the share of each stratum, and how much of it
+(`restock.replay.mixture.share_controller`) decides the share of each stratum, and how much of it
 is logged.
 """
 
@@ -19,17 +19,17 @@ from torch import Tensor
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
+from restock.replay.mixture.share_controller import (
+    PlannedDraws,
+    ShareController,
+)
 from restock.replay.panel.logged_sampler import (
     BatchDraw,
     LoggedSampler,
 )
 from restock.replay.ring.ring import FreshRing
 from restock.replay.sampling.gather import gather_rows
-from restock.replay.sampling.quotas import Quotas
-from restock.replay.sampling.share_controller import (
-    PlannedDraws,
-    ShareController,
-)
+from restock.replay.sampling.sampler import Quotas
 from restock.state import Stateful
 from restock.train.feed.logs import Logs
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from restock.arrays import F32, Bools, Ints
 from restock.errors import ConfigError
+from restock.replay.mixture.share_controller import PlannedDraws
 from restock.replay.panel.logged_sampler import LoggedSampler, sampler_by_shares, sampler_for
-from restock.replay.sampling.share_controller import PlannedDraws
 from restock.train.dqn.config import LossConfig
 
 if TYPE_CHECKING:
@@ -71,14 +71,12 @@ class Logs:
     perturbation: Coded | None = None  # of the twin; null for hardware
     panel: Panel | None = None  # that they are from
     planned: PlannedDraws = _UNPLANNED  # what the run will draw
-    huber_delta: float = 1.0  # of the run's loss: the floor of LAP's priorities
 
     @classmethod
     def of_panel(
         cls,
         panel: Panel,
         planned: PlannedDraws = _UNPLANNED,
-        huber_delta: float = 1.0,
         *,
         as_of_ns: int | None = None,
     ) -> Logs:
@@ -115,7 +113,6 @@ class Logs:
             ),
             panel=panel,
             planned=planned,
-            huber_delta=huber_delta,
         )
 
     def __len__(self) -> int:
@@ -152,7 +149,6 @@ class Logs:
             seed=seed,
             planned=self.planned,
             logs_share=logs_share,
-            lap_floor=self.huber_delta,
             fresh=fresh,
         )
 

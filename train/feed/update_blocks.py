@@ -4,7 +4,7 @@ The samplers that a run on the CPU has draw the batches, so that a seed feeds th
 row numbers, a few kilobytes, go to the device, which holds the logs' rows and a mirror of the ring.
 While the device makes one block of updates, the next is drawn and the one before is recorded: the
 host waits once a block, if at all. If a draw depends on the TD errors of the batch before
-(priorities, adaptive shares), a block has one update, and the host waits after each.
+(priorities), a block has one update, and the host waits after each.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from restock.errors import ConfigError, MixtureError, PanelError
 from restock.ingest.profile.profile import Profile, load_profile
 from restock.replay.panel.logged_sampler import BatchDraw, LoggedSampler
 from restock.replay.panel.panel import Panel
+from restock.replay.sampling.rules import RULES
 from restock.train.dqn.algorithm import Loss
 from restock.train.feed.batch_record import FeedRecord, row_ids
 from restock.train.feed.batches import ReplayBatch
@@ -175,10 +176,11 @@ class MixedFeed:
         if self.logs is None:
             return NO_LOGS
         if self._td_missing:
+            others = ", ".join(name for name, rule in RULES.items() if not rule.follows_td)
             raise MixtureError(
                 "the mixture's draws follow TD errors, and this buffer gets none",
-                remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix"
-                " without [adaptive], `per` and `lap`",
+                remedy="for Stable-Baselines3 set `critic`, e.g. to dqn_critic(model); or mix with"
+                f" a `within` of {others}",
             )
         if self._sampler is None:
             self._sampler = self.logs.sampler(batch_size, self.logs_share, self.seed)
@@ -225,7 +227,7 @@ class MixedFeed:
         """The batch of one update, logs first: packed rows (B, W), and what is known of them.
 
         `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
-        Priorities and adaptive shares follow `td` where it is known.
+        Priorities follow `td` where it is known.
 
         Raises:
             NotFinite: a row or a TD error is NaN or infinite; names the rows.

@@ -36,6 +36,7 @@ from restock.arrays import F32
 from restock.errors import MixtureError
 from restock.replay.panel.panel import Panel
 from restock.replay.ring.ring import FreshRing
+from restock.replay.sampling.rules import RULES
 from restock.replay.store.store import Store
 from restock.train.libraries.mixed_feed import FeedOptions, MixedFeed
 
@@ -107,8 +108,9 @@ class MixtureReplayBuffer(ReplayBuffer):
                 "its rows have importance weights, but the losses of Stable-Baselines3 do not use "
                 "any",
                 where=str(panel.path),
-                remedy='mix with `correction = {pre = "none", post = "none"}` and without'
-                ' `within = "per"`, or say ignore_weights=True',
+                remedy='mix with `correction = {pre = "none", post = "none"}` and a `within` of'
+                f" {', '.join(n for n, rule in RULES.items() if not rule.has_weights)}; or say"
+                " ignore_weights=True",
             )
         self._log_actions = self._logged_actions(panel, self._commands)
         size = int(np.prod(self.obs_shape))
@@ -263,8 +265,8 @@ class MixtureReplayBuffer(ReplayBuffer):
 
 
 def weighted(panel: Panel) -> bool:
-    """Whether batches of a panel are to be weighted: by corrections, or by PER within a stratum."""
-    by_rule = any(stratum.within == "per" for stratum in panel.strata)
+    """Return whether batches of a panel are to be weighted, by corrections or by a draw rule."""
+    by_rule = any(RULES[stratum.within].has_weights for stratum in panel.strata)
     return by_rule or any(stratum.correction != "none" for stratum in panel.strata)
 
 

@@ -264,7 +264,7 @@ class SqliteFile:
         yield from ((channel, some.batch()) for channel, some in pending.items())
 
     def _rows(self, cursor: sqlite3.Cursor) -> Iterator[list[_Row]]:
-        """Yield rows in their order, some at a time; a large one alone."""
+        """Rows in their order, some at a time; a large one alone."""
         row_bytes = BYTES_PER_BATCH // 16
         while rows := self._fetch(cursor, row_bytes):
             row_bytes = sum(row[3] or 0 for row in rows) // len(rows) + 64

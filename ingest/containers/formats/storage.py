@@ -105,7 +105,7 @@ def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tupl
 
 
 def _custom_data(text: str) -> tuple[dict[str, str], int]:
-    """Return its entries, and how many of them are not text.
+    """Its entries, and how many of them are no text.
 
     Only those lines are parsed, and their values stay as they are written: `007` is no number.
     """

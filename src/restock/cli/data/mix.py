@@ -173,9 +173,6 @@ def describe(plan: PanelPlan) -> dict[str, Any]:
             for name, part in plan.mixture.sources.parts.items()
             if not isinstance(part, int | float)
         },
-        "adaptive": None
-        if plan.mixture.adaptive is None
-        else msgspec.structs.asdict(plan.mixture.adaptive),
         "task_hash": plan.task_hash,
         "n_step": plan.mixture.n_step,
         "discount": plan.mixture.discount,
@@ -316,8 +313,6 @@ def _summary(document: dict[str, Any]) -> list[str]:
     }
     drawn = [rule if len(rules) == 1 else f"{rule} ({', '.join(of_rule[rule])})" for rule in rules]
     lines.append(f"within a stratum: {'; '.join(drawn)}")
-    if document["adaptive"] is not None:
-        lines.append("shares follow the TD error while training: [adaptive]")
     if "id" in document:
         lines.append(f"panel {document['id']} -> {document['panel']}")
     else:

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from restock.replay.sampling.rules import RULES
 from restock.report.look.blocks import Rows, count, estimate, number
 from restock.report.run.facts import Facts, evaluation_bias
 from restock.report.run.practice import by_arm
@@ -244,7 +245,8 @@ def _rule(mixture: dict[str, Any] | None) -> str | None:
     """Say how the logged part of a batch is drawn."""
     if mixture is None:
         return None
-    within = str(mixture.get("within", "uniform")).replace("_", " ")
+    name = str(mixture.get("within", "uniform"))
+    within = RULES[name].doc if name in RULES else name
     cap = mixture.get("max_replays_per_row")
     most = f", a row at most {cap:g} times" if cap else ""
     return f"quotas by stratum, within one {within}{most}"
@@ -256,7 +258,7 @@ def _fresh_rule(facts: Facts, mixture: dict[str, Any] | None) -> str | None:
         return None
     rules = [] if mixture is None else [*mixture["strata"], mixture["each_condition"] or {}]
     by_quota = any(rule.get("share", "natural") != "natural" for rule in rules)
-    if by_quota or (mixture or {}).get("adaptive"):
+    if by_quota:
         return "quotas by stratum, each of its rows alike"
     return "uniform over the ring"
 

@@ -2,7 +2,7 @@
 
 A panel's shares are a plan for the mixture's `[planned]` draws. A run knows how much it will draw,
 at which environment step, and where its TD errors are: the controller plans the mixture for that
-run, follows its schedules and its [adaptive] rule, and counts what is drawn, so that no stratum
+run, follows its schedules, and counts what is drawn, so that no stratum
 gives more than its rows may give under `max_replays_per_row`.
 
 A quota is a stratum's share of the batch, whether its rows are logged or fresh. Logged rows give
@@ -23,15 +23,9 @@ from numpy.typing import NDArray
 
 from restock.arrays import F64, Bools, Ints
 from restock.errors import MixtureError
-from restock.replay.mixture.mixture import Adaptive, Mixture, Shortfall, SourceShares, StratumRule
+from restock.replay.mixture.mixture import Mixture, Shortfall, SourceShares, StratumRule
 from restock.replay.mixture.schedules import knots, mean_over, value_at
-from restock.replay.mixture.shares import (
-    adaptive_bounds,
-    scaled_within,
-    wanted_shares,
-    within_limits,
-)
-from restock.replay.sampling.sampler import checked_errors
+from restock.replay.mixture.shares import wanted_shares, within_limits
 from restock.state import Stateful
 
 REFRESH_BATCHES = 64  # shares that move are worked out again after so many
@@ -63,56 +57,9 @@ class SampledStratum:
     corrected: bool = False  # whether importance weights take its boost away
 
 
-class GroupDro(Stateful):
-    """The shares (S,) of the strata of one source, and what their rows erred since the last step.
-
-    Group distributionally robust optimisation (Sagawa, Koh, Hashimoto and Liang, ICLR 2020,
-    arXiv:1911.08731), algorithm 1: q_g <- q_g exp(eta loss_g), normalised. There the gradient step
-    is weighted by q; here q is the share of the draws, which is the same in expectation and wastes
-    no rows. The loss of a group is its mean |TD error|, in units of the groups' mean, so that eta
-    means the same whatever the scale of rewards. Floor and ceiling keep every group sampled, and
-    none from taking all.
-
-    `shares` begin as planned; a stratum of share 0 stays at 0.
-
-    Raises:
-        MixtureError: floors that sum to more than 1, or ceilings to less.
-    """
-
-    STATE: ClassVar[tuple[str, ...]] = ("shares", "td_abs", "_sum", "_rows")
-
-    def __init__(self, rule: Adaptive, shares: F64, floor: F64, cap: F64) -> None:
-        self.rule = rule
-        self.low, self.high = adaptive_bounds(rule, shares, floor, cap)
-        self.shares: F64 = scaled_within(shares, self.low, self.high)
-        self.td_abs: F64 = np.full(len(shares), np.nan)  # what the last step saw, (S,)
-        self._sum: F64 = np.zeros(len(shares))
-        self._rows: Ints = np.zeros(len(shares), np.int64)
-
-    def observe(self, stratum: NDArray[Any], td_abs: NDArray[Any]) -> None:
-        """|TD error| (n,) of rows of these strata (n,)."""
-        self._sum += np.bincount(stratum, td_abs, minlength=len(self._sum))
-        self._rows += np.bincount(stratum, minlength=len(self._rows))
-
-    def step(self) -> F64:
-        """Take one step; returns the new shares (S,). A stratum that was not drawn errs as all."""
-        seen = self._rows > 0
-        if seen.any():
-            error = np.divide(self._sum, self._rows, out=np.zeros(len(seen)), where=seen)
-            unit = max(float(error[seen].mean()), 1e-12)
-            factor = np.exp(self.rule.step_size * np.where(seen, error / unit, 1.0))
-            self.shares = scaled_within(self.shares * factor, self.low, self.high)
-            self.td_abs = np.where(seen, error, np.nan)
-        self._sum[:] = 0.0
-        self._rows[:] = 0
-        return self.shares
-
-
 @dataclass
-class _SourceDraws(Stateful):
+class _SourceDraws:
     """The strata of one source, and what it is planned to give."""
-
-    STATE: ClassVar[tuple[str, ...]] = ("dro",)
 
     name: str
     strata: slice
@@ -123,7 +70,6 @@ class _SourceDraws(Stateful):
     online: float
     got: F64  # shares of its strata now
     natural: Ints | F64  # what divides "natural" shares: rows, or how often strata occur
-    dro: GroupDro | None = None
     wanted: F64 | None = None  # the shares asked for, if they never change
 
 
@@ -148,7 +94,7 @@ class ShareController(Stateful):
 
     SAME: ClassVar[tuple[str, ...]] = ("names",)
     STATE: ClassVar[tuple[str, ...]] = (
-        *("drawn", "batches", "learnt", "env_steps", "sources", "shares", "logs_share"),
+        *("drawn", "batches", "env_steps", "shares", "logs_share"),
         *("online", "wanted", "fresh_shares", "stock"),
     )
 
@@ -170,7 +116,7 @@ class ShareController(Stateful):
         self.stock: F64 = np.zeros(size)  # fresh rows that may be drawn, in batches
         self._share_given = logs_share
         self.drawn: Ints = np.zeros(len(strata), np.int64)
-        self.batches = self.learnt = 0  # drawn, and learnt from
+        self.batches = 0  # drawn
         self.env_steps = 0.0
         self.shares: F64 = np.zeros(len(strata))
         self.logs_share = 0.0
@@ -180,17 +126,11 @@ class ShareController(Stateful):
         portions += mixture.sources.parts.values()
         self._moves = any(knots(portion) for portion in portions)
         # Where no stratum has a quota, a ring is drawn from as it is.
-        self._steers = mixture.adaptive is not None or any(share != "natural" for share in shares)
+        self._steers = any(share != "natural" for share in shares)
         self._work_out(mixture.shortfall)
         self.planned_shares, self._wanted_offline = self.shares.copy(), self.wanted
         if fresh is not None and mixture.shortfall == "refuse":
             self._refuse_short()
-        if mixture.adaptive is not None:
-            for source in self.sources:
-                floors = np.array([rule.floor for rule in source.rules])
-                if source.got.sum() > 0:
-                    source.dro = GroupDro(mixture.adaptive, source.got, floors, source.caps)
-            self._work_out("redistribute")
 
     @classmethod
     def fixed(
@@ -214,7 +154,7 @@ class ShareController(Stateful):
             of_source,
             [stratum.rule for stratum in strata],
             np.array([stratum.rows for stratum in strata], np.int64),
-            np.array([self._cap_of(stratum.rule) for stratum in strata]),
+            np.array([stratum.rule.cap for stratum in strata]),
             *self._draws_of(name),
             np.zeros(len(strata)),
             np.array([s.rows if s.occurs is None else s.occurs for s in strata]),
@@ -228,10 +168,6 @@ class ShareController(Stateful):
         mean = self._scaled({n: mean_over(part, *span) for n, part in sources.parts.items()})
         offline = planned.offline * parts[name] / max(sum(parts.values()), 1e-12)
         return offline, planned.online * mean[name]
-
-    def _cap_of(self, rule: StratumRule) -> float:
-        adaptive = self.mixture.adaptive
-        return rule.cap if adaptive is None else min(rule.cap, adaptive.ceiling)
 
     def parts_at(self, env_steps: float) -> dict[str, float]:
         """The share of an online batch each source is to have, before its rows are looked at."""
@@ -291,29 +227,6 @@ class ShareController(Stateful):
         """A stratum's rows were drawn as often as they may be. True where the shares changed."""
         return self._work_out("redistribute")
 
-    def observe(self, stratum: NDArray[Any], td_abs: NDArray[Any]) -> bool:
-        """A batch was learnt from: |TD error| (n,) of its rows of these strata (n,).
-
-        True where the shares changed.
-
-        Raises:
-            MixtureError: where shares follow them, an error that is negative or not finite, or not
-                one a row.
-        """
-        rule = self.mixture.adaptive
-        if rule is None:
-            return False
-        td_abs = checked_errors(td_abs, stratum)
-        self.learnt += 1
-        stepping = self.learnt > rule.after_updates and self.learnt % rule.every_updates == 0
-        for source in self.sources:
-            if source.dro is not None:
-                of_source = (stratum >= source.strata.start) & (stratum < source.strata.stop)
-                source.dro.observe(stratum[of_source] - source.strata.start, td_abs[of_source])
-                if stepping:
-                    source.dro.step()
-        return self._work_out("redistribute") if stepping else False
-
     def _work_out(self, shortfall: Shortfall) -> bool:
         """Shares for this moment, within what the rows still allow."""
         if self.online:
@@ -336,8 +249,6 @@ class ShareController(Stateful):
 
     def _wanted(self, source: _SourceDraws) -> F64:
         """The shares (S,) of a source's rows that the mixture asks for now."""
-        if source.dro is not None:
-            return source.dro.shares
         if self._moves:
             return wanted_shares(source.rules, source.natural, self.env_steps)
         if source.wanted is None:
@@ -401,9 +312,6 @@ class ShareController(Stateful):
     def _wanted_fresh(self, stock: F64) -> F64:
         """The shares (S,) of fresh rows: natural strata as often as the ring has them."""
         source = self.sources[0]
-        if source.dro is not None:
-            every = [s.dro.shares for s in self.sources if s.dro is not None]
-            return np.asarray(np.mean(every, axis=0))
         if all(rule.share != "natural" for rule in source.rules):
             return self._wanted(source)  # whatever the rows
         have = stock if np.isfinite(stock).all() and stock.sum() > 0 else source.natural

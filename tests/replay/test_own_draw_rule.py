@@ -1,0 +1,84 @@
+"""A draw rule of your own, one class and one row of RULES, draws everywhere that rows are drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.library_buffers import make_store
+from support.panels import panel_of
+
+from restock.errors import ConfigError
+from restock.replay import RULES, Panel, Rule, StratumDraws, StratumRows, sampler_for
+
+MIXTURE = """
+within = "recent"
+correction = {pre = "none", post = "none"}
+[evaluation_split]
+by = "none"
+[each_condition]
+share = "natural"
+"""
+
+
+class Recent(StratumDraws):
+    """Draws the newest tenth of a stratum's rows, with replacement."""
+
+    def __init__(self, rows: StratumRows) -> None:
+        newest_first = np.argsort(rows.column("stamp_ns"), kind="stable")[::-1]
+        self.newest = newest_first[: max(len(rows) // 10, 1)]
+
+    def draw(self, count: int, rng: np.random.Generator, batches: int):  # type: ignore[no-untyped-def]
+        return rng.choice(self.newest, count), None
+
+
+@pytest.fixture
+def recent_panel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Panel:
+    monkeypatch.setitem(RULES, "recent", Rule(Recent, "the newest tenth"))
+    return panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")
+
+
+def test_a_sampler_draws_by_it(recent_panel: Panel) -> None:
+    sampler, stamps = sampler_for(recent_panel, 64, seed=0), recent_panel.meta_column("stamp_ns")
+    drawn = [sampler.draw() for _ in range(50)]
+    rows = np.concatenate([one.rows for one in drawn])
+    strata = np.concatenate([one.strata for one in drawn])
+    for number, stratum in enumerate(recent_panel.stratum_rows()):
+        of_stratum = rows[strata == number]
+        if len(of_stratum):
+            newest = np.sort(stamps[stratum])[::-1][: max(len(stratum) // 10, 1)]
+            assert stamps[of_stratum].min() >= newest.min()
+
+
+def test_stable_baselines3_draws_by_it(recent_panel: Panel, tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3")
+    from support.library_buffers import sb3_envs
+
+    from restock.train import MixtureReplayBuffer
+
+    env = sb3_envs(1)
+    spaces = env.observation_space, env.action_space
+    given = {"panel": recent_panel.path, "run": tmp_path / "run", "logs_share": 1.0}
+    buffer = MixtureReplayBuffer(100, *spaces, device="cpu", n_envs=1, **given)
+    observations = buffer.sample(32).observations.numpy()
+    newest = {
+        row.tobytes()
+        for stratum in recent_panel.stratum_rows()
+        for row in recent_panel.rows[newest_rows(recent_panel, stratum)]
+    }
+    width = observations.shape[1]
+    known = {np.frombuffer(row, np.float32)[:width].tobytes() for row in newest}
+    assert {row.tobytes() for row in observations} <= known
+    buffer.close()
+    env.close()
+
+
+def newest_rows(panel: Panel, stratum: np.ndarray) -> np.ndarray:
+    newest = np.argsort(panel.meta_column("stamp_ns")[stratum], kind="stable")[::-1]
+    return stratum[newest[: max(len(stratum) // 10, 1)]]
+
+
+def test_a_rule_that_nobody_made_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the rules are uniform, without_replacement, per"):
+        panel_of(make_store(tmp_path), MIXTURE, tmp_path / "panel")
