@@ -223,5 +223,5 @@ def test_a_learner_that_is_not_finite_names_its_update(device: str, tmp_path: Pa
 def test_gpu_with_too_little_memory_is_reported() -> None:
     full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 90.00 GiB.")
     error = as_restock_error(full, ["train", "--device", "cuda"])
-    assert "GPU's memory does not suffice: CUDA out of memory" in error.what
+    assert "out of GPU memory: CUDA out of memory" in error.what
     assert "--device cpu" in str(error.remedy)

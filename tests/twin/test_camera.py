@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from restock.errors import ConfigError
-from restock.train.twin.env import camera as camera_module
 from restock.train.twin.env.render import Camera
 from restock.train.twin.env.vector_env import WarehouseVectorEnv
 from restock.train.twin.physics.episode import EpisodeSpec
@@ -90,6 +89,6 @@ def test_an_unknown_camera_is_refused() -> None:
 def test_without_egl_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco.egl", None)  # as if it could not be imported
     with pytest.raises(ConfigError, match="EGL is unavailable") as raised:
-        camera_module.Camera("overhead")
+        Camera("overhead")
     assert "libegl1" in str(raised.value.remedy)
     assert "the drawn map needs no GL" in str(raised.value.remedy)
