@@ -397,7 +397,8 @@ class QuotaSampler(BlockSampler):
         """
         if not self._follows_td:
             return
-        errors, places = checked_errors(td_abs, rows), self._place[rows]
+        errors = checked_errors(td_abs, rows)
+        places: Ints = self._place[rows].astype(np.int64)
         if len(self.draws) == 1:
             self.draws[0].update(places, errors)
             return
