@@ -41,7 +41,7 @@ class Contents:
 
 
 def check_license(identifier: str | None) -> None:
-    """Raises StoreError where it is no identifier as hubs of data sets write them."""
+    """Raise StoreError where it is no identifier as hubs of data sets write them."""
     if identifier is not None and not _IDENTIFIER.fullmatch(identifier):
         raise StoreError(
             f"{identifier!r} is not an identifier of a licence",
@@ -53,7 +53,7 @@ def check_license(identifier: str | None) -> None:
 def card(
     selection: Selection, counts: Counts, contents: Contents, to: str, identifier: str | None
 ) -> str:
-    """The text of the card; without an identifier it says that no licence was given."""
+    """Return the text of the card; without an identifier it says that no licence was given."""
     reported, task = counts.describe(), selection.task
     size = next((name for most, name in _SIZES if reported["transitions"] < most), "1M<n<10M")
     front = [

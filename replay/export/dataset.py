@@ -157,7 +157,7 @@ def _advancing(
 
 
 def _while_there_is_room(episodes: Iterator[Trajectory], out: Path) -> Iterator[Trajectory]:
-    """Raises StoreError before the disk is full."""
+    """Raise StoreError before the disk is full."""
     for trajectory in episodes:
         free = shutil.disk_usage(out.parent).free
         if free < ROOM_BYTES + 2 * trajectory.observations.nbytes:

@@ -50,7 +50,7 @@ class ImageFeature:
         return f"{self.name}: {self.as_recorded:,} pictures as they were recorded{packed}"
 
     def picture(self, frame: CameraFrame) -> tuple[bytes, NDArray[np.uint8] | None]:
-        """A frame as a file, and its pixels where they were decoded for that.
+        """Return a frame as a file, and its pixels where they were decoded for that.
 
         Raises:
             StoreError: it has another size than those before, or more than 8 bits a channel.
@@ -97,7 +97,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 
 def chosen_cameras(store: Store, named: Sequence[str] | None) -> list[str]:
-    """The cameras whose frames are exported: those named, or all (None).
+    """Return the cameras whose frames are exported: those named, or all (None).
 
     Raises:
         StoreError: the store has no such camera.

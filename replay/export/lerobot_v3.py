@@ -148,7 +148,7 @@ class _DataFiles:
 
 
 def _frames(t: Trajectory, number: int, first_frame: int, fps: float) -> dict[str, Any]:
-    """An episode's columns, (T,) or (T, k) each."""
+    """Return an episode's columns, (T,) or (T, k) each."""
     steps = np.arange(len(t))
     last = steps == len(t) - 1
     return {

@@ -77,7 +77,7 @@ def write_minari(
 
 
 def _twin(selection: Selection) -> Any:
-    """The twin's spec, where it runs the very task of these rows; else none."""
+    """Return the twin's spec, where it runs the very task of these rows; else none."""
     if load_profile(TWIN_PROFILE).task.hash != selection.task.hash:
         return None
     spec = copy.deepcopy(gymnasium.spec(TWIN))  # the registry's own must stay as it is

@@ -58,7 +58,7 @@ def write_parquet(
 
 
 def as_table(trajectory: Trajectory, number: int) -> pa.Table:
-    """A trajectory's transitions as rows."""
+    """Return a trajectory's transitions as rows."""
     t, steps = trajectory, len(trajectory)
     last = np.arange(steps) == steps - 1
     columns: dict[str, Any] = {

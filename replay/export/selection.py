@@ -70,7 +70,7 @@ def open_selection(
     continuous: bool = False,
     cameras: Sequence[str] | None = (),
 ) -> Iterator[Selection]:
-    """The rows of a panel, or of a query to a store.
+    """Yield the rows of a panel, or of a query to a store.
 
     Args:
         path: a store or a panel.
@@ -270,7 +270,7 @@ def _tags(store: Store, recordings: Sequence[str]) -> dict[str, dict[str, str]]:
 def _batches(
     connection: duckdb.DuckDBPyConnection, relation: duckdb.DuckDBPyRelation, where: str
 ) -> Iterator[pa.RecordBatch]:
-    """A query's rows as they come; Ctrl-C stops it.
+    """Yield a query's rows as they come; Ctrl-C stops it.
 
     Raises QueryError for what goes wrong while it runs.
     """
@@ -308,7 +308,7 @@ def _of_panel(panel: Panel, continuous: bool) -> Selection:
 
 
 def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
-    """A panel's rows in order, as a query would give them."""
+    """Yield a panel's rows in order, as a query would give them."""
     text = {"recording_id", "episode_id", "condition", "zone", "behaviour_policy"}
     text |= {"behaviour_version", *LATER}
     meta = panel.meta.cast(
@@ -341,7 +341,7 @@ def _panel_batches(panel: Panel) -> Iterator[pa.RecordBatch]:
 def _range(
     task: Task, seen: tuple[tuple[float, float], tuple[float, float]] | None
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the task's actions span, or more where commands went beyond it."""
+    """Return what the task's actions span, or more where commands went beyond it."""
     table = np.asarray(task.actions)
     low, high = table.min(axis=0), table.max(axis=0)
     if seen is not None:

@@ -177,7 +177,7 @@ class _Rows:
 
 
 def _trajectory(rows: _Rows, begin: int, end: int, counts: Counts) -> Iterator[Trajectory]:
-    """The rows [begin, end) as one trajectory, or none where nothing is left of them."""
+    """Yield the rows [begin, end) as one trajectory, or none where nothing is left of them."""
     last = end - 1
     ended = bool(rows.terminated[last] or rows.truncated[last])
     after = rows.next_observation[last]
@@ -215,7 +215,7 @@ def count_episodes(trajectories: Iterable[Trajectory], counts: Counts) -> Iterat
 
 
 def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
-    """A list column (n lists) as (n, D) float32. Raises StoreError where lengths differ."""
+    """Return a list column (n lists) as (n, D) float32. Raises StoreError where lengths differ."""
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         array = array.combine_chunks()
@@ -232,7 +232,7 @@ def observation_matrix(column: pa.ChunkedArray, where: str) -> F32:
 
 
 def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
-    """A column that must not have nulls."""
+    """Return a column that must not have nulls."""
     if count := table[name].null_count:
         raise StoreError(
             f"{count} rows have no {name}", where=where, remedy=f"add WHERE {name} IS NOT NULL"
@@ -241,7 +241,7 @@ def _whole(table: pa.Table, name: str, where: str) -> NDArray[Any]:
 
 
 def _plain(table: pa.Table, name: str) -> NDArray[Any]:
-    """A scalar column; whole numbers with nulls become float64, text objects."""
+    """Return a scalar column; whole numbers with nulls become float64, text objects."""
     values: NDArray[Any] = table[name].to_numpy()
     return values
 

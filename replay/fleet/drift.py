@@ -140,7 +140,7 @@ def measure_drift(
 
 
 def _notes(tests: Rows, periods: Rows, every: str) -> list[str]:
-    """What a reader must know of what was not, or hardly, compared."""
+    """Return what a reader must know of what was not, or hardly, compared."""
     notes = []
     robots = sorted({row["robot"] for row in periods})
     if "untagged" in robots:

@@ -71,7 +71,7 @@ def install_gaps(store: Store) -> None:
 
 
 def gaps_table(found: ShoppingList) -> pa.Table:
-    """A row a gap, columns COLUMNS."""
+    """Return a row a gap, columns COLUMNS."""
     from restock.replay.fleet.shopping_list import document
 
     lines = [{**line, "unit": found.unit} for line in document(found)["gaps"]]

@@ -67,7 +67,7 @@ def find_gaps(
     min_rows: int = 0,
     by: Sequence[str] = CELL,
 ) -> tuple[Yields, list[Gap]]:
-    """The store's episodes, and what is missing, the most first.
+    """Return the store's episodes, and what is missing, the most first.
 
     Args:
         name: of the mixture, for the reports; `folder`: where its other stores are looked up.
@@ -127,7 +127,7 @@ def _refuse_unknown(kinds: Sequence[str], known: Sequence[str]) -> None:
 
 
 def uncorrected(mixture: Mixture) -> Mixture:
-    """The mixture without weights, which take long to estimate and ask for no rows.
+    """Return the mixture without weights, which take long to estimate and ask for no rows.
 
     A shortfall is what is looked for: it is no reason to refuse.
     """
@@ -143,7 +143,7 @@ def uncorrected(mixture: Mixture) -> Mixture:
 
 
 def _without_split(store: Store, mixture: Mixture) -> Mixture:
-    """The mixture, which keeps no recording from a store of one."""
+    """Return the mixture, which keeps no recording from a store of one."""
     if mixture.evaluation_split.by != "recording":
         return mixture
     several = store.sql("SELECT count(DISTINCT recording_id) > 1 FROM transitions").fetchall()[0][0]
@@ -180,7 +180,7 @@ def _thinnest(plan: PanelPlan, code: int, needed: int) -> tuple[str, ...]:
 def _of_audits(
     connection: duckdb.DuckDBPyConnection, yields: Yields, thresholds: Thresholds
 ) -> list[Gap]:
-    """What the shipped audits of coverage ask for."""
+    """Return what the shipped audits of coverage ask for."""
     gaps = []
     limits = {name: {k: float(v) for k, v in thresholds.get(name, {}).items()} for name in AUDITS}
     lines = connection.sql(

@@ -58,7 +58,7 @@ class MissionsFile(Checked, frozen=True, kw_only=True):
 
 
 def read_missions(path: str | Path) -> MissionsFile:
-    """A missions file.
+    """Read a missions file.
 
     Raises:
         ConfigError: it cannot be read, an unknown key, or a value that does not fit.
@@ -70,7 +70,7 @@ def read_missions(path: str | Path) -> MissionsFile:
 
 
 def of_list(found: ShoppingList, *, store: str, store_version: int, mixture: str) -> MissionsFile:
-    """The plan of a shopping list.
+    """Return the plan of a shopping list.
 
     Raises:
         ConfigError: it plans nothing: there are no gaps, or none that anything seen so far fills.
@@ -99,7 +99,7 @@ def of_list(found: ShoppingList, *, store: str, store_version: int, mixture: str
 
 
 def refuse_existing(path: Path) -> None:
-    """Raises ConfigError where there is something already."""
+    """Raise ConfigError where there is something already."""
     if path.exists():
         raise ConfigError(
             "already there", where=str(path), remedy="choose another name, or give --force"
@@ -115,7 +115,7 @@ def write_missions(path: Path, missions: MissionsFile) -> None:
 
 
 def as_toml(missions: MissionsFile) -> str:
-    """The text of the file."""
+    """Return the text of the file."""
     driven = any(order.missions is not None for order in missions.missions)
     how = "`restock twin record --missions` drives it" if driven else "the twin cannot drive hours"
     lines = [

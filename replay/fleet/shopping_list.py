@@ -89,7 +89,7 @@ def shopping_list(
     confidence: float = 0.8,
     seed: int = 0,
 ) -> ShoppingList:
-    """What fills the gaps, at the rates of the store's episodes.
+    """Return what fills the gaps, at the rates of the store's episodes.
 
     Args:
         unit: missions of a kind, or hours of logging; None: missions where the recordings knew the
@@ -143,7 +143,7 @@ def _may_fill(supply: Supply, gap: Gap) -> bool:
 
 
 def _supplies(gap: Gap, kinds: Sequence[str | None]) -> list[Supply]:
-    """What fills a gap best: a cell of a zone is filled by missions that come through it."""
+    """Return what fills a gap best: a cell of a zone is filled by missions that come through it."""
     zone, robot = gap.cell.get("zone"), gap.cell.get("robot")
     return [
         Supply(kind, None if zone is None else str(zone), str(robot) if robot else None)
@@ -208,7 +208,7 @@ def _least(
 def _forecasts(
     table: dict[tuple[int, Supply], Forecast], index: int, supply: Supply
 ) -> list[Forecast]:
-    """What is known of a supply for a gap; the worst of it counts.
+    """Return what is known of a supply for a gap; the worst of it counts.
 
     Of many zones the one that was luckiest looks best: where the gap is of any zone, missions
     through one are worth no more than those through all.

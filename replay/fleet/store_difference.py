@@ -87,7 +87,7 @@ class StoreDifference:
         return bool(self.definitions or self.recordings or self.labels or self.other_labels)
 
     def document(self) -> dict[str, Any]:
-        """What `restock coverage diff --json` prints."""
+        """Return what `restock coverage diff --json` prints."""
         changed = {
             change: sum(row["change"] == change for row in self.episodes)
             for change in ("in", "out", "changed")
@@ -112,7 +112,7 @@ class StoreDifference:
 
 @interrupts_raised
 def diff_stores(first: Store, second: Store, *, seed: int = 0) -> StoreDifference:
-    """What is different in `second`.
+    """Return what is different in `second`.
 
     Raises:
         StoreError: their rows are of different tasks, or cannot be read.
@@ -352,7 +352,7 @@ def _in_both(connection: duckdb.DuckDBPyConnection, names: Sequence[str]) -> lis
 
 
 def _custom(connection: duckdb.DuckDBPyConnection) -> list[str]:
-    """A profile's own signals that are numbers, of both stores."""
+    """Return a profile's own signals that are numbers, of both stores."""
     names = [
         str(name)
         for side in "ab"

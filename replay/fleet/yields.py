@@ -40,7 +40,7 @@ class Yields:
         return len(self.episode_id)
 
     def members(self, kind: str | None = None, zone: str | None = None) -> Ints:
-        """The episodes of a kind, and those that came through a zone."""
+        """Return the episodes of a kind, and those that came through a zone."""
         chosen = np.ones(len(self), np.bool_)
         if kind is not None:
             chosen &= np.array([one == kind for one in self.kind], np.bool_)
@@ -62,7 +62,7 @@ class Yields:
         return self._sum(kept)
 
     def values(self, name: str) -> list[str | int]:
-        """What there is of condition, zone, action or robot."""
+        """Return what there is of condition, zone, action or robot."""
         values: list[str | int] = self.cells[name].unique().to_pylist()
         if name == "condition":
             values = [one for held in values for one in str(held).split(",")]
@@ -106,7 +106,7 @@ def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> 
 
 
 def in_order(yields: Yields, names: pa.Array, found: F64) -> F64:
-    """What was found in the episodes of these ids, as `yields` has them (E,), or NaN."""
+    """Return what was found in the episodes of these ids, as `yields` has them (E,), or NaN."""
     place = {name: index for index, name in enumerate(names.to_pylist())}
     padded = np.append(found, np.nan)
     return padded[[place.get(name, -1) for name in yields.episode_id]]

@@ -315,7 +315,7 @@ def shipped_mixtures() -> list[str]:
 
 
 def load_mixture(name_or_path: str | Path) -> Mixture:
-    """A shipped mixture by name, or a TOML file.
+    """Load a shipped mixture by name, or a TOML file.
 
     Raises:
         ConfigError: no such name or file, no TOML, an unknown key or a value that is not valid.
@@ -336,7 +336,7 @@ def load_mixture(name_or_path: str | Path) -> Mixture:
 
 
 def parse_mixture(text: str, *, where: str = "mixture") -> Mixture:
-    """A mixture from TOML text. Raises ConfigError with the path of what is wrong."""
+    """Return a mixture from TOML text. Raises ConfigError with the path of what is wrong."""
     return _mixture(parse_toml(text, where=where), where)
 
 
@@ -351,7 +351,7 @@ def _mixture(document: dict[str, Any], where: str) -> Mixture:
 
 
 def shipped_schema() -> str:
-    """The JSON Schema of mixture files, as it is shipped.
+    """Return the JSON Schema of mixture files, as it is shipped.
 
     Editors complete and check a mixture by it: `#:schema FILE` as the first line of a TOML file
     names it to Taplo and to VS Code's Even Better TOML.

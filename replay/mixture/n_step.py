@@ -33,7 +33,7 @@ def step_flags(
     truncated: Bools,
     explored: Bools,
 ) -> NDArray[np.uint8]:
-    """What the step after each row is to it, (N - 1,) bits for N rows in order.
+    """Return what the step after each row is to it, (N - 1,) bits for N rows in order.
 
     `episode` and `policy` (N,) are codes, equal where the values are; `explored` (N,) says that a
     row's own policy thought its action less likely than chance.

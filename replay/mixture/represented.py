@@ -90,7 +90,7 @@ def stands_for_others(mixture: Mixture, source: str) -> bool:
 
 
 def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: str) -> F64:
-    """The rates as given; what is left to the other strata by their rows."""
+    """Return the rates as given; what is left to the other strata by their rows."""
     if unknown := sorted(set(rates) - set(names)):
         raise MixtureError(
             f"source {source!r}: `represents` gives a rate for {', '.join(unknown)}, which is not "

@@ -79,12 +79,12 @@ Portion = Fraction | Schedule
 
 
 def value_at(portion: Portion, env_steps: float) -> float:
-    """The share at a step."""
+    """Return the share at a step."""
     return portion if isinstance(portion, int | float) else portion.at(env_steps)
 
 
 def knots(portion: Portion) -> list[int]:
-    """The steps where a schedule begins, bends or ends; none for a number."""
+    """Return the steps where a schedule begins, bends or ends; none for a number."""
     if isinstance(portion, int | float):
         return []
     if isinstance(portion, Piecewise):
@@ -93,7 +93,7 @@ def knots(portion: Portion) -> list[int]:
 
 
 def mean_over(portion: Portion, begin: float, end: float) -> float:
-    """The mean share over [begin, end] environment steps, by a fine rule of midpoints."""
+    """Return the mean share over [begin, end] environment steps, by a fine rule of midpoints."""
     if isinstance(portion, int | float) or end <= begin:
         return value_at(portion, begin)
     edges = sorted({begin, end, *(k for k in knots(portion) if begin < k < end)})

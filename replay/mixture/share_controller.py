@@ -161,7 +161,7 @@ class ShareController(Stateful):
         )
 
     def _draws_of(self, name: str) -> tuple[float, float]:
-        """The rows that a source is to give offline, and online."""
+        """Return the rows that a source is to give offline, and online."""
         planned, sources = self.planned, self.mixture.sources
         parts = self.parts_at(0)
         span = (planned.begin_env_steps, planned.end_env_steps)
@@ -248,7 +248,7 @@ class ShareController(Stateful):
         return changed
 
     def _wanted(self, source: _SourceDraws) -> F64:
-        """The shares (S,) of a source's rows that the mixture asks for now."""
+        """Return the shares (S,) of a source's rows that the mixture asks for now."""
         if self._moves:
             return wanted_shares(source.rules, source.natural, self.env_steps)
         if source.wanted is None:
@@ -310,7 +310,7 @@ class ShareController(Stateful):
         return np.asarray(known & ~corrected, np.bool_)
 
     def _wanted_fresh(self, stock: F64) -> F64:
-        """The shares (S,) of fresh rows: natural strata as often as the ring has them."""
+        """Return the shares (S,) of fresh rows: natural strata as often as the ring has them."""
         source = self.sources[0]
         if all(rule.share != "natural" for rule in source.rules):
             return self._wanted(source)  # whatever the rows
@@ -334,7 +334,7 @@ class ShareController(Stateful):
         return np.minimum(left / max(ahead, 1.0), 1.0)
 
     def forecast(self) -> list[dict[str, Any]]:
-        """What a run will be fed, as far as can be known before it: a row a stratum, (S,).
+        """Return what a run will be fed, as far as can be known before it: a row a stratum, (S,).
 
         Shares of all rows of its batches: natural, wanted, from logs, from the ring, and short,
         with the reason. It counts on the ring for every stratum that fresh rows can be in.
@@ -395,7 +395,7 @@ class ShareController(Stateful):
         return f"{reason}, and the ring has too few fresh rows of it"
 
     def _refuse_short(self) -> None:
-        """Raises MixtureError if a quota cannot be met, where the mixture refuses that."""
+        """Raise MixtureError if a quota cannot be met, where the mixture refuses that."""
         short = [row for row in self.forecast() if row["short_share"] > _SHORT]
         if short:
             raise MixtureError(
@@ -458,7 +458,7 @@ class ShareController(Stateful):
         return min(by_draws, source.online * left)
 
     def describe(self) -> list[dict[str, Any]]:
-        """A row a stratum, for people and for a run's table `shares`."""
+        """Return a row a stratum, for people and for a run's table `shares`."""
         limit = self.max_replays
         rows = []
         for i, (stratum, share) in enumerate(zip(self.strata, self.shares.tolist(), strict=True)):

@@ -72,7 +72,7 @@ def plan_shares(
 def within_limits(
     wanted: F64, limit: F64, caps: F64, shortfall: Shortfall, complaints: Callable[[], str]
 ) -> SharePlan:
-    """What becomes of wanted shares (S,) where rows allow no more than `limit` (S,).
+    """Return what becomes of wanted shares (S,) where rows allow no more than `limit` (S,).
 
     `caps` (S,) bound what a stratum takes of the others' surplus; `complaints` says who is short.
 
@@ -190,7 +190,7 @@ def row_limits(
     episodes: Ints,
     draws: float,
 ) -> F64:
-    """The largest share of `draws` that each stratum's rows allow, (S,)."""
+    """Return the largest share of `draws` that each stratum's rows allow, (S,)."""
     limit = np.where(rows > 0, 1.0, 0.0)
     if mixture.most_draws is not None and draws > 0:
         limit = np.minimum(limit, mixture.most_draws * rows / draws)

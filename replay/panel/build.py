@@ -69,7 +69,7 @@ def open_source(
     conditions: Sequence[Condition] | None = None,
     folder: Path | None = None,
 ) -> Iterator[TransitionSource]:
-    """A store, or a table with the columns of `ingest.task.schema`, as a source of a panel.
+    """Yield a store, or a table with the columns of `ingest.task.schema`, as a source of a panel.
 
     A store comes with the other stores of `mixture`, whose relative paths begin at `folder`.
     Without `conditions` a table's are the shipped ones that its labels name.
@@ -144,7 +144,7 @@ def _register(connection: duckdb.DuckDBPyConnection, given: pa.Table) -> None:
 
 
 def _kinds(relation: duckdb.DuckDBPyRelation) -> dict[str, str]:
-    """What the values of each column are, whatever their size."""
+    """Return what the values of each column are, whatever their size."""
     return dict(zip(relation.columns, map(_kind, map(str, relation.types)), strict=True))
 
 
@@ -210,7 +210,7 @@ def build_panel(
 
 
 def plan_only(store: str, name: str) -> PanelPlan:
-    """What a panel of a mixture, by its name or its file, would hold; nothing is written.
+    """Return what a panel of a mixture, by its name or its file, would hold; nothing is written.
 
     Raises:
         StoreError, ConfigError, MixtureError: see `plan_panel`; those say which mixture it is.
@@ -282,7 +282,7 @@ def _write_all(
 
 @contextmanager
 def _enough_memory() -> Iterator[None]:
-    """What DuckDB, or Arrow for it, says when it has too little. Raises PanelError."""
+    """Yield what DuckDB, or Arrow for it, says when it has too little. Raises PanelError."""
     try:
         yield
     except (duckdb.OutOfMemoryException, OSError) as error:

@@ -94,7 +94,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         return self._pass(epoch, worker.id, worker.num_workers)
 
     def _pass(self, epoch: int, number: int, of: int) -> Iterator[dict[str, Tensor]]:
-        """The batches of worker `number` of so many."""
+        """Yield the batches of worker `number` of so many."""
         rank, ranks = self._rank()
         sampler = self._sampler(epoch)
         try:
@@ -119,7 +119,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         return sampler_for(self.panel, self.batch_size, seed=(self.seed, 6, of_pass))
 
     def _check(self) -> None:
-        """Raises MixtureError where draws follow what a data set does not receive."""
+        """Raise MixtureError where draws follow what a data set does not receive."""
         moving = controller_for(self.panel, planned_by(self.panel.header.mixture)).strata_move
         if moving or needs_td(self.panel):
             follows = "environment steps" if moving else "TD errors"

@@ -215,7 +215,7 @@ class LoggedSampler(Stateful):
             self.sampler.close()
 
     def describe(self) -> list[dict[str, Any]]:
-        """A row a stratum, for the run's table `shares`."""
+        """Return a row a stratum, for the run's table `shares`."""
         replays = self.replays
         rows = self.controller.describe()
         for index, (row, members) in enumerate(zip(rows, self._stratum_rows, strict=True)):
@@ -233,7 +233,7 @@ def sampler_for(
     logs_share: float | None = None,
     fresh: Bools | None = None,
 ) -> LoggedSampler:
-    """The sampler that draws from a panel as its mixture says.
+    """Return the sampler that draws from a panel as its mixture says.
 
     Args:
         batch_size: logged rows of a batch.
@@ -320,7 +320,7 @@ def needs_td(panel: Panel) -> bool:
 
 
 def planned_by(mixture: Mixture) -> PlannedDraws:
-    """The draws that a mixture was planned for."""
+    """Return the draws that a mixture was planned for."""
     online = float(mixture.planned.updates * mixture.planned.batch_size)
     return PlannedDraws(online=online, end_env_steps=mixture.sources.last_bend)
 
@@ -331,7 +331,7 @@ def controller_for(
     logs_share: float | None = None,
     fresh: Bools | None = None,
 ) -> ShareController:
-    """The shares of a learner that draws so much from a panel.
+    """Return the shares of a learner that draws so much from a panel.
 
     Raises:
         MixtureError: see `ShareController`.
@@ -354,7 +354,7 @@ def controller_for(
 
 
 def _weights(panel: Panel) -> WeightsInForce | F32 | None:
-    """The weights of a panel's rows, or None where none is corrected."""
+    """Return the weights of a panel's rows, or None where none is corrected."""
     strata = panel.strata
     if all(stratum.correction == "none" for stratum in strata):
         weights = panel.weights

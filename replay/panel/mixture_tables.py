@@ -132,14 +132,14 @@ def _changed_ns(name: str) -> int:
 
 
 def strata_table(plan: PanelPlan) -> pa.Table:
-    """The strata of a plan, columns STRATA."""
+    """Return the strata of a plan, columns STRATA."""
     return pa.table(
         {name: [getattr(line, _RENAMED.get(name, name)) for line in plan.strata] for name in STRATA}
     )
 
 
 def rows_table(plan: PanelPlan) -> pa.Table:
-    """The rows that a plan packs, in their order, columns ROWS."""
+    """Return the rows that a plan packs, in their order, columns ROWS."""
     rows = plan.rows.take(pa.array(plan.panel_rows))
     code = pa.array(plan.stratum[plan.panel_rows])
     return pa.table(

@@ -214,7 +214,7 @@ def _groups(rows: int, stop: Event) -> Iterator[slice]:
 
 @contextmanager
 def _writer(path: Path) -> Iterator[Callable[[pa.Table], None]]:
-    """Writes a Parquet file, a row group at a time."""
+    """Write a Parquet file, a row group at a time."""
     made: list[pq.ParquetWriter] = []
 
     def write(rows: pa.Table) -> None:

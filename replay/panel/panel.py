@@ -209,7 +209,7 @@ class Panel:
         return np.asarray(table[name].to_numpy())
 
     def _read(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Raises PanelError where the file is damaged."""
+        """Raise PanelError where the file is damaged."""
         return read_table(self.path / name, columns=columns, error=PanelError, remedy=AGAIN)
 
     @property
@@ -237,7 +237,7 @@ class Panel:
         return np.asarray(self.meta_column("return_to_go"), np.float32)
 
     def stratum_rows(self) -> list[Ints]:
-        """The row numbers of each stratum, in order of `strata`."""
+        """Return the row numbers of each stratum, in order of `strata`."""
         code = self.stratum_code
         return [np.flatnonzero(code == index) for index in range(len(self.strata))]
 
@@ -248,7 +248,7 @@ class Panel:
         return sampler_for(self, batch_size, seed=seed)
 
     def tensor(self) -> Any:
-        """The packed rows as a memory-mapped torch tensor (n, W), for `gather_rows`."""
+        """Return the packed rows as a memory-mapped torch tensor (n, W), for `gather_rows`."""
         import torch
 
         return torch.from_file(

@@ -42,7 +42,7 @@ class FileRecord(msgspec.Struct, frozen=True):
         return cls(size, checksum(path, LEAF_BYTES), sample_checksum(path), LEAF_BYTES)
 
     def check(self, path: Path, *, verify: bool) -> None:
-        """Raises PanelError where the file is not as it was written."""
+        """Raise PanelError where the file is not as it was written."""
         if sys.byteorder != "little":
             raise PanelError("panels need a little-endian machine", where=str(path))
         if not path.is_file():
@@ -83,7 +83,7 @@ class Leaves:
         self._digests[number] = blake3(content).digest(DIGEST_BYTES)
 
     def root(self) -> str:
-        """The checksum, 32 hex digits, of leaves that were all added."""
+        """Return the checksum, 32 hex digits, of leaves that were all added."""
         return blake3(b"".join(self._digests)).hexdigest(DIGEST_BYTES)
 
     def record(self, path: Path) -> FileRecord:
@@ -127,7 +127,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 def seal(header: msgspec.Struct) -> bytes:
-    """A header as indented JSON, with a checksum over its values."""
+    """Return a header as indented JSON, with a checksum over its values."""
     values = msgspec.to_builtins(header)
     return msgspec.json.format(msgspec.json.encode(values | {"seal": _seal_of(values)}), indent=1)
 
@@ -137,7 +137,7 @@ class _Version(msgspec.Struct):
 
 
 def packed_by(content: bytes) -> int | None:
-    """The version of the packing that a header names; None where there is none to read."""
+    """Return the version of the packing that a header names; None where there is none to read."""
     try:
         return msgspec.json.decode(content, type=_Version).packing_version
     except (msgspec.DecodeError, ValueError):
@@ -145,7 +145,7 @@ def packed_by(content: bytes) -> int | None:
 
 
 def unseal(content: bytes, kind: type[T], where: Path) -> T:
-    """What `seal` was given. Raises PanelError for what is no such header, or was edited."""
+    """Return what `seal` was given. Raises PanelError for what is no such header, or was edited."""
     try:
         values = msgspec.json.decode(content, type=dict[str, Any])
         given_seal = values.pop("seal", None)

@@ -179,7 +179,7 @@ def without_measured_actions(
 
 
 def unknown_conditions(connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    """The conditions and exposures that no recording's rows tell, and why not."""
+    """Return the conditions and exposures that no recording's rows tell, and why not."""
     if "recordings" not in {name for (name,) in connection.sql(_VIEWS).fetchall()}:
         return {}  # rows without recordings: nothing says otherwise
     rows: list[tuple[str, str]] = connection.sql(
@@ -250,7 +250,7 @@ def episodes_met(
 
 
 def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
-    """A list column (n lists of `size` floats) as (n, size).
+    """Return a list column (n lists of `size` floats) as (n, size).
 
     Raises:
         PanelError: a list of another size.
@@ -263,7 +263,7 @@ def matrix(column: pa.Array, size: int) -> NDArray[np.float32]:
 
 
 def one_task(table: pa.Table) -> str:
-    """The task of all rows that the mixture admits.
+    """Return the task of all rows that the mixture admits.
 
     Raises:
         MixtureError: it admits none.

@@ -278,7 +278,7 @@ def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 
 
 def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
-    """The same of rows that all count."""
+    """Return the same of rows that all count."""
     rule, seed = mixture.evaluation_split, mixture.seed
     if rule.is_empty:
         return EvaluationRows.none(len(table))
@@ -347,7 +347,7 @@ def _ends_of_episodes(
 
 
 def _whole_groups(table: pa.Table, rule: EvaluationSplit, seed: int) -> Bools:
-    """The rows (N,) of the groups that are kept whole."""
+    """Return the rows (N,) of the groups that are kept whole."""
     column, group = _GROUPS.get(rule.by, ("episode_id", "episode"))
     code = codes(table, column)
     untold = (code < 0) & bools(table, "admitted")
@@ -400,5 +400,5 @@ def _hash(name: str, seed: int) -> int:
 
 
 def scramble(ids: Ints, seed: int) -> NDArray[np.uint64]:
-    """A fixed mixing of ids: the same on every machine, whatever the order."""
+    """Return a fixed mixing of ids: the same on every machine, whatever the order."""
     return splitmix64(ids.astype(np.uint64) + np.uint64((seed * GOLDEN + 1) % 2**64))

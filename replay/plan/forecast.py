@@ -78,7 +78,7 @@ def forecast(
 def _needed(
     found: F64, amount: F64, weights: F64, rate: float, missing: float, rng: np.random.Generator
 ) -> float:
-    """The amount after which `missing` is reached, in one replicate."""
+    """Return the amount after which `missing` is reached, in one replicate."""
     if missing <= 0:
         return 0.0
     mean = float(weights @ found)

@@ -241,7 +241,7 @@ def _sources(
     logged: Bools,
     size: int,
 ) -> list[SourceRows]:
-    """What each store may give, with its share of a batch as a run begins; `size` strata.
+    """Return what each store may give, with its share of a batch as a run begins; `size` strata.
 
     A recording of which the mixture admits none of the rows (`logged`) is no logging of its kind.
     """
@@ -362,7 +362,7 @@ def _joined(
 
 
 def _prefix(source: SourceRows) -> str:
-    """What stands before the names of a source's strata."""
+    """Return what stands before the names of a source's strata."""
     return "" if source.name == LOGS else f"{source.name}/"
 
 
@@ -376,5 +376,5 @@ def _effective_rows(drawn: F64, code: NDArray[np.int16], weight: F32) -> float:
 
 
 def outcome_column(stratum: str) -> str:
-    """The column of a panel's metadata with P(stratum | state, action)."""
+    """Return the column of a panel's metadata with P(stratum | state, action)."""
     return f"probability_of_{stratum}"

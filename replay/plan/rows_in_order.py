@@ -83,14 +83,14 @@ class RowsInOrder:
             return pa.table(list(pool.map(column, names)), names)
 
     def _ranks(self) -> Ints:
-        """The place of each recording's code in the order of their ids."""
+        """Return the place of each recording's code in the order of their ids."""
         ids = pa.array(list(self._codes["recording_id"]), pa.string())
         rank = np.empty(len(ids), np.int64)
         rank[pc.array_sort_indices(ids).to_numpy()] = np.arange(len(ids))
         return rank
 
     def _sorted_rows(self, rank: Ints) -> pa.Array:
-        """The order of single rows, (N,)."""
+        """Return the order of single rows, (N,)."""
         keys = [pa.concat_arrays(self._parts[key]).to_numpy() for key in reversed(KEYS)]
         of_batches = [part.cast(pa.int32()) for part in self._parts["recording_id"]]
         return pa.array(np.lexsort([*keys, rank[pa.concat_arrays(of_batches).to_numpy()]]))
@@ -160,7 +160,7 @@ def _before(one: list[Ints], other: list[Ints]) -> Bools:
 
 
 def _code_type(size: int) -> pa.DataType:
-    """The smallest type that has the codes of so many texts."""
+    """Return the smallest type that has the codes of so many texts."""
     return pa.int8() if size <= 1 << 7 else pa.int16() if size <= 1 << 15 else pa.int32()
 
 

@@ -180,7 +180,7 @@ def _hours(driving: Forecast | None) -> dict[str, float]:
 
 
 def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> None:
-    """Raises MixtureError where schedules leave the other strata no way to share out the rest."""
+    """Raise MixtureError where schedules leave the other strata no way to share out the rest."""
     portions = [rule.share for rule in rules if not isinstance(rule.share, str)]
     bends = sorted({step for portion in portions for step in knots(portion)})
     # Between two bends a cosine can lie above the line that joins them.

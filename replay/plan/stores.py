@@ -37,7 +37,7 @@ class AllStores:
 
 @contextmanager
 def all_stores(first: Store, mixture: Mixture, folder: Path | None = None) -> Iterator[AllStores]:
-    """The first store with the mixture's others beside it, each at its pinned version.
+    """Yield the first store with the mixture's others beside it, each at its pinned version.
 
     A relative path is looked up in `folder` (that of the mixture's file), else where one stands.
     The first store's own views stay as they are.

@@ -111,7 +111,7 @@ def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[Re
 
 
 def rules_of(mixture: Mixture, names: Sequence[str]) -> list[StratumRule]:
-    """The rules of strata by their names, listed ones and those of `each_condition`."""
+    """Return the rules of strata by their names, listed ones and those of `each_condition`."""
     listed = {rule.name: rule for rule in mixture.strata}
     each = mixture.each_condition or EachCondition()
     return [listed.get(name) or _rule_for(name, each) for name in names]
@@ -176,7 +176,7 @@ def least_steps(rule: StratumRule, steps: Ints) -> int:
 def assign(
     member: Bools, strata: Sequence[ResolvedStratum], *, only_pre: bool = False
 ) -> NDArray[np.int16]:
-    """The stratum of each row (N,), from membership (N, S); -1 where it belongs to none.
+    """Return the stratum of each row (N,), from membership (N, S); -1 where it belongs to none.
 
     `only_pre` leaves out strata chosen on the outcome: where the row's state alone would put it,
     if `member` is of the state alone.
@@ -197,7 +197,7 @@ def deal_episodes(
     strata: Sequence[ResolvedStratum],
     counted: Bools,
 ) -> NDArray[np.int16]:
-    """The rarest stratum of each episode (E,); -1 where it is not dealt to one.
+    """Return the rarest stratum of each episode (E,); -1 where it is not dealt to one.
 
     The stratum with the fewest rows so far takes one of its episodes, and so on until none is left;
     first those that could go nowhere else. So a condition that is met in few episodes has all of

@@ -50,7 +50,7 @@ class Places:
         return int((self._ids[1:] == self._ids[:-1]).sum())
 
     def of(self, ids: Ints) -> Ints:
-        """The place of each of these ids (n,); -1 of one that is not there."""
+        """Return the place of each of these ids (n,); -1 of one that is not there."""
         place = np.empty(len(ids), np.int64)
         run = np.maximum(np.searchsorted(self._first, ids, "right") - 1, 0)
         # Ids that come together are mostly of one run.

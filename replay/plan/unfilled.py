@@ -81,7 +81,7 @@ def taken_by_others(
 
 
 def _count(rows: Bools, rule: StratumRule, episode: Codes) -> int:
-    """The size of some rows (N,) in the unit of a stratum."""
+    """Return the size of some rows (N,) in the unit of a stratum."""
     return int((np.bincount(episode[rows]) > 0).sum() if rule.unit == "episode" else rows.sum())
 
 
@@ -92,7 +92,7 @@ def _usual_steps(table: pa.Table, index: int, admitted: Bools) -> int:
 
 
 def _less_often(taker: ResolvedStratum, steps: int) -> str:
-    """What leaves nominal more than a condition that holds nearly everywhere does."""
+    """Return what leaves nominal more than a condition that holds nearly everywhere does."""
     name = taker.name
     in_mixture = (
         f'under [[strata]] give {name} unit = "step", or min_steps = {steps + 1} (half of its'

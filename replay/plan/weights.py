@@ -89,7 +89,7 @@ class RowWeights:
         return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
 
     def under(self, shares: F64) -> F32:
-        """The weights (N,) under these shares (S,)."""
+        """Return the weights (N,) under these shares (S,)."""
         boost = self.boost(shares)
         table, state_aim = self._table(boost)
         drawn = np.divide(shares, self.rows, out=np.zeros(len(shares)), where=self.rows > 0)
@@ -202,7 +202,7 @@ class WeightsInForce:
                 self._weight[at] = weights.under(shares[span] / total)
 
     def of(self, rows: NDArray[Any]) -> F32:
-        """The weights (n,) of rows (n,)."""
+        """Return the weights (n,) of rows (n,)."""
         weight: F32 = self._weight[rows]
         return weight
 

@@ -47,7 +47,7 @@ _COLUMNS += ["open", VERDICT]  # of a review file
 
 
 def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
-    """The events whose label is most doubtful, first the one that is most so.
+    """Return the events whose label is most doubtful, first the one that is most so.
 
     Of a condition with a probability: those whose mean log odds speak least for the label, and
     stretches without the label that are likely enough to be a missed event. Of others: the
@@ -76,7 +76,7 @@ def opened_by(event: DoubtfulEvent, store: str) -> str:
 
 
 def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]:
-    """The lines of a review file, with a verdict to fill in."""
+    """Return the lines of a review file, with a verdict to fill in."""
     rows = []
     for event in events:
         row = asdict(event)
@@ -91,7 +91,7 @@ def review_rows(events: list[DoubtfulEvent], store: str) -> list[dict[str, Any]]
 
 
 def review_csv(rows: list[dict[str, Any]]) -> str:
-    """A review file."""
+    """Return a review file."""
     text = io.StringIO()
     writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
     writer.writeheader()

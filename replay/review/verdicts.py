@@ -85,7 +85,7 @@ class _Episode:
 
 
 def read_verdicts(path: Path | str, store: Store) -> Verdicts:
-    """The corrections that a file gives, every line of it checked.
+    """Read the corrections that a file gives, every line of it checked.
 
     Raises:
         LabelError: the file cannot be read, a line names rows or a condition that are not there,
@@ -151,7 +151,7 @@ class _Reading:
         self.problems.append(f"line {line}: {what}")
 
     def _refuse(self) -> None:
-        """Raises LabelError where problems were found."""
+        """Raise LabelError where problems were found."""
         if not self.problems:
             return
         shown = self.problems[:_MAX_SAID]
@@ -179,7 +179,7 @@ class _Reading:
             ) from error
 
     def _check_columns(self, columns: set[str]) -> None:
-        """Raises LabelError where a column is missing."""
+        """Raise LabelError where a column is missing."""
         needed = (("condition",), ("episode_id", "recording"), ("first_step",), ("last_step",))
         missing = [
             " or ".join(names)
@@ -195,7 +195,7 @@ class _Reading:
             )
 
     def _line(self, line: int, said: Mapping[str, str]) -> Verdict | None:
-        """A line; None where it has no verdict, or a problem."""
+        """Return a line; None where it has no verdict, or a problem."""
         words = {said[name].lower() for name in (VERDICT, "value") if said.get(name)}
         if not words:
             self.left_open += 1
@@ -294,7 +294,7 @@ class _Reading:
         return episode
 
     def _stretches(self, verdict: Verdict, episode: _Episode) -> Iterator[tuple[bool, Ints]]:
-        """What is said of which rows: of the event's own steps, and of those it truly has."""
+        """Yield what is said of which rows: of the event's own steps, and of those it truly has."""
         own = _between(episode.step, verdict.first_step, verdict.last_step)
         if verdict.extent is None:
             yield verdict.value, own

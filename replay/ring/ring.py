@@ -103,7 +103,7 @@ class PendingSteps(Stateful):
     def pack(
         self, envs: Ints, next_observation: NDArray[Any], terminated: NDArray[Any]
     ) -> tuple[F32, dict[str, NDArray[Any]]]:
-        """The oldest step of each of these environments (n,), packed, and forgotten.
+        """Pack the oldest step of each of these environments (n,), packed, and forgotten.
 
         `next_observation` (N, D) and `terminated` (N,) are of the step added last. Returns rows
         (n, W) and their metadata (n,) each.
@@ -336,7 +336,7 @@ class FreshRing(Stateful):
         return len(slots)
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
-        """The condition code of each slot (n,); -1 where it has no label yet."""
+        """Return the condition code of each slot (n,); -1 where it has no label yet."""
         codes: NDArray[np.int16] = self.by_condition.stratum[slots]
         return codes
 

@@ -47,7 +47,7 @@ class StratumSlots(Stateful):
             self.stratum[slot] = stratum
 
     def members(self, stratum: int) -> Ints:
-        """The slots of a stratum, (counts[stratum],), in no meaningful order."""
+        """Return the slots of a stratum, (counts[stratum],), in no meaningful order."""
         return self._members[stratum][: self.counts[stratum]]
 
     @property

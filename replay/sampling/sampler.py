@@ -83,7 +83,7 @@ class Sampler(Protocol):
         """All that decides the draws to come: arrays and JSON values."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Puts the draws to come where `state_dict` found them."""
+        """Put the draws to come where `state_dict` found them."""
 
 
 class Quotas(Stateful):

@@ -80,7 +80,7 @@ class Finding:
 
 
 def shipped_audits() -> list[Audit]:
-    """The audits that come with Restock, by name."""
+    """Return the audits that come with Restock, by name."""
     return _load((files("restock.replay.store") / "audits").iterdir(), "restock")
 
 
@@ -100,7 +100,7 @@ def load_audits(folder: str | Path | None = None) -> list[Audit]:
 
 
 def load_thresholds(file: str | Path | None = None) -> dict[str, dict[str, float | str]]:
-    """The shipped thresholds, with those of a file in their place.
+    """Load the shipped thresholds, with those of a file in their place.
 
     Raises ConfigError for a file that is no TOML or holds anything but tables of values.
     """

@@ -60,7 +60,7 @@ def recommend_capacity(
     cells_share: float = CELLS_SHARE,
     effective_episodes: float = EFFECTIVE_EPISODES,
 ) -> Capacity:
-    """The least number of newest rows that keep the diversity of a store's tasks.
+    """Return the least number of newest rows that keep the diversity of a store's tasks.
 
     They keep `cells_share` of the condition x zone x action cells ever seen, and are worth
     `effective_episodes`. Below the first, a first-in-first-out buffer forgets whole cells, and no
@@ -104,7 +104,7 @@ def recommend_capacity(
 
 
 def capacity_of_rows(transitions: pa.Table) -> Capacity:
-    """The same of rows in memory: of a panel (`panel.meta`), which is what a run is fed."""
+    """Return the same of rows in memory: of a panel (`panel.meta`), which is what a run is fed."""
     macros = files("restock.replay.store").joinpath("capacity.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
         rows = transitions.select(list(_COLUMNS)).rename_columns({"condition": "primary_condition"})

@@ -33,7 +33,7 @@ UNITS = (
 
 
 def view_docs() -> dict[str, str]:
-    """What each view is, by name."""
+    """Return what each view is, by name."""
     return {name: table["doc"] for name, table in _read().items() if name != "shared"}
 
 
@@ -58,7 +58,7 @@ def column_docs() -> dict[tuple[str, str], str]:
 
 
 def unit(column: str) -> str:
-    """A column's unit, from its name's ending; "" for none."""
+    """Return a column's unit, from its name's ending; "" for none."""
     return next((unit for ending, unit in UNITS if column.endswith(ending)), "")
 
 

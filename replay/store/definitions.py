@@ -211,7 +211,7 @@ def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> It
 
 
 def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]:
-    """What is held of a store of this size."""
+    """Return what is held of a store of this size."""
     rows = _rows(connection)
     return [
         *(HELD_SUMMARIES if made.summaries and rows <= FEW_SUMMARISED_ROWS else ()),
@@ -243,7 +243,7 @@ def install_common(connection: duckdb.DuckDBPyConnection, observation_type: str)
 
 
 def definitions(observation_type: str = "FLOAT[]", names: Sequence[str] = (*VIEWS, *MACROS)) -> str:
-    """The text of these SQL files, with the type that observations are cast to."""
+    """Return the text of these SQL files, with the type that observations are cast to."""
     folder = files("restock.replay.store")
     text = [(folder / name).read_text(encoding="utf-8") for name in names]
     whole = with_columns(with_included("\n".join(text), folder))
@@ -264,7 +264,7 @@ def _of_store(observation_type: str, names: Sequence[str]) -> str:
 
 
 def made_by(name: str) -> list[str]:
-    """The views and macros of one of these files."""
+    """Return the views and macros of one of these files."""
     return list(_statements(definitions(names=[name])))
 
 
@@ -279,7 +279,7 @@ def _statements(text: str) -> Mapping[str, str]:
 
 @cache
 def _named_in(statement: str) -> frozenset[str]:
-    """What a statement reads, calls, or has in quotes: there are macros of a view's name."""
+    """Return what a statement reads, calls, or has in quotes: there are macros of a view's name."""
     sql = re.sub(r"--.*", "", statement)
     found = re.findall(r"\b(?:FROM|JOIN)\s+(\w+)|\b(\w+)\(|'(\w+)'", sql)
     return frozenset(name for names in found for name in names)

@@ -67,7 +67,7 @@ class CameraFrame:
 def camera_frames(
     store: Store, rows: str | Sequence[int], camera: str | None = None
 ) -> Iterator[CameraFrame]:
-    """The frames in force at the steps of some rows, by recording, step and camera.
+    """Yield the frames in force at the steps of some rows, by recording, step and camera.
 
     A row at which no frame is in force gives none. Some dozens of frames are in memory at a time.
 
@@ -115,7 +115,7 @@ def camera_frames(
 
 
 def cameras_of(store: Store) -> list[str]:
-    """The cameras that a store has frames of."""
+    """Return the cameras that a store has frames of."""
     rows = store.sql("SELECT DISTINCT camera FROM frames ORDER BY ALL").fetchall()
     return [str(name) for (name,) in rows]
 
@@ -123,7 +123,7 @@ def cameras_of(store: Store) -> list[str]:
 def _read(
     store: Store, found: Sequence[tuple[Any, ...]], sources: Mapping[str, str]
 ) -> Iterator[CameraFrame]:
-    """The frames of rows (transition_id, recording_id, camera, frame_index, age_s, …)."""
+    """Yield the frames of rows (transition_id, recording_id, camera, frame_index, age_s, …)."""
     keys = sorted({row[1:4] for row in found})
     recordings, cameras, indices = zip(*keys, strict=True)
     named = ", ".join(f"stored.{name}" for name in (*_OWN, *_LAYOUT))

@@ -127,7 +127,7 @@ _COUNT = re.compile(r"\s*select\s+count\(\s*\*?\s*\)\s+from\s+transitions\s*;?\s
 
 
 def _counted(connection: duckdb.DuckDBPyConnection, text: str) -> str:
-    """The same query, from the counts of the store's files where these answer it."""
+    """Return the same query, from the counts of the store's files where these answer it."""
     if not _COUNT.fullmatch(text):
         return text
     views = "SELECT view_name FROM duckdb_views() WHERE view_name IN ('transitions', $1)"
@@ -197,7 +197,7 @@ def found(
 
 
 def values(relation: duckdb.DuckDBPyRelation) -> list[tuple[Any, ...]]:
-    """The rows of a relation; times with a zone as text in UTC."""
+    """Return the rows of a relation; times with a zone as text in UTC."""
     if ZONED not in map(str, relation.types):
         return relation.fetchall()
     columns = [
@@ -254,7 +254,7 @@ OF_CONDITIONS = (
 
 
 def hint(error: duckdb.Error) -> str | None:
-    """What to ask instead, if a name was not found."""
+    """Return what to ask instead, if a name was not found."""
     if isinstance(error, duckdb.BinderException) and _NO_CONDITION.search(str(error)):
         return OF_CONDITIONS
     if isinstance(error, duckdb.CatalogException | duckdb.BinderException):

@@ -203,7 +203,7 @@ class Store:
         self._definitions.computed[names] = partial(install, self)
 
     def conditions(self) -> tuple[Condition, ...]:
-        """The conditions that labelled the store's rows, of the newest ingest.
+        """Return the conditions that labelled the store's rows, of the newest ingest.
 
         Only what the table keeps of them: name, timing, priority and SQL.
         """
@@ -238,7 +238,7 @@ class Store:
         return sorted(self._tasks)
 
     def task_json(self, task_hash: str | None = None) -> str:
-        """The task of the store's rows as JSON.
+        """Return the task of the store's rows as JSON.
 
         Raises StoreError where the rows are of several tasks and none, or no such, is named.
         """
@@ -256,7 +256,7 @@ class Store:
         )
 
     def task(self, task_hash: str | None = None) -> Task:
-        """The task of the store's rows. Raises StoreError as `task_json` does."""
+        """Return the task of the store's rows. Raises StoreError as `task_json` does."""
         return self._decode(self.task_json(task_hash), Task, "task")
 
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
@@ -270,7 +270,7 @@ class Store:
         yield from StoreReader(self.path).ends(held)
 
     def _decode(self, text: str, kind: type[T], name: str) -> T:
-        """What a manifest keeps as JSON.
+        """Return what a manifest keeps as JSON.
 
         Raises StoreError where another Restock wrote it, or it is damaged.
         """
@@ -364,12 +364,12 @@ class Store:
             raise (isinstance(cause, duckdb.Error) and damage(cause)) or error from error
 
     def _paths(self) -> list[str]:
-        """The files of rows and manifests, by their paths in the store."""
+        """Return the files of rows and manifests, by their paths in the store."""
         tables = (self._transitions, self._recordings)
         return [f"{table.table}/{path}" for table in tables for path in table.paths]
 
     def _frames(self) -> StoredTable:
-        """The frames of cameras that the manifests of its rows name."""
+        """Return the frames of cameras that the manifests of its rows name."""
         files = frame_files(self._manifests)
         if files:
             import pyarrow.compute as pc  # slow to import

@@ -158,7 +158,7 @@ def register(
 
 
 def _manifests(place: Location, recordings: DeltaTable, held: Sequence[StoredFile]) -> list[str]:
-    """The files of the manifests of these rows, those of an older version included.
+    """Return the files of the manifests of these rows, those of an older version included.
 
     A manifest is taken out of `recordings` when its rows are replaced. Who reads the rows as they
     were before, by version or because the writer was between two commits, finds it by its name.

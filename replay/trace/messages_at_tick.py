@@ -36,7 +36,7 @@ class MessageAtTick:
 def messages_at_tick(
     path: str | Path, profile: Profile, *, recording_id: str, tick: int, stamp_ns: int
 ) -> list[MessageAtTick]:
-    """The messages that one tick of a recording was made of, by age.
+    """Return the messages that one tick of a recording was made of, by age.
 
     Of each input and custom signal the latest one, and where the pose comes from transforms, each
     transform on the way.
@@ -104,7 +104,7 @@ def _of_inputs(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
-    """What each custom signal makes of its message, by its path."""
+    """Yield what each custom signal makes of its message, by its path."""
     for name, signal in aligned.profile.signals.items():
         columns = aligned.inputs.topics.get(signal.topic)
         if columns is None:
@@ -118,7 +118,7 @@ def _of_signals(aligned: AlignedInputs) -> Iterator[_Message]:
 
 
 def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
-    """The transforms from the robot's frame up to the fixed one, where they give the pose."""
+    """Yield the transforms from the robot's frame up to the fixed one, where they give the pose."""
     tree = aligned.tree
     if tree is None or "pose" in aligned.inputs.by_name:
         return

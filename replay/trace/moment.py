@@ -40,7 +40,7 @@ class Moment:
     notes: list[str] = field(default_factory=list)
 
     def column(self, name: str) -> list[Any]:
-        """A column of the steps, (T,)."""
+        """Return a column of the steps, (T,)."""
         return [step[name] for step in self.steps]
 
     @property
@@ -54,7 +54,7 @@ class Moment:
         return [int(stamp) + self.log_offset_ns for stamp in self.column("stamp_ns")]
 
     def sector_scans(self) -> list[SeenScan]:
-        """What the policy saw of the lidar at each step: a range a sector, T of them.
+        """Return what the policy saw of the lidar at each step: a range a sector, T of them.
 
         The observation holds clearances: with the body's reach that way they are ranges again.
         Empty where the robot has no lidar.
@@ -85,7 +85,7 @@ def find_moment(
     recording: Path | str | None = None,
     profile: str | None = None,
 ) -> Moment:
-    """The seconds around a row of a store.
+    """Return the seconds around a row of a store.
 
     Args:
         origin: of the row, as a trace found it.

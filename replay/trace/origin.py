@@ -103,7 +103,7 @@ def find_origin(
 
 
 def _look_up(source: StoreVersion, transition: int) -> Origin | None:
-    """The row at that version, or as it is now where that version can no longer be read."""
+    """Return the row at that version, or as it is now where that version can no longer be read."""
     now = _read(StoreVersion(source.path), transition)
     if source.version is None:
         return now
@@ -121,7 +121,7 @@ def _look_up(source: StoreVersion, transition: int) -> Origin | None:
 
 
 def _read(source: StoreVersion, transition: int) -> Origin | None:
-    """A row with what stands around it; None where that version, or its files, are gone."""
+    """Read a row with what stands around it; None where that version, or its files, are gone."""
     try:
         with Store(source.path, version=source.version) as store:
             rows = rows_of(store.connection, sql_file("trace.sql"), {"id": transition})
@@ -188,7 +188,7 @@ def _frames(
 def rows_of(
     connection: duckdb.DuckDBPyConnection, sql: str, parameters: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """The rows that a query gives, by column.
+    """Return the rows that a query gives, by column.
 
     Raises:
         StoreError: the file that it asks (its parameter `file`) cannot be read.
@@ -207,7 +207,7 @@ def rows_of(
 
 
 def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
-    """What became of a row since."""
+    """Return what became of a row since."""
     if now is None:
         return ["the newest version of the store no longer has this row"]
     changed = [name for name in _RELABELLED if row.get(name) != now.transition.get(name)]
@@ -323,5 +323,5 @@ def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -
 
 @cache
 def sql_file(name: str) -> str:
-    """A query of this folder."""
+    """Return a query of this folder."""
     return (files("restock.replay.trace") / name).read_text(encoding="utf-8")

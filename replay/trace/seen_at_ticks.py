@@ -41,7 +41,7 @@ class Seen:
 
 
 def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: int) -> Seen:
-    """What the ticks in [low_ns, high_ns] of the alignment clock saw.
+    """Return what the ticks in [low_ns, high_ns] of the alignment clock saw.
 
     Raises:
         RecordingError: the recording does not fit the profile.

@@ -57,7 +57,7 @@ def damage(path: Path, how: str) -> None:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store, a panel of it and a run on that, each as small as it can be."""
+    """Return a store, a panel of it and a run on that, each as small as it can be."""
     root = tmp_path_factory.mktemp("whole")
     task = load_profile("warehouse_amr").task
     rows = [recording_transitions(number, episodes=6, task=task) for number in (1, 2)]
@@ -81,7 +81,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_verbs(run: Path, root: Path, out: Path) -> dict[str, list[str]]:
-    """A command line a verb that reads a run."""
+    """Return a command line a verb that reads a run."""
     path = str(run)
     return {
         "eval": ["eval", path, "--dry-run", "--policies", "agent"],
@@ -222,7 +222,7 @@ def test_a_missing_table_is_reported_as_empty(
 
 
 def edited(root: Path, folder: Path, values: dict[str, object]) -> Path:
-    """The run with other values in its config.json."""
+    """Return the run with other values in its config.json."""
     run = folder / "run"
     shutil.copytree(root / "run", run)
     document = json.loads((run / "config.json").read_text())

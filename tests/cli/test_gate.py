@@ -37,7 +37,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def check(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, dict[str, str]]:
-    """The exit code, and each check's status."""
+    """Return the exit code, and each check's status."""
     code = main(["audit", *map(str, args), "--json"])
     checks = json.loads(capsys.readouterr().out)["audits"]
     return code, {f"{one['part']}.{one['audit']}": one["status"] for one in checks}

@@ -16,7 +16,7 @@ COLUMNS = (72, 80, 90, 120)
 
 
 def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
-    """A help without the line of its usage."""
+    """Return a help without the line of its usage."""
     assert cli.main([*words, "--help"]) == 0
     usage, *lines = capsys.readouterr().out.splitlines()
     assert usage.startswith(f"usage: restock {' '.join(words)}")
@@ -67,7 +67,7 @@ def test_the_jobs_of_a_verb_are_listed_a_line_each(capsys: pytest.CaptureFixture
 
 
 def on_a_terminal(*words: str, **environment: str) -> str:
-    """What a command prints on a terminal, stdout and stderr."""
+    """Return what a command prints on a terminal, stdout and stderr."""
     ours, theirs = pty.openpty()
     others = {name: value for name, value in os.environ.items() if name != "NO_COLOR"}
     process = subprocess.Popen(

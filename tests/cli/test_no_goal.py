@@ -23,7 +23,7 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short training under a profile that only says how to drive, not where to."""
+    """Return a short training under a profile that only says how to drive, not where to."""
     root = tmp_path_factory.mktemp("no_goal")
     text = (files("restock.ingest.profile") / "profiles" / "warehouse_amr.toml").read_text("utf-8")
     text = text.replace('goal = "route"', 'goal = "none"')

@@ -14,7 +14,7 @@ from restock import cli
 
 @pytest.fixture
 def cut(tmp_path: Path) -> Path:
-    """A recording that is cut short in the middle."""
+    """Return a recording that is cut short in the middle."""
     bag = write_bag(Drive(), tmp_path / "bags" / "cut", storage="mcap")
     (file,) = bag.glob("*.mcap")
     os.truncate(file, int(0.8 * file.stat().st_size))

@@ -55,7 +55,7 @@ HOSTILE = "<script>alert(1)</script>"
 
 
 def filled(table: str, **values: object) -> dict[str, object]:
-    """A row of a run's table; what is not given is a plain value of the column's type."""
+    """Return a row of a run's table; what is not given is a plain value of the column's type."""
     row: dict[str, object] = {}
     for field in TABLES[table]:
         if pa.types.is_boolean(field.type):
@@ -73,7 +73,7 @@ def filled(table: str, **values: object) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def run(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run directory as training and `restock eval` leave it, over the synthetic store."""
+    """Return a run directory as training and `restock eval` leave it, over the synthetic store."""
     root = tmp_path_factory.mktemp("reported")
     mixture = parse_mixture(
         "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
@@ -684,7 +684,7 @@ def test_every_section_has_its_figures(html: str) -> None:
 
 
 def rows_of(html: str, section: str) -> list[list[str]]:
-    """The cells of the rows of a section's tables."""
+    """Return the cells of the rows of a section's tables."""
     part = html.split(f'<section id="{section}">')[1].split("</section>")[0]
     lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
     cell = r"<td[^>]*>(?:<span>)?(.*?)(?:</span>)?</td>"  # a phone's list has a cell in a span

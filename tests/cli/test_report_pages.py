@@ -200,7 +200,7 @@ def missing(*gaps: dict[str, Any], unit: str = "missions", **plan: Any) -> dict[
 
 
 def coverage_of(store: Store, gaps: dict[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
-    """The cards by label, and the sections by id."""
+    """Return the cards by label, and the sections by id."""
     page = coverage_page(coverage_facts(store), gaps, "nothing to compare")
     cards = {card["label"]: card["value"] for card in page["cards"]}
     return cards, {section.id: section for section in page["sections"]}

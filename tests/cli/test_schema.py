@@ -36,7 +36,7 @@ def problems(name: str, document: dict[str, Any]) -> list[str]:
 
 
 def kind_of(path: str, document: dict[str, Any]) -> str | None:
-    """What a shipped TOML file is, by where it lies and what it holds."""
+    """Return what a shipped TOML file is, by where it lies and what it holds."""
     if path.startswith("ingest/profile/profiles/"):
         return "profile"
     if path.startswith(("replay/mixture/mixtures/", "benchmarks/")):

@@ -127,7 +127,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, bag: Path) -> 
 
 
 def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """The exit code, and the document."""
+    """Return the exit code, and the document."""
     code = cli.main(["start", *argv, "--json"])
     return code, json.loads(capsys.readouterr().out)
 

@@ -22,7 +22,7 @@ from restock.ingest.profile.profile import load_profile
 
 
 def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """The exit code, and the document."""
+    """Return the exit code, and the document."""
     code = cli.main(["start", *argv, "--json"])
     return code, json.loads(capsys.readouterr().out)
 

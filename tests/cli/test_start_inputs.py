@@ -45,7 +45,7 @@ BUMP = "".join(f"uint8 {side}\n" for side in ("left_front", "left_side", "right_
 
 
 def start(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, Any]:
-    """The exit code, and the document."""
+    """Return the exit code, and the document."""
     code = cli.main(["start", *argv, "--json"])
     return code, json.loads(capsys.readouterr().out)
 
@@ -56,7 +56,7 @@ def commands(document: Any) -> dict[str, str]:
 
 @pytest.fixture
 def damaged(tmp_path: Path) -> Path:
-    """A recording that is cut short in the middle."""
+    """Return a recording that is cut short in the middle."""
     bag = write_bag(Drive(), tmp_path / "bags" / "damaged", storage="mcap")
     (file,) = bag.glob("*.mcap")
     os.truncate(file, int(0.8 * file.stat().st_size))

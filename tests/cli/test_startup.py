@@ -18,7 +18,7 @@ SLOW = OF_LEARNING | {"pandas", "pyarrow.dataset", "typeguard", "asyncio", "rosb
 
 
 def loaded(*args: str, codes: tuple[int, ...] = (0, 1)) -> set[str]:
-    """The modules that one command has imported when it ends."""
+    """Return the modules that one command has imported when it ends."""
     code = (
         "import json, sys; from restock.cli import main; code = main(sys.argv[1:]);"
         "sys.stderr.write(json.dumps(sorted(sys.modules))); sys.exit(code)"

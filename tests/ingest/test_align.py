@@ -181,7 +181,7 @@ def test_messages_logged_at_zero_are_left_out_and_counted(tmp_path, capsys):
 
 
 def never_stamped(drive: Drive, *names: str) -> dict[str, Any]:
-    """A drive's typed topics, some of a driver that leaves header stamps at zero."""
+    """Return a drive's typed topics, some of a driver that leaves header stamps at zero."""
     found = dict(typed_topics(drive))
     for name in names:
         kind, topic = found[name]

@@ -56,7 +56,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def written(path: Path, store: Path, cameras: str = CAMERAS) -> tuple[IngestResult, list[Any]]:
-    """The result, and the rows of frames."""
+    """Return the result, and the rows of frames."""
     result = ingest(path, profile_with(cameras), store=StoreWriter(store))
     files = sorted((store / "frames").rglob("*.parquet"))
     return result, [row for file in files for row in pq.read_table(file).to_pylist()]

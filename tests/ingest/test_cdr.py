@@ -56,7 +56,7 @@ def agree(message: RosType, payloads: list[bytes], *, ros1: bool = False) -> Non
 
 @st.composite
 def definitions(draw: st.DrawFn, *, ros1: bool = False) -> str:
-    """A message definition with the messages it is made of, as a recording carries it."""
+    """Return a message definition with the messages it is made of, as a recording carries it."""
     bounds = "[]" if ros1 else "[<=5]"  # ROS 1 knows none
     repeats = [bounds if repeat == "[<=5]" else repeat for repeat in REPEATS]
     others = ["time", "duration"] if ros1 else ["string<=8", "builtin_interfaces/Time"]

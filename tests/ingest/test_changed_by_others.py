@@ -29,7 +29,7 @@ def store(tmp_path: Path) -> Path:
 
 
 def with_protocol(store: Path, name: str = TRANSITIONS, **protocol: object) -> Path:
-    """A commit that changes a table's protocol, as Spark writes it."""
+    """Return a commit that changes a table's protocol, as Spark writes it."""
     log = store / name / "_delta_log"
     number = len(list(log.glob("*.json")))
     text = json.dumps({"protocol": protocol}) + "\n"

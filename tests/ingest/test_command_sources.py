@@ -83,7 +83,7 @@ def taken_over(duration_s: float = 12.0) -> dict[str, tuple[str, TopicColumns]]:
 
 
 def profile_of(bag: Path, folder: Path, sources: str) -> Path:
-    """A proposal with these sources of commands and no others."""
+    """Return a proposal with these sources of commands and no others."""
     file = folder / "p.toml"
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
     kept, skip = [], False

@@ -313,7 +313,7 @@ def test_a_condition_gives_one_value_a_step_in_their_order(monkeypatch, sql, let
 
 
 def doubled(times: int) -> dict[str, str]:
-    """A text that gets twice as long with each name."""
+    """Return a text that gets twice as long with each name."""
     first = {"text_0": "'x' || clearance_m::VARCHAR"}
     return first | {f"text_{n + 1}": f"text_{n} || text_{n}" for n in range(times)}
 

@@ -27,7 +27,7 @@ def expected(file: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def written(content: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The records of a file as our parser reads them, those of chunks in their place."""
+    """Yield the records of a file as our parser reads them, those of chunks in their place."""
     for opcode, start, stop in walk(content, len(MAGIC), len(content) - len(MAGIC)):
         record = parse(Op(opcode), content, start, stop)
         if opcode == Op.CHUNK:
@@ -43,7 +43,7 @@ def written(content: bytes) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def plain(record: dict[str, Any], content: bytes) -> dict[str, Any]:
-    """A record as the JSON writes one: numbers as texts, bytes as lists of them."""
+    """Return a record as the JSON writes one: numbers as texts, bytes as lists of them."""
 
     def value(name: str, item: Any) -> Any:
         if name in SPANS:

@@ -54,7 +54,7 @@ def poses(time_s: Any) -> tuple[Any, Any, Any]:
 
 
 def winding() -> Topics:
-    """What it records, all clocks right."""
+    """Return what it records, all clocks right."""
     fast, tenth = np.arange(0, DURATION_S, 0.05), np.arange(0, DURATION_S, 0.1)
     (speed, rate), (requested, turned) = motion(fast), motion(tenth)
     x, y, yaw = poses(fast)
@@ -75,7 +75,7 @@ def _ranges(count: int) -> dict[str, Any]:
 
 
 def in_a_hall(topics: Topics, seen_s: float = 0.0) -> Topics:
-    """The same within four walls, seen so much before the stamps of the scans."""
+    """Return the same within four walls, seen so much before the stamps of the scans."""
     scan = topics["/scan"]
     time_s = (np.asarray(scan.fields["header.stamp"]) - START_NS) / NS - seen_s
     x, y, yaw = poses(np.clip(time_s, 0, DURATION_S))
@@ -88,21 +88,21 @@ def in_a_hall(topics: Topics, seen_s: float = 0.0) -> Topics:
 
 
 def shifted(topics: Topics, name: str, seconds: float) -> Topics:
-    """The same, with the stamps of a topic ahead by so much."""
+    """Return the same, with the stamps of a topic ahead by so much."""
     one = topics[name]
     stamp = np.asarray(one.fields["header.stamp"]) + round(seconds * NS)
     return {**topics, name: replace(one, fields={**one.fields, "header.stamp": stamp})}
 
 
 def scaled(topics: Topics, name: str, factor: float, *paths: str) -> Topics:
-    """The same, with fields of a topic multiplied."""
+    """Return the same, with fields of a topic multiplied."""
     one = topics[name]
     fields = {path: np.asarray(one.fields[path]) * factor for path in paths}
     return {**topics, name: replace(one, fields={**one.fields, **fields})}
 
 
 def two_publishers(topics: Topics) -> Topics:
-    """The same, with every third message of the odometry from another frame."""
+    """Return the same, with every third message of the odometry from another frame."""
     one, third = topics["/odom"], np.arange(len(topics["/odom"])) % 3 == 0
     fields = dict(one.fields)
     for axis, moved in (("x", 7.0), ("y", 2.0)):
@@ -120,7 +120,7 @@ def two_frames(topics: Topics) -> Topics:
 
 
 def slipping(topics: Topics) -> Topics:
-    """The same, with wheels that turn twice as fast for a third of the time."""
+    """Return the same, with wheels that turn twice as fast for a third of the time."""
     one = topics["/odom"]
     time_s = (np.asarray(one.fields["header.stamp"]) - START_NS) / NS
     factor = np.where(time_s % 15 < 5, 2.0, 1.0)
@@ -144,7 +144,7 @@ def profile(tmp_path_factory: pytest.TempPathFactory) -> Profile:
 
 
 def found_in(topics: Topics, profile: Profile, folder: Path) -> tuple[list[Finding], Any]:
-    """The findings, and each step's stamp, pose and command."""
+    """Return the findings, and each step's stamp, pose and command."""
     with open_recording(written(topics, folder / "bag")) as recording:
         steps = steps_of(profile, read_topics(recording, profile))
     names = ("stamp_ns", "pose_x_m", "pose_y_m", "command_speed_mps", "command_yaw_rate_radps")
@@ -230,7 +230,7 @@ def test_a_topic_that_alone_lies_out_of_order_is_no_set_back(profile, tmp_path):
 
 
 def shifted_all(topics: Topics, seconds: float) -> Topics:
-    """The same, with all stamps ahead by so much."""
+    """Return the same, with all stamps ahead by so much."""
     for name in topics:
         topics = shifted(topics, name, seconds)
     return topics

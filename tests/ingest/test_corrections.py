@@ -88,7 +88,7 @@ def said(store: Path, first: int, last: int, value: bool, condition: str = "soon
 
 
 def soon(store: Path) -> list[int]:
-    """The steps that have the label."""
+    """Return the steps that have the label."""
     found = labels(store, "step_index, list_contains(conditions, 'soon')")
     return [step for step, holds in found if holds]
 

@@ -40,7 +40,7 @@ def with_signals(*tables: str) -> str:
 def steps_with(
     table: str, fields: dict[str, FieldColumn], times: list[float] | None = None
 ) -> Steps:
-    """A drive of six seconds with messages of /x at these times (default: each second)."""
+    """Return a drive of six seconds with messages of /x at these times (default: each second)."""
     at = np.arange(0.0, 6.0) if times is None else np.array(times)
     topics = Drive().topics() | {"/x": columns(at, fields)}
     return steps_of(parse_profile(with_signals(table), where="p"), topics)
@@ -265,7 +265,7 @@ sql = "left_radps > {} AND len(beams_m) = 2 AND battery_v > 20"
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample bag with custom signals, and a condition on them."""
+    """Return the sample bag with custom signals, and a condition on them."""
     folder = tmp_path_factory.mktemp("custom")
     (folder / "p.toml").write_text(with_signals(*OWN, FAST.format(5)))
     command = ["ingest", str(SAMPLE), "--store", str(folder / "store")]

@@ -43,7 +43,7 @@ Topic = tuple[str, str, str, str, bytes, Sequence[bytes]]  # topic, encoding, ty
 
 
 def write(path: Path, *topics: Topic) -> Path:
-    """An MCAP file of these topics, a message a millisecond."""
+    """Write an MCAP file of these topics, a message a millisecond."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -202,7 +202,7 @@ F = FieldDescriptorProto
 
 
 def scan_files() -> Files:
-    """A Scan message with all kinds of fields, as a recorder would embed it."""
+    """Return a Scan message with all kinds of fields, as a recorder would embed it."""
     file = FileDescriptorProto(name="scan.proto", package="lab", syntax="proto3")
     file.dependency.extend(["google/protobuf/timestamp.proto", "google/protobuf/duration.proto"])
     scan = file.message_type.add(name="Scan")
@@ -420,7 +420,7 @@ def proto_name(kind: str) -> str:
 
 
 def as_descriptor(kind: RosType) -> Files:
-    """A ROS type as protobuf would define it."""
+    """Return a ROS type as protobuf would define it."""
     files = build_file_descriptor_set(timestamp_pb2.Timestamp)
     files.MergeFrom(build_file_descriptor_set(duration_pb2.Duration))
     file = files.file.add(name="ros.proto", package="ros", syntax="proto3")
@@ -445,7 +445,7 @@ def as_descriptor(kind: RosType) -> Files:
 
 
 def plain(value: Any) -> Any:
-    """A message of rosbags as JSON's kinds of values."""
+    """Return a message of rosbags as JSON's kinds of values."""
     if hasattr(value, "__msgtype__"):
         # Constants are fields of rosbags' classes, too.
         names = [name for name in value.__dataclass_fields__ if name.islower()]
@@ -457,7 +457,7 @@ def plain(value: Any) -> Any:
 
 
 def fill(message: Any, values: dict[str, Any]) -> Any:
-    """The same values in a protobuf message."""
+    """Return the same values in a protobuf message."""
     for name, value in values.items():
         if isinstance(value, dict) and value.keys() == {"sec", "nanosec"}:
             part = getattr(message, name)
@@ -476,7 +476,7 @@ def fill(message: Any, values: dict[str, Any]) -> Any:
 
 
 def copies(folder: Path, count: int) -> dict[str, Path]:
-    """The first messages of a sample recording as they are, in JSON and in protobuf."""
+    """Return the first messages of a sample recording as they are, in JSON and in protobuf."""
     paths = {encoding: folder / f"{encoding}.mcap" for encoding in ("cdr", "json", "protobuf")}
     with ExitStack() as stack:
         writers = {

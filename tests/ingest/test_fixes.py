@@ -27,7 +27,7 @@ RATE_S = 0.1
 
 
 def geodesic_m(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """The shortest way on the ellipsoid, by Vincenty's inverse formula (1975)."""
+    """Return the shortest way on the ellipsoid, by Vincenty's inverse formula (1975)."""
     polar_m = (1 - FLATTENING) * AXIS_M
     u1, u2 = (np.arctan((1 - FLATTENING) * np.tan(np.radians(p[0]))) for p in (one, other))
     apart = turn = np.radians(other[1] - one[1])
@@ -176,7 +176,7 @@ def test_the_heading_by_the_track_is_causal_and_held():
 
 
 def plain_track_yaw(x: np.ndarray, y: np.ndarray, track_m: float) -> np.ndarray:
-    """The definition, with a look at every earlier position since the last turn."""
+    """Return the definition, with a look at every earlier position since the last turn."""
     yaw, held, back = np.full(len(x), np.nan), np.nan, 0
     for here in range(len(x)):
         far = np.flatnonzero(np.hypot(x[here] - x[: here + 1], y[here] - y[: here + 1]) >= track_m)

@@ -35,7 +35,7 @@ ENCODINGS = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 
 
 def proposed(path: Path, capsys: Any, code: int = 0) -> tuple[str, list[str]]:
-    """The proposal's TOML, and what it is told to lack."""
+    """Return the proposal's TOML, and what it is told to lack."""
     assert main(["profile", "new", str(path), "--json"]) == code
     said = json.loads(capsys.readouterr().out)
     return said["toml"], said["problems"]

@@ -30,7 +30,7 @@ Line = tuple[float, str, str, float, float, float, float]
 def transforms(
     lines: list[Line], *, latency_s: float = 0.002, ahead_s: float = 0.0
 ) -> TopicColumns:
-    """A topic of one transform a message, in the order of the lines."""
+    """Return a topic of one transform a message, in the order of the lines."""
     one = offsets_of(np.ones(len(lines), np.int64))
     stamp = START_NS + np.rint(np.array([line[0] for line in lines]) * 1e9).astype(np.int64)
     half = np.array([line[6] for line in lines]) / 2
@@ -216,7 +216,7 @@ def test_a_quaternion_of_no_length_is_not_finite():
 
 
 def drive_with_transforms(drive: Drive, *, until_s: float = 99.0) -> dict[str, TopicColumns]:
-    """The drive with map -> odom -> base_link at 10 Hz; odom is turned half round."""
+    """Return the drive with map -> odom -> base_link at 10 Hz; odom is turned half round."""
     times = [t for t in np.arange(0, drive.duration_s, 0.1).tolist() if t < until_s]
     lines: list[Line] = []
     for t in times:

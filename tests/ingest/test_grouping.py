@@ -58,7 +58,7 @@ def read(path: Path, size: int, rows: int, *, salvage: bool) -> dict[str, Any]:
 
 
 def shuffled(source: Path, target: Path, chunk_size: int, seed: int, **options: Any) -> Path:
-    """The same messages out of order, as several recorders' buffers leave them."""
+    """Return the same messages out of order, as several recorders' buffers leave them."""
     with source.open("rb") as file, target.open("wb") as sink:
         messages = list(make_reader(file).iter_messages(log_time_order=False))
         random.Random(seed).shuffle(messages)

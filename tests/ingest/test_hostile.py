@@ -35,7 +35,7 @@ from restock.replay.store.store import Store
 
 
 def bag_with(folder: Path, script: str) -> Path:
-    """A bag's file after an SQL script."""
+    """Return a bag's file after an SQL script."""
     file = next(write_bag(folder / "run", 2).glob("*.db3"))
     base = sqlite3.connect(file)
     base.executescript(script)

@@ -26,7 +26,7 @@ Run = Callable[..., tuple[int, Any, str]]
 
 @pytest.fixture(scope="session")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sqlite3 bag of a robot that reaches one goal and drives on to the next."""
+    """Return a sqlite3 bag of a robot that reaches one goal and drives on to the next."""
     goals = [(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)]
     return write_bag(Drive(goals=goals, truth="nominal"), tmp_path_factory.mktemp("bag") / "drive")
 

@@ -159,7 +159,7 @@ def test_the_ends_are_kept_with_the_rows(store):
 
 
 def stale(store: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """The recordings whose labels or profile the audit calls stale."""
+    """Return the recordings whose labels or profile the audit calls stale."""
     capsys.readouterr()
     main(["audit", str(store), "--json"])
     audits = json.loads(capsys.readouterr().out)["audits"]

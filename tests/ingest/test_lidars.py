@@ -127,7 +127,7 @@ def transforms(lidars: list[tuple[str, Place]], roll_rad: float) -> TopicColumns
 
 
 def two_lidars(front: str = "", rear: str = "") -> str:
-    """The shipped profile of a robot with the lidars of `Corridor`."""
+    """Return the shipped profile of a robot with the lidars of `Corridor`."""
     start, end = WAREHOUSE.index("[inputs.scan]"), WAREHOUSE.index("[inputs.goal]")
     table = WAREHOUSE[start:end].replace("optional = true\n", "")
 

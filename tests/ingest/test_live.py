@@ -35,7 +35,7 @@ TASK = PROFILE.task
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An exported policy that never learnt anything: which one it is does not matter."""
+    """Return an exported policy that never learnt anything: which one it is does not matter."""
     pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     from restock.train.evaluation.onnx_policy import export_onnx

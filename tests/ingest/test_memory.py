@@ -62,7 +62,7 @@ print(json.dumps(peaks))
 
 
 def with_images(drive: Path, target: Path, images: int, storage: str) -> Path:
-    """The drive with images among its messages."""
+    """Return the drive with images among its messages."""
     types = get_typestore(Stores.ROS2_HUMBLE)
     rng = np.random.default_rng(1)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
@@ -90,7 +90,7 @@ def with_images(drive: Path, target: Path, images: int, storage: str) -> Path:
 
 
 def unchunked(bag: Path) -> Path:
-    """The messages of an MCAP bag outside any chunk, without a data section CRC."""
+    """Return the messages of an MCAP bag outside any chunk, without a data section CRC."""
     target = bag.with_suffix(".mcap")
     with next(bag.glob("*.mcap")).open("rb") as file, target.open("wb") as sink:
         writer = Writer(sink, use_chunking=False, compression=CompressionType.NONE)

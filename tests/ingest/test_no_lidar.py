@@ -79,7 +79,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def blind(drives: Path) -> tuple[Path, IngestResult]:
-    """A store of the drive without a lidar."""
+    """Return a store of the drive without a lidar."""
     store = drives / "store"
     return store, ingest(drives / "blind", BLIND, store=StoreWriter(store))
 

@@ -30,7 +30,7 @@ ROBOTS = {  # of others -> transitions of the proposal
 
 
 def with_all_signals(toml: str) -> str:
-    """The proposal with every commented-out custom signal taken in."""
+    """Return the proposal with every commented-out custom signal taken in."""
     lines, inside = [], False
     for line in toml.splitlines():
         inside = line.startswith("# [signals.") or (inside and line.startswith("# "))

@@ -54,7 +54,7 @@ class Commanded(Drive):
 def propose(
     drive: Drive, folder: Path, capsys: pytest.CaptureFixture[str], *options: str, code: int = 0
 ) -> tuple[Path, dict[str, Any], Path]:
-    """The bag, what `profile new --json` says, and the profile as a file."""
+    """Return the bag, what `profile new --json` says, and the profile as a file."""
     bag = write_bag(drive, folder / "bag")
     assert main(["profile", "new", str(bag), "--json", *options]) == code
     said = json.loads(capsys.readouterr().out)

@@ -35,7 +35,7 @@ Topics = dict[str, Any]
 
 
 def driven() -> Topics:
-    """A drive of a robot whose logs do not say who drives."""
+    """Return a drive of a robot whose logs do not say who drives."""
     topics: Topics = typed_topics(Drive(duration_s=12.0))
     del topics["/behaviour_policy"]
     return topics
@@ -64,7 +64,7 @@ def in_shadow() -> Topics:
 
 
 def proposed(topics: Topics, folder: Path, name: str = "robot") -> tuple[Path, Path, Profile]:
-    """The bag, its proposal, and that as a profile."""
+    """Return the bag, its proposal, and that as a profile."""
     bag, file = write_topics(topics, folder / f"{name}_bag"), folder / f"{name}.toml"
     assert main(["profile", "new", str(bag), "--out", str(file)]) == 0
     return bag, file, load_profile(file)

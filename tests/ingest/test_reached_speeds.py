@@ -15,7 +15,7 @@ TOLD = np.where(TICKS_S % 5 < 3, 0.5, 0.1)  # 3 s fast, 2 s slowly
 
 
 def late(reported: np.ndarray, at_s: np.ndarray, most: float) -> np.ndarray:
-    """A base that follows after .3 s, as fast as it can."""
+    """Return a base that follows after .3 s, as fast as it can."""
     index = np.searchsorted(TICKS_S, at_s - 0.3, "right") - 1
     return np.clip(reported[np.maximum(index, 0)], -most, most)
 

@@ -100,7 +100,7 @@ def without_metadata(bag: Path) -> Path:
 
 
 def split_sqlite(bag: Path) -> Path:
-    """The bag's messages in three files; the second holds the earliest."""
+    """Return the bag's messages in three files; the second holds the earliest."""
     file = next(bag.glob("*.db3"))
     for part in range(3):
         copy = shutil.copy(file, bag / f"run_{part}.db3")
@@ -113,7 +113,7 @@ def split_sqlite(bag: Path) -> Path:
 
 
 def with_metadata(bag: Path, version: int) -> Path:
-    """The bag with a metadata.yaml as rosbag2 wrote it at that version."""
+    """Return the bag with a metadata.yaml as rosbag2 wrote it at that version."""
     file = next(bag.glob("*.db3")).name
     qos: object = "- history: 1\n  depth: 10\n"
     about = {
@@ -483,7 +483,7 @@ def test_statistics_that_count_more_than_there_is(tmp_path: Path) -> None:
 
 
 def without_summary(path: Path, *, missing: int) -> Path:
-    """The file without what comes after its data, and without one of its message indexes."""
+    """Return the file without what comes after its data, and without one of its message indexes."""
     from restock.ingest.containers.formats.mcap_records import MAGIC, PREFIX, Op, walk
 
     content = path.read_bytes()

@@ -48,7 +48,7 @@ def three(place: Path | str, *, joined: bool = False) -> StoreWriter:
 
 
 def called(recording_id: str, path: str) -> tuple[pa.Table, pa.Table]:
-    """A recording with this id that was ingested by this path."""
+    """Return a recording with this id that was ingested by this path."""
     new = {"recording_id": recording_id, "source_file": path, "ingest_id": f"{recording_id}-a"}
     manifest, rows = (replaced(table, new) for table in one(1))
     return manifest, rows

@@ -21,7 +21,7 @@ NEATO = SHARED / "fleet-neato"
 
 
 def ingested(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[str, Any]:
-    """What `restock ingest … --json` says of one recording."""
+    """Return what `restock ingest … --json` says of one recording."""
     capsys.readouterr()
     main(["ingest", *map(str, arguments), "--json"])
     (one,) = json.loads(capsys.readouterr().out)["recordings"]
@@ -30,7 +30,7 @@ def ingested(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict
 
 @pytest.fixture(scope="module")
 def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first fifth of a recording, as a crash would leave it."""
+    """Return the first fifth of a recording, as a crash would leave it."""
     path = tmp_path_factory.mktemp("part") / "part.mcap"
     content = MONDAY.read_bytes()
     path.write_bytes(content[: len(content) // 5])

@@ -35,7 +35,7 @@ Run = Callable[..., tuple[int, Any, str]]
 
 @pytest.fixture
 def place(s3_server: str, request: pytest.FixtureRequest) -> str:
-    """A place for a store, of this test alone."""
+    """Return a place for a store, of this test alone."""
     return address(request)
 
 
@@ -112,7 +112,7 @@ def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def both(place: str) -> list[str]:
-    """What a reader and a writer are told."""
+    """Return what a reader and a writer are told."""
     errors = []
     for work in (lambda: Store(place), lambda: StoreWriter(place).write(*one(1))):
         with pytest.raises(StoreError) as caught:

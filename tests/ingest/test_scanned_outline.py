@@ -153,7 +153,7 @@ def test_things_beside_a_robot_that_stands_are_not_its_own(tmp_path, capsys):
 
 
 def lidar_at(x_m: float, y_m: float, yaw_rad: float, roll_rad: float = 0.0) -> TopicColumns:
-    """The transform of the scans' frame, rolled and then turned."""
+    """Return the transform of the scans' frame, rolled and then turned."""
     one = offsets_of(np.array([1]))
     yaw, roll = yaw_rad / 2, roll_rad / 2
     values: dict[str, Any] = {

@@ -15,7 +15,7 @@ from restock.ingest.profile.signal_paths import PathProblem, SignalPath
 
 
 def values_at(path: str, columns: dict[str, FieldColumn], end: str | None = None) -> list[list]:
-    """What a path finds, message by message."""
+    """Return what a path finds, message by message."""
     read = SignalPath.read(path)
     got = read.find(columns, end)
     count = len(next(iter(columns.values())))

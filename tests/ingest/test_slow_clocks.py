@@ -46,7 +46,7 @@ def at_pace(topics: dict[str, TopicColumns], pace: float, pause: tuple[float, fl
 
 
 def turning(duration_s: float = 30.0) -> dict[str, TopicColumns]:
-    """A drive whose command is the x at which it was given: each row tells when it was."""
+    """Return a drive whose command is the x at which it was given: each row tells when it was."""
     topics = Drive(duration_s, goals=[(0.0, 40.0, 1.0)]).topics()
     command = topics["/cmd_vel"]
     given_s = (command.log_time_ns - START_NS) * 1e-9

@@ -68,7 +68,7 @@ def read(file: Path, *, salvage: bool) -> tuple[Counter[Row], int | None, list[s
 
 
 def kinds(content: bytes) -> dict[int, list[int]]:
-    """The numbers of the pages, by their first byte, that hold the table of messages."""
+    """Return the numbers of the pages, by their first byte, that hold the table of messages."""
     pages: dict[int, list[int]] = {}
     for number in range(3, len(content) // PAGE):
         pages.setdefault(content[number * PAGE], []).append(number)

@@ -50,7 +50,7 @@ def commands(seed: int, *, spot: bool) -> Any:
 
 
 def shown(name: str, seed: int, *, spot: bool) -> DriveEvidence:
-    """What such a drive of the twin's robot shows, by a localiser's poses."""
+    """Return what such a drive of the twin's robot shows, by a localiser's poses."""
     robot, body = ROBOTS[name]
     reported = commands(seed, spot=spot)
     still = (

@@ -89,7 +89,7 @@ def test_what_stands_does_not_come_nearer_however_the_robot_moves(discs, forward
 
 
 def over(scans: list[Any]) -> float:
-    """What came nearer at the last of these scans (1, K) of a robot that stands."""
+    """Return what came nearer at the last of these scans (1, K) of a robot that stands."""
     *earlier, now = (signals(step, one, 0.0, 0.0) for step, one in enumerate(scans))
     return float(came_nearer(TASK, now, earlier[::-1])[0])
 

@@ -31,7 +31,7 @@ from restock.replay.store.store import Store
 
 
 def mcap(path: Path, *records: tuple[str, dict[Any, Any]]) -> Path:
-    """An MCAP file of one message, with these metadata records."""
+    """Return an MCAP file of one message, with these metadata records."""
     with path.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start()

@@ -26,7 +26,7 @@ from restock.replay.store.store import Store, is_store
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of recordings."""
+    """Return a folder of recordings."""
     return write_bags(tmp_path_factory.mktemp("bags"), 5)
 
 
@@ -156,7 +156,7 @@ def _alive(pid: int) -> bool:
 
 
 def descendants(pid: int) -> list[int]:
-    """A process's children, and theirs."""
+    """Return a process's children, and theirs."""
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that just ended

@@ -65,7 +65,7 @@ def clean() -> Tables:
 
 @pytest.fixture(scope="module")
 def statuses(clean: Tables) -> dict[str, str]:
-    """What every audit of a store alone says of it."""
+    """Return what every audit of a store alone says of it."""
     alone = [audit for audit in AUDITS.values() if audit.needs is None]
     thresholds = load_thresholds()
     chosen = {audit.name: thresholds[audit.name] for audit in alone if audit.parameters}
@@ -330,7 +330,7 @@ def one_circle(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def replayed(table: pa.Table, recordings: pa.Table) -> Tables:
-    """The second recording is the first one, later, its poses in another frame."""
+    """Return a store whose second recording is the first one, later, its poses in another frame."""
     one = table.filter(pa.array(rows_where(table, "recording_id", f"{1:016x}")))
     one = replaced(one, "wheel_speed_mps", np.linspace(0.1, 0.9, len(one)).astype(np.float32))
     again = replaced(one, "recording_id", [f"{2:016x}"] * len(one))
@@ -340,7 +340,7 @@ def replayed(table: pa.Table, recordings: pa.Table) -> Tables:
 
 
 def recorded_twice_at_once(table: pa.Table, recordings: pa.Table) -> Tables:
-    """The second recording begins 20 s before the first one ends."""
+    """Return two recordings, the second of which begins 20 s before the first ends."""
     starts = recordings["start_stamp_ns"].to_pylist()[0] + np.array([0, 40 * 10**9])
     recordings = replaced(recordings, "start_stamp_ns", starts)
     return table, replaced(recordings, "end_stamp_ns", starts + 60 * 10**9)
@@ -472,7 +472,7 @@ def test_an_evaluation_full_of_easy_episodes_is_biased(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A panel of the store for each way of holding out."""
+    """Return a panel of the store for each way of holding out."""
     folder, made = tmp_path_factory.mktemp("panels"), {}
     with Store(store_path) as store:
         for by in ("episode", "recording", "time"):
@@ -484,7 +484,7 @@ def panels(store_path: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 def beside_panel(store: Path, panel: Path, name: str, spoil: str = "SELECT 1") -> Finding:
-    """What an audit finds of a panel whose held-out list was spoilt."""
+    """Return what an audit finds of a panel whose held-out list was spoilt."""
     chosen = {name: load_thresholds()[name]} if AUDITS[name].parameters else {}
     with open_place(store, beside={"panel": panel}) as connection:
         install_named(connection, spoil)

@@ -37,7 +37,7 @@ def controller(
     known: tuple[bool, ...] = (True, True, True),
     corrected: tuple[bool, ...] = (False, False, False),
 ) -> ShareController:
-    """The shares of a run of so many environment steps, of the default schedule."""
+    """Return the shares of a run of so many environment steps, of the default schedule."""
     mixture = parse_mixture(text)
     strata = [
         SampledStratum(name, "logs", rule, count, 9, corrected=weighed)
@@ -179,7 +179,7 @@ def test_another_plan_changes_what_logged_rows_give() -> None:
 
 
 def ring_of(strata: list[int], rows: int = 40) -> FreshRing:
-    """A ring in which one ended episode's steps are in these strata, -1: in none."""
+    """Return a ring in which one ended episode's steps are in these strata, -1: in none."""
     ring = FreshRing(rows, 1, 1, discount=0.9, conditions=("any",), strata=("a", "b"))
     key = 0
     for step in range(len(strata)):

@@ -26,7 +26,7 @@ def rows(connection: duckdb.DuckDBPyConnection, query: str) -> list[dict[str, An
 
 
 def of_samples(signals: pa.Table, conditions: pa.Table | None = None) -> duckdb.DuckDBPyConnection:
-    """The views of drift.sql over given samples."""
+    """Return the views of drift.sql over given samples."""
     connection = duckdb.connect()
     connection.register("episode_signals", signals)
     if conditions is None:

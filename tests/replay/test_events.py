@@ -24,7 +24,7 @@ PERIOD_NS = 200_000_000
 
 
 def events_by_hand(store: Store) -> dict[str, dict[str, Any]]:
-    """What the view says, one row after the other."""
+    """Return what the view says, one row after the other."""
     ends = dict(store.sql("SELECT recording_id, end_stamp_ns FROM recordings").fetchall())
     rows = store.sql(
         "SELECT * EXCLUDE (observation, next_observation) FROM transitions ORDER BY ALL"

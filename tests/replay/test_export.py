@@ -251,7 +251,7 @@ def test_every_format_says_where_it_is_from_and_leaves_no_trace_of_a_failure(
 
 
 def provenance_in(to: str, out: Path) -> Any:
-    """What the data set itself says."""
+    """Return what the data set itself says."""
     text: Callable[[], Any] = {
         "parquet": lambda: pq.read_metadata(out).metadata[b"restock"],
         "npz": lambda: np.load(out)["restock"].item(),

@@ -27,7 +27,7 @@ NEAR = [number % 6 == 0 for number in range(EPISODES)]
 
 
 def planted(failed: Callable[[int], bool], near: list[bool] = NEAR) -> pa.Table:
-    """A recording whose episodes are exposed as EXPOSED, `near` where they came too near."""
+    """Return a recording whose episodes are exposed as EXPOSED, `near` where they came too near."""
     rows = recording_transitions(1, episodes=EPISODES, seed=3)
     episode = rows["episode_index"].to_numpy()
     step = rows["step_index"].to_numpy()

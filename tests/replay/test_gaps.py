@@ -31,7 +31,7 @@ KINDS = ("nominal", "wheel_slip", "blocked_aisle")
 
 
 def simulated(rows: pa.Table) -> pa.Table:
-    """The rows with their labels for the truth."""
+    """Return the rows with their labels for the truth."""
     place = rows.schema.get_field_index("true_condition")
     return rows.set_column(place, rows.schema.field(place), rows["condition"].combine_chunks())
 

@@ -87,7 +87,7 @@ def test_passes_are_repeated_or_renewed_by_epoch_and_seed(panel: Panel) -> None:
 
 
 def passes(dataset: PanelDataset, count: int, **options: Any) -> list[list[list[int]]]:
-    """The row numbers of every batch of so many passes of one loader."""
+    """Return the row numbers of every batch of so many passes of one loader."""
     loader = DataLoader(dataset, batch_size=None, **options)
     found = []
     for epoch in range(count):

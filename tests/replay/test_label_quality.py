@@ -18,7 +18,7 @@ from restock.replay.store.store import Store
 
 
 def with_truth(table: pa.Table, missed: float) -> pa.Table:
-    """The labels are the truth, but for a share of the true steps that were not labelled."""
+    """Return labels that are the truth, but for a share of true steps without a label."""
     rng = np.random.default_rng(3)
     named = table["conditions"].to_pylist()
     truth = [",".join(sorted(names)) or "nominal" for names in named]

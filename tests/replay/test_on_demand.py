@@ -19,7 +19,7 @@ _LISTED = "SELECT view_name FROM duckdb_views() WHERE NOT internal"
 
 
 def made(store: Store) -> set[str]:
-    """The views that a store's connection has."""
+    """Return the views that a store's connection has."""
     return {name for (name,) in store.bare.execute(_LISTED).fetchall()}
 
 

@@ -23,14 +23,14 @@ NEATO = SHARED / "fleet-neato"
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> list[dict[str, object]]:
-    """What `restock sql STORE QUERY --json` prints."""
+    """Return what `restock sql STORE QUERY --json` prints."""
     assert main(["sql", *map(str, arguments), "--json"]) == 0
     rows: list[dict[str, object]] = json.loads(capsys.readouterr().out)
     return rows
 
 
 def audited(store: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, list[dict[str, object]]]:
-    """The first rows of each audit that failed."""
+    """Return the first rows of each audit that failed."""
     capsys.readouterr()
     assert main(["audit", str(store), "--json"]) == 1
     findings = json.loads(capsys.readouterr().out)["audits"]
@@ -40,7 +40,7 @@ def audited(store: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, list[d
 def copy_of(
     table: pa.Table, recording: int, *, later_ns: int = 0, jitter_ns: int = 0, first: int = 0
 ) -> pa.Table:
-    """The same steps as another ingest would write them, from the row `first` on."""
+    """Return the same steps as another ingest would write them, from the row `first` on."""
     part = table.slice(first)
     rows, name = len(part), f"{recording:016x}"
     moved = np.random.default_rng(0).integers(-jitter_ns, jitter_ns + 1, rows) + later_ns

@@ -54,7 +54,7 @@ def test_transitions_are_those_that_were_written(store: Store, transitions: pa.T
 @pytest.mark.parametrize("attached", [False, True])
 def test_no_join_holds_the_transitions_in_memory(store: Store, attached: bool) -> None:
     def held(node: dict[str, Any]) -> list[str]:
-        """What the joins of a plan keep: their right sides."""
+        """Return what the joins of a plan keep: their right sides."""
         of_join = [str(node["children"][1])] if node["name"] == "HASH_JOIN" else []
         return of_join + [text for child in node["children"] for text in held(child)]
 

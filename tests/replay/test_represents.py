@@ -68,7 +68,7 @@ def recording(number: int, episodes: int, near: int) -> pa.Table:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store in which one mission of fifty is a near collision, and an archive of those."""
+    """Return a store in which one mission of fifty is a near collision, and an archive of those."""
     folder = tmp_path_factory.mktemp("fleet")
     write_store(folder / "main", [recording(1, 100, 2)])
     write_store(folder / "incidents", [recording(2, 30, 25)])

@@ -58,7 +58,7 @@ def truly(store: Store) -> dict[str, dict[int, frozenset[str]]]:
 def true_steps(
     event: DoubtfulEvent, truth: dict[str, dict[int, frozenset[str]]], reach: int = 0
 ) -> list[int]:
-    """The steps of an event, and `reach` around it, at which its condition is true."""
+    """Return the steps of an event, and `reach` around it, at which its condition is true."""
     steps = range(event.first_step - reach, event.last_step + reach + 1)
     return [s for s in steps if event.condition in truth[event.episode_id].get(s, ())]
 
@@ -168,7 +168,7 @@ def test_a_list_without_events_is_a_header_and_says_so(
 def fill(
     store: Path, events: list[DoubtfulEvent], file: Path, verdicts: dict[int, str], **changed: str
 ) -> Path:
-    """A review file with verdicts on some lines, and other values in the first of them."""
+    """Return a review file with verdicts on some lines, and other values in the first of them."""
     rows = review_rows(events, str(store))
     for place, verdict in verdicts.items():
         rows[place]["verdict"] = verdict

@@ -43,7 +43,7 @@ def earlier(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
 
 
 def shipped(way: float, steps: int, bumps: bool) -> tuple[list[float], str]:
-    """A bump ends the episode, and costs 6."""
+    """Return a profile in which a bump ends the episode and costs 6."""
     rewards, _ = earlier(way, steps, False)
     if not bumps:
         return rewards, "goal"
@@ -70,7 +70,7 @@ def some_rows() -> pa.Table:
 
 
 def store_of(path: Path, episodes: Sequence[Episode]) -> Path:
-    """A store of these episodes, in order."""
+    """Return a store of these episodes, in order."""
     lengths = np.array([len(rewards) for _, rewards, _ in episodes])
     rows = int(lengths.sum())
     table = some_rows().slice(0, rows)

@@ -134,7 +134,7 @@ def test_known_values_of_termination_truncation_and_bootstrap() -> None:
 def filled(
     capacity: int = 40, steps: int = 60, seed: int = 0, n_step: int = 3
 ) -> tuple[FreshRing, Drive]:
-    """A ring after some steps, ended episodes labelled by the parity of their step."""
+    """Return a ring after some steps, ended episodes labelled by the parity of their step."""
     ring = FreshRing(capacity, 2, SIZE, discount=0.9, n_step=n_step, conditions=CONDITIONS)
     drive = Drive(2, seed)
     advance(ring, drive, steps)

@@ -33,7 +33,7 @@ def out_of(capsys: pytest.CaptureFixture[str], *args: str, code: int = 0) -> str
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-    """A run directory as far as SQL looks at it."""
+    """Return a run directory as far as SQL looks at it."""
     path = tmp_path / "run"
     (path / "eval").mkdir(parents=True)
     (path / "config.json").write_text("{}")

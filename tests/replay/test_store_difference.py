@@ -30,7 +30,7 @@ from restock.replay.store.store import Store
 
 
 def relabelled(rows: pa.Table, steps: int) -> pa.Table:
-    """The same rows of another ingest, the first of them slipping."""
+    """Return the same rows of another ingest, the first of them slipping."""
     condition = rows["condition"].to_pylist()
     condition[:steps] = ["wheel_slip"] * steps
     return rows.set_column(rows.schema.get_field_index("condition"), "condition", [condition])

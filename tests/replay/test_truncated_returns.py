@@ -35,7 +35,7 @@ ENDINGS = ("end of the recording", "gap", "goal", "new goal", "time limit")
 
 
 def write_recording(folder: Path, storage: str) -> Path:
-    """A drive whose episodes end in every way, as a bag or as the MCAP file of one."""
+    """Write a drive whose episodes end in every way, as a bag or as the MCAP file of one."""
     topics = typed_topics(DRIVE)
     kind, commands = topics["/cmd_vel"]
     time_s = (commands.log_time_ns - START_NS) * 1e-9

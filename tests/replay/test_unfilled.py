@@ -30,7 +30,7 @@ LISTED = '[[strata]]\nname = "{}"\nunit = "{}"\nshare = "equal"\n'
 
 @pytest.fixture(scope="module")
 def braking(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A real recording, labelled by a profile that calls every stop hard braking."""
+    """Return a real recording, labelled by a profile that calls every stop hard braking."""
     folder = tmp_path_factory.mktemp("braking")
     (folder / "amr.toml").write_text(WAREHOUSE + BRAKING.format(0.25))
     log, store = str(ROOT / "sample_logs" / "amr_tuesday"), str(folder / "store")

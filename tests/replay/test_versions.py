@@ -25,7 +25,7 @@ JOBS = ("coverage gaps", "coverage drift", "store label")
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """A store of two recordings, and the version that had one."""
+    """Return a store of two recordings, and the version that had one."""
     path = tmp_path_factory.mktemp("versions") / "store"
     writer = StoreWriter(path)
     first = writer.write(*one(1))

@@ -46,7 +46,7 @@ def config(**settings: object) -> TrainConfig:
 
 
 def learnt(settings: TrainConfig, updates: int = 500, **given: object) -> np.ndarray:
-    """The values (4, 2) after learning from every row of the corridor."""
+    """Return the values (4, 2) after learning from every row of the corridor."""
     rows, _ = corridor()
     learner = Learner(settings, STATES, 2)
     for step in range(1, updates + 1):

@@ -55,7 +55,7 @@ Plant = Callable[[FedRows], FedRows]
 
 @pytest.fixture(scope="module")
 def logs() -> FedRows:
-    """What sound logs look like: the twin's, of other episodes than the twin's own."""
+    """Return what sound logs look like: the twin's, of other episodes than the twin's own."""
     return _drive(seed=7)
 
 
@@ -92,7 +92,7 @@ def _late(rows: FedRows) -> FedRows:
 
 
 def _degrees(rows: FedRows) -> FedRows:
-    """The gyroscope's readings, and the slip that is the wheels' less them."""
+    """Return the gyroscope's readings, and the slip that is the wheels' less them."""
     gyro, slip = map(rows.task.observation_names.index, ("gyro_yaw_rate", "slip_yaw_rate"))
     made = [rows.observation.copy(), rows.next_observation.copy()]
     for held in made:

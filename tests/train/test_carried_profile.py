@@ -65,7 +65,7 @@ def ingest(folder: Path, name: str, recording: str, store: Path) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store, its panel and a run of it, by a profile whose files are gone."""
+    """Return a store, its panel and a run of it, by a profile whose files are gone."""
     folder = tmp_path_factory.mktemp("carried")
     ingest(folder, "mine", TUESDAY, folder / "store")
     assert main(["mix", str(folder / "store"), "--out", str(folder / "panel")]) == 0

@@ -53,7 +53,7 @@ def make_run(
     target: TargetRule = Polyak(),  # noqa: B008  (frozen)
     seed: int = 0,
 ) -> Run:
-    """A run whose evaluations show these figures, as training writes them."""
+    """Make a run whose evaluations show these figures, as training writes them."""
     config = msgspec.to_builtins(TrainConfig(target=target, seed=seed))
     run = Run.create(path, {"config": config, "panel": None})
     for window in range(1, windows + 1):

@@ -53,7 +53,7 @@ def test_the_worst_failure_and_the_best_rescue_of_each_condition() -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose policy is nobody's: it fails, with several environments at a time."""
+    """Return a run whose policy is nobody's: it fails, with several environments at a time."""
     path = kept_run(tmp_path_factory.mktemp("film") / "run")
     plan = plan_evaluation(path, policies=("agent",), episodes=KINDS)
     drive_evaluation(plan)

@@ -203,7 +203,7 @@ DIFFERENT |= {"action_residual", "logged_ns"}  # the twin has no recorder
 
 
 def episodes_of(rows: pa.Table, profile: Profile) -> list[FreshEpisode]:
-    """A recording's rows as the twin's episodes are kept."""
+    """Return a recording's rows as the twin's episodes are kept."""
     ends = episode_ends(rows)
     assert ends is not None
     names = [column.name for column in SIGNAL_COLUMNS]

@@ -18,7 +18,7 @@ CAPACITY = 50
 
 
 def ring_of(rng: np.random.Generator) -> FreshRing:
-    """A ring whose metadata are any numbers."""
+    """Return a ring whose metadata are any numbers."""
     ring = FreshRing(
         CAPACITY, 1, 4, discount=0.9, n_step=1, conditions=["a", "b"], behaviour_policies=["p"]
     )

@@ -30,7 +30,7 @@ NEEDS = {
 
 
 def example(name: str) -> Any:
-    """An example's module; the test is skipped where its library is not installed."""
+    """Return an example's module; the test is skipped where its library is not installed."""
     pytest.importorskip(NEEDS[name])
     torch.set_num_threads(1)
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

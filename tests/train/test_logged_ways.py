@@ -34,7 +34,7 @@ LOGGED_TRAINING = ["train", "--set", "evaluation.missions=logged"]
 
 
 def rows_toward(goal: F64, places: F64) -> F64:
-    """What the signals say of a drive (N, 2) that looks at its goal."""
+    """Return what the signals say of a drive (N, 2) that looks at its goal."""
     offset = goal - places
     distance = np.hypot(*offset.T)
     yaw = np.arctan2(offset[:, 1], offset[:, 0])

@@ -99,7 +99,7 @@ def test_offline_learning_alone_agrees_with_value_iteration(tmp_path: Path) -> N
 
 
 def one_stratum(shelf: Logs, **changes: Any) -> Logs:
-    """The same logs with one stratum of other rows."""
+    """Return the same logs with one stratum of other rows."""
     return dataclasses.replace(shelf, strata=["nominal"], timings=["pre"], **changes)
 
 

@@ -39,7 +39,7 @@ def test_values_are_those_of_torch(settings: dict[str, object]) -> None:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that kept a policy."""
+    """Return a run that kept a policy."""
     return kept_run(tmp_path_factory.mktemp("runs") / "a")
 
 

@@ -35,7 +35,7 @@ CONFIG = OpeConfig(model=QUICK)
 
 
 def with_probability(table: pa.Table, probability: float) -> pa.Table:
-    """The same rows with the action's probability logged."""
+    """Return the same rows with the action's probability logged."""
     place = table.schema.get_field_index("action_probability")
     column = pa.array(np.full(len(table), probability, np.float32))
     return table.set_column(place, table.schema.field(place), column)

@@ -44,7 +44,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A profile of one's own, a store that it labelled, and a panel of that."""
+    """Return a profile of one's own, a store that it labelled, and a panel of that."""
     folder = tmp_path_factory.mktemp("own")
     text = WAREHOUSE.replace('name = "warehouse_amr"', 'name = "mine"', 1)
     (folder / "mine.toml").write_text(text + OWN.format(volts=26.395))

@@ -297,7 +297,7 @@ SETTINGS = config(replay={"logs_share": None}, schedule={"env_steps": 1600})
 
 @pytest.fixture(scope="module")
 def whole(table: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> tuple[Session, Panel]:
-    """A run on everything at once."""
+    """Return a run on everything at once."""
     path = tmp_path_factory.mktemp("runs")
     built = panel(table, path / "panel", EVERYTHING)
     return run_to_end(path / "whole", SETTINGS, logs=toy_logs(built)), built

@@ -119,7 +119,7 @@ treatment = "method"
 
 
 def study_of_two_comparisons(tmp_path: Path) -> Path:
-    """Writes s.toml; its folder of results, in which all was trained and evaluated before."""
+    """Write s.toml; its folder of results, in which all was trained and evaluated before."""
     arm = '\n[[arms]]\nname = "again"\nbaseline = "dueling"\ntreatment = "method"'
     (tmp_path / "s.toml").write_text(f"measures = []{SMALL}{arm}")
     out = tmp_path / "out"

@@ -160,7 +160,7 @@ def test_unlikely_actions_are_neither_taken_nor_targeted() -> None:
 
 
 def forward(env: Any, observation: np.ndarray) -> np.ndarray:
-    """A teacher on the corridor: on, but nothing to say of the first cell."""
+    """Return a teacher on the corridor: on, but nothing to say of the first cell."""
     return np.where(observation[:, 0] == 1, UNKNOWN, FORWARD)
 
 

@@ -63,7 +63,7 @@ def a_run(path: Path) -> Run:
 
 
 def follow(run: Run, name: str) -> Events:
-    """A run's curves, to one tracker."""
+    """Return a run's curves, to one tracker."""
     events = Events(run.path, tracker_sinks(run, [name]))
     for step, values in CURVES:
         events.scalars(step, "train", values)

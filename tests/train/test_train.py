@@ -47,7 +47,7 @@ MIXTURE = parse_mixture("[each_condition]\nshare = 'natural'\n[evaluation_split]
 
 @pytest.fixture(scope="module")
 def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A panel of random rows of the twin's task."""
+    """Return a panel of random rows of the twin's task."""
     task = load_profile("warehouse_amr").task
     path = tmp_path_factory.mktemp("panels") / "panel"
     rows = recording_transitions(1, episodes=40, task=task)
@@ -57,7 +57,7 @@ def panel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory, panel: Path) -> Path:
-    """A small run on that panel."""
+    """Return a small run on that panel."""
     path = tmp_path_factory.mktemp("runs") / "a"
     argv = ["train", "--panel", str(panel), "--out", str(path), "--env-steps", "400", *TINY]
     assert main(argv) == 0

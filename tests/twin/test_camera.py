@@ -28,7 +28,7 @@ SPECS = [EpisodeSpec("near_collision", 14), EpisodeSpec("wheel_slip", 5)]
 
 
 def _share(frame: np.ndarray, color: tuple[int, int, int], within: int = 45) -> float:
-    """The share of a frame's pixels that are near a colour."""
+    """Return the share of a frame's pixels that are near a colour."""
     off = np.abs(frame.astype(int) - np.array(color)).max(axis=-1)
     return float((off < within).mean())
 

@@ -40,7 +40,7 @@ _INPUTS = ("command", "pose", "wheels", "imu", "scan")
 
 
 def recorded(profile: Profile, folder: Path) -> Path:
-    """A drive under `TRUE` on an empty floor, each command held for a second."""
+    """Return a drive under `TRUE` on an empty floor, each command held for a second."""
     robot = robot_model(profile.robot, profile.task.body)
     sim = Simulation(1, profile.task, empty_floor(), 0.01, 1, robot=robot)
     spec = EpisodeSpec("nominal", 0)

@@ -168,7 +168,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
 
 
 def png_header(width: int, height: int) -> bytes:
-    """A PNG that says how large it is, and ends there."""
+    """Return a PNG that says how large it is, and ends there."""
 
     def chunk(kind: bytes, data: bytes = b"") -> bytes:
         return (

@@ -43,7 +43,7 @@ def environments() -> list[WarehouseVectorEnv]:
 
 
 def both(env: WarehouseVectorEnv, monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """The ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
+    """Return the ranges (8, beams) as compiled code finds them, and as MuJoCo casts them."""
     found = []
     for switch in ("1", "0"):
         monkeypatch.setenv(native.SWITCH, switch)

@@ -193,7 +193,7 @@ def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
 
 
 def drawn(missions: tuple[MissionOrder, ...], share: float, count: int = 400) -> list[EpisodeSpec]:
-    """The episodes that one of two environments begins."""
+    """Return the episodes that one of two environments begins."""
     queue = EpisodeQueue(2, [FLOOR], {"nominal": 1.0}, None, seed=5)
     if missions:
         queue.follow(orders(*missions), share)

@@ -61,7 +61,7 @@ def drive(sim: Simulation, speed: float, yaw_rate: float, seconds: float) -> Non
 
 
 def wheel_share() -> float:
-    """The share of the robot's weight that the driven wheels carry, standing."""
+    """Return the share of the robot's weight that the driven wheels carry, standing."""
     model, _ = build_model(default_warehouse(), stand_in(TASK.body))
     data = mujoco.MjData(model)
     data.qpos[:3] = 6.0, 5.0, 0.1

@@ -64,7 +64,7 @@ def steps(store: Path) -> Iterator[LoggedSteps]:
 
 
 def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> OpenLoopStart:
-    """What a drive of `count` periods from these rows begins with."""
+    """Return what a drive of `count` periods from these rows begins with."""
     now = {name: column[rows] for name, column in steps.now.items()}
     pose = np.stack([now[name] for name in POSE], axis=-1)
     return OpenLoopStart(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))

@@ -210,7 +210,7 @@ def test_a_recording_holds_what_was_said_from_then_on() -> None:
 
 @pytest.fixture
 def old_store(tmp_path: Path) -> Path:
-    """A store from before there were such columns."""
+    """Return a store from before there were such columns."""
     manifest, rows = one(1)
     StoreWriter(tmp_path / "s").write(manifest, rows.drop_columns(COLUMNS))
     return tmp_path / "s"

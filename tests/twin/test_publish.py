@@ -22,7 +22,7 @@ SECONDS = 4.0
 
 
 def _drive(rng: np.random.Generator) -> Drive:
-    """A left-hand circle of 1 m radius at .5 m/s, bumped at 1.05 s, replanned at 2 s."""
+    """Drive a left-hand circle of 1 m radius at .5 m/s, bumped at 1.05 s, replanned at 2 s."""
     time = np.arange(0, SECONDS + 1e-9, 0.01)
     yaw = 0.5 * time
     pose = np.stack([np.sin(yaw), 1 - np.cos(yaw), yaw], axis=-1)

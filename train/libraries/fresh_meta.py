@@ -104,7 +104,7 @@ class FreshMeta:
         return self.by_condition.stratum
 
     def condition(self, slots: NDArray[Any]) -> NDArray[np.int16]:
-        """The condition code of each slot (n,); -1 where it has no label yet."""
+        """Return the condition code of each slot (n,); -1 where it has no label yet."""
         codes: NDArray[np.int16] = self.by_condition.stratum[slots]
         return codes
 

@@ -58,7 +58,7 @@ class LibraryArm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_installed() -> None:
-    """Raises ConfigError where Stable-Baselines3 is not installed."""
+    """Raise ConfigError where Stable-Baselines3 is not installed."""
     if not installed("stable_baselines3"):
         raise ConfigError(
             "an arm trains with Stable-Baselines3, which is not installed",
@@ -67,7 +67,7 @@ def check_installed() -> None:
 
 
 def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
-    """The study's settings as the library can follow them.
+    """Return the study's settings as the library can follow them.
 
     Raises:
         ConfigError: settings that it has no counterpart of.

@@ -73,19 +73,19 @@ class PartialTables:
 
 
 def column(values: Any) -> Any:
-    """A column, or one value for all rows, without NaNs."""
+    """Return a column, or one value for all rows, without NaNs."""
     if isinstance(values, np.ndarray) and values.dtype.kind == "f" and np.isnan(values).any():
         values = values.tolist()
     return [known(value) for value in values] if isinstance(values, list) else known(values)
 
 
 def known(value: Any) -> Any:
-    """A value, or None for NaN."""
+    """Return a value, or None for NaN."""
     return None if isinstance(value, float) and value != value else value
 
 
 def episode_row(env: int, key: int, info: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of `episodes`, as far as the last step's info tells."""
+    """Return a row of `episodes`, as far as the last step's info tells."""
     columns = set(TABLES["episodes"].names)
     row = {"env": env, "episode": key, "conditions": []}
     row |= {name: _plain(info[name]) for name in _INFO if name in info}

@@ -167,7 +167,7 @@ class MixedFeed:
                 self._episodes[labelled.key]["conditions"] = labelled.conditions
 
     def draw_logs(self, batch_size: int) -> BatchDraw:
-        """The logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
+        """Draw the logged rows (L,) of a batch, by the mixture; all of it where nothing is fresh.
 
         Raises:
             MixtureError: nothing is fresh, and the panel's rows were drawn as often as they may be;
@@ -328,7 +328,7 @@ class MixedFeed:
 
 
 def environment_profile(name: str | None, panel: Panel | None) -> Profile:
-    """The profile of this name; without one the panel's, without a panel warehouse_amr."""
+    """Return the profile of this name; without one the panel's, without a panel warehouse_amr."""
     if name is None and panel is not None:
         return profile_of_panel(panel)
     return load_profile(name or PROFILE)

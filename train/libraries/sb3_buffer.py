@@ -211,7 +211,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.feed.invalid_steps += 1
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """A batch: logs first, then fresh rows."""
+        """Return a batch: logs first, then fresh rows."""
         feed, ring = self.feed, self.ring
         drawing = feed.draw_logs(batch_size)
         slots = feed.sample_fresh(np.arange(len(ring)), batch_size - len(drawing.rows))

@@ -51,7 +51,7 @@ def _environment(config: TrainConfig) -> Any:
 
 
 def _made(kind: Any, config: TrainConfig, arguments: dict[str, Any], **ours: Any) -> Any:
-    """The algorithm. Raises ConfigError for arguments that it does not take."""
+    """Return the algorithm. Raises ConfigError for arguments that it does not take."""
     torch.set_num_threads(config.threads)
     env = _environment(config)
     try:
@@ -148,7 +148,7 @@ class _Drive(BaseCallback):
         self.check()
 
     def check(self) -> None:
-        """Raises NotFinite where an update has left a parameter that is not finite."""
+        """Raise NotFinite where an update has left a parameter that is not finite."""
         finite = all(p.isfinite().all() for layer in self.linears for p in layer.parameters())
         steps = {"env_steps": self.num_timesteps, "gradient_steps": self.updates()}
         check_kept(finite, self.evaluations.run.path, steps)

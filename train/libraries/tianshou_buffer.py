@@ -153,7 +153,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         return np.concatenate([self.fresh.capacity + drawing.rows, slots])
 
     def sample(self, batch_size: int | None) -> tuple[Any, NDArray[Any]]:
-        """A batch with its weights, and where its rows are."""
+        """Return a batch with its weights, and where its rows are."""
         index = self.sample_indices(batch_size)
         batch: Any = self[index]
         weight = np.ones(len(index), np.float32)

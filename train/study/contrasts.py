@@ -42,7 +42,7 @@ KINDS_OF_MEASURE = ("auc", "success")
 
 
 def unknown_measure(name: str) -> str | None:
-    """What is wrong with the name of a measure, or None."""
+    """Return what is wrong with the name of a measure, or None."""
     kind, _, what = name.partition("_")
     if kind in KINDS_OF_MEASURE and what in (*CELLS, "rare"):
         return None
@@ -183,14 +183,14 @@ def contrast(
 
 
 def _why_no_interval(ahead: F64) -> str | None:
-    """What `paired_t` lacks in paired differences (n,), or None."""
+    """Return what `paired_t` lacks in paired differences (n,), or None."""
     if (seeds := len(ahead)) < MIN_PAIRS:
         return f"{counted(seeds, 'seed')}, at least {MIN_PAIRS} are needed"
     return "the same in every seed: nothing varies" if nothing_varies(ahead) else None
 
 
 def with_holm(contrasts: Sequence[Contrast]) -> list[Contrast]:
-    """The same with p adjusted for all that are not the primary one."""
+    """Return the same with p adjusted for all that are not the primary one."""
     places = [i for i, one in enumerate(contrasts) if not one.primary and one.p is not None]
     adjusted = holm([float(contrasts[i].p or 0.0) for i in places])
     found = list(contrasts)

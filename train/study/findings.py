@@ -29,7 +29,7 @@ MAX_NAMED = 4  # checks that refuse a comparison
 
 
 def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> dict[str, Any]:
-    """The study and all that it found, as JSON values.
+    """Return the study and all that it found, as JSON values.
 
     `comparisons` are those of `run_study`; an error is why there is none.
     """
@@ -52,7 +52,7 @@ def findings(plan: StudyPlan, comparisons: Sequence[Comparison | RunError]) -> d
 
 
 def _compared(pair: Pair, comparison: Comparison | RunError) -> dict[str, Any]:
-    """A comparison as JSON values, with why it has no outcomes, or ""."""
+    """Return a comparison as JSON values, with why it has no outcomes, or ""."""
     if isinstance(comparison, RunError):
         why = f"{comparison.where}: {comparison.what}" if comparison.where else comparison.what
         comparison = Comparison(pair.treatment, "inconclusive", [], [], [], [], None, [])
@@ -90,7 +90,7 @@ def _why_refused(pair: Pair, comparison: Comparison) -> str:
 
 
 def _finished(plan: StudyPlan) -> dict[str, Sequence[Path]]:
-    """The finished runs of each arm."""
+    """Return the finished runs of each arm."""
     return {
         arm.name: [path for path in plan.runs(arm) if (path / DONE).exists()]
         for arm in plan.study.arms
@@ -169,7 +169,7 @@ def _driven_by(path: Path, policy: str) -> list[dict[str, Any]]:
 
 
 def _references(plan: StudyPlan) -> tuple[dict[Any, float], dict[str, list[dict[str, Any]]]]:
-    """The planner's times where it arrived, and the references' episodes, by name."""
+    """Return the planner's times where it arrived, and the references' episodes, by name."""
     path = plan.jobs[0].path
     names = plan.study.evaluation.references if path.is_dir() else ()
     episodes = {name: rows for name in names if (rows := _driven_by(path, name))}
@@ -212,7 +212,7 @@ def _over_seeds(runs: Sequence[dict[str, float]]) -> dict[str, list[float | None
 
 
 def _range(name: str) -> tuple[float, float]:
-    """What a measure of `_measured` can be."""
+    """Return what a measure of `_measured` can be."""
     if name.startswith("success "):
         return 0.0, 1.0
     return (0.0 if name in NOT_NEGATIVE else -math.inf), math.inf

@@ -196,7 +196,7 @@ class Study(Checked, frozen=True):
 
 
 def load_study(path: Path | str) -> Study:
-    """A study from a TOML file.
+    """Load a study from a TOML file.
 
     Raises:
         ConfigError: no such file, no TOML, an unknown key or an invalid value; names the key.
@@ -231,7 +231,7 @@ def _refuse_without_updates(arm: ArmConfig, schedule: ScheduleConfig, where: str
 
 
 def _refuse_unknown_names(evaluation: StudyEvaluation, where: str) -> None:
-    """Raises ConfigError where a run could not be evaluated, which would be found once trained."""
+    """Raise ConfigError where a run could not be evaluated, which would be found once trained."""
     from restock.train.evaluation.evaluation_plan import refuse_unknown
 
     names = evaluation.perturbations
@@ -290,7 +290,7 @@ class StudyPlan:
         ]
 
     def runs(self, arm: ArmConfig) -> list[Path]:
-        """The run directories of an arm, one a seed."""
+        """Return the run directories of an arm, one a seed."""
         return [job.path for job in self.jobs if job.arm.name == arm.name]
 
     def panel(self, arm: ArmConfig) -> Path | None:
@@ -344,7 +344,7 @@ def check_jobs(plan: StudyPlan) -> None:
 
 
 def _only(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """What one request says and the other does not."""
+    """Return what one request says and the other does not."""
     reported = [text for text in one.get("settings", ()) if text not in other.get("settings", ())]
     reported += [
         f"{key} = {json.dumps(value)}"

@@ -171,7 +171,7 @@ def run_job(plan: StudyPlan, job: StudyJob, say: Say) -> None:
 
 
 def _episodes_flags(evaluation: StudyEvaluation) -> list[str]:
-    """What `restock eval` is told to drive."""
+    """Return what `restock eval` is told to drive."""
     given = evaluation.episodes
     if isinstance(given, dict):
         text = ",".join(f"{kind}={count}" for kind, count in given.items())

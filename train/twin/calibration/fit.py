@@ -93,7 +93,7 @@ class FitConfig(Checked, frozen=True):
     name: str = "fitted"
 
     def check(self) -> None:
-        """Raises ValueError where a parameter cannot be fitted."""
+        """Raise ValueError where a parameter cannot be fitted."""
         if not self.parameters:
             raise ValueError(f"no parameter is given: choose from {', '.join(PARAMETERS)}")
         for name in self.parameters:
@@ -208,7 +208,7 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
 def _search(
     residuals: ReplayResiduals, coordinates: Coordinates, config: FitConfig, report: Report
 ) -> F64:
-    """The best point (n,) of a search over the whole ranges, on few segments."""
+    """Return the best point (n,) of a search over the whole ranges, on few segments."""
     report(f"searching {config.search_points} points on {len(residuals.segments)} segments")
     scale = {name: CHANNELS[name][1] for name in residuals.channels}
     problem = FitProblem(residuals, coordinates, scale)
@@ -264,7 +264,7 @@ def _least_squares(
 def _held_out_gaps(
     data: _FitData, scope: FitScope, config: FitConfig, fitted: Perturbation, report: Report
 ) -> tuple[HeldOutGap, ...]:
-    """The gap of position on what the fit has not seen, at 1, 3 and 6 s."""
+    """Return the gap of position on what the fit has not seen, at 1, 3 and 6 s."""
     if "position" not in scope.channels or not config.held_out:
         return ()
     report("driving the held-out segments again")

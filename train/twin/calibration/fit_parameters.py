@@ -108,13 +108,13 @@ class Coordinates:
         return np.clip((inner - self._low) / self._span, 0.0, 1.0)
 
     def perturbation(self, z: F64) -> Perturbation:
-        """The perturbation at a point (n,)."""
+        """Return the perturbation at a point (n,)."""
         # Rounded so that equal points are equal, and ends of ranges are within them.
         values = dict(zip(self.names, (round(float(v), 9) for v in self.values(z)), strict=True))
         return msgspec.structs.replace(self.base, **values)
 
     def drivable(self, z: F64, timestep_s: float) -> F64:
-        """The point (n,) with the nearest latency that is some physics steps."""
+        """Return the point (n,) with the nearest latency that is some physics steps."""
         moved = z.copy()
         if "latency_s" in self.names:
             at = self.names.index("latency_s")
@@ -123,7 +123,7 @@ class Coordinates:
         return moved
 
     def without(self, name: str) -> Coordinates:
-        """The same with one parameter fewer; it stays as in `base`."""
+        """Return the same with one parameter fewer; it stays as in `base`."""
         return Coordinates([other for other in self.names if other != name], self.base, self.task)
 
 
@@ -144,7 +144,7 @@ def fit_scope(
     recordings: Sequence[str],
     robot: Robot | None = None,
 ) -> FitScope:
-    """What of `names` the recordings (all, if none is named) can identify at all.
+    """Return what of `names` the recordings (all, if none is named) can identify at all.
 
     `robot` is the profile's own; None: the twin's stand-in stands for the log's.
 

@@ -81,7 +81,7 @@ class ReplayResiduals:
         return residuals
 
     def _between(self, perturbation: Perturbation) -> list[tuple[Perturbation, float]]:
-        """The replays that make up a perturbation, and their weights."""
+        """Return the replays that make up a perturbation, and their weights."""
         ticks = perturbation.latency_s / self.timestep_s
         low = int(np.floor(ticks + 1e-6))
         above = max(ticks - low, 0.0)
@@ -227,7 +227,7 @@ class FitProblem:
 
 
 def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
-    """The best (best, n) of the base and `points` points of a Sobol sequence."""
+    """Return the best (best, n) of the base and `points` points of a Sobol sequence."""
     from scipy.stats import qmc  # here: it is slow to import
 
     sampler = qmc.Sobol(len(problem.coordinates), scramble=True, rng=seed)

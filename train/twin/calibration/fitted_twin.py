@@ -88,7 +88,7 @@ class FittedTwin:
         }
 
     def toml(self) -> str:
-        """The perturbation as TOML that training reads, with what is known of each value."""
+        """Return the perturbation as TOML that training reads, with what is known of each value."""
         estimates = {item.name: item for item in self.estimates}
         lines = [
             f"# Effective parameters, fitted to {', '.join(self.recordings)}",
@@ -106,7 +106,7 @@ class FittedTwin:
 
 
 def fleet_schedule(fits: Sequence[FittedTwin]) -> Schedule:
-    """A schedule that draws each parameter between its smallest and largest fitted value.
+    """Return a schedule that draws each parameter between its smallest and largest fitted value.
 
     A parameter that not every recording identified stays as in the base.
     """
@@ -267,7 +267,7 @@ def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
 def unidentified(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty
 ) -> ParameterEstimate | None:
-    """The parameter that is known least of those that stay as in the base, if there is one.
+    """Return the parameter that is known least of those that stay as in the base, if there is one.
 
     One stays that is known too little, and whose value in the base explains the log as well.
     """
@@ -326,7 +326,7 @@ def _confounded_with(correlation: F64, index: int) -> int | None:
 def as_in_base(
     name: str, base: Perturbation, reason: str, low: float | None = None, high: float | None = None
 ) -> ParameterEstimate:
-    """A parameter that is not fitted."""
+    """Return a parameter that is not fitted."""
     value, unit = float(getattr(base, name)), PARAMETERS[name].unit
     return ParameterEstimate(name, unit, value, low, high, False, reason)
 

@@ -167,7 +167,7 @@ def one_step(
 
 
 def _sensed(driven: OpenLoopResult, twin: int) -> Signals:
-    """What one twin senses at the end, by the names of the signals."""
+    """Return what one twin senses at the end, by the names of the signals."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]
     return sensed | {"bumped": driven.bumped[twin]}
@@ -215,7 +215,7 @@ class PlanMemory:
     error_m: float  # of what remains, seen on the rebuilt plans from the logged poses, median
 
     def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> dict[str, F64]:
-        """The route's signals at t + 1 from other poses (n,), for `rows` (n,).
+        """Return the route's signals at t + 1 from other poses (n,), for `rows` (n,).
 
         The logged ones, and what the rebuilt plan says of the difference between the two poses:
         where that is small, so is what was not rebuilt exactly.
@@ -241,7 +241,7 @@ class PlanMemory:
 
 
 def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
-    """The plans of all rows; none where the task has no route."""
+    """Return the plans of all rows; none where the task has no route."""
     count = len(steps)
     if steps.task.goal != "route":
         nowhere = np.full(count, -1, np.int64)
@@ -262,7 +262,7 @@ def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
 
 
 def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
-    """The polyline (P, 2) of rows [begin, end) that saw one plan."""
+    """Return the polyline (P, 2) of rows [begin, end) that saw one plan."""
     rows = slice(begin, end)
     x, y = steps.now["pose_x_m"][rows], steps.now["pose_y_m"][rows]
     yaw, remaining = steps.now["pose_yaw_rad"][rows], steps.now["route_remaining_m"][rows]
@@ -486,7 +486,7 @@ def _mean(
 
 
 def _columns(name: str, interval: ConfidenceInterval) -> dict[str, float | None]:
-    """An interval as values of a row; NaN as None."""
+    """Return an interval as values of a row; NaN as None."""
     values = {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return {key: None if np.isnan(value) else value for key, value in values.items()}
 

@@ -99,7 +99,7 @@ def logged_steps(
     recordings: Sequence[str] = (),
     robot: Robot | None = None,
 ) -> LoggedSteps:
-    """The rows of a task of a store, of these recordings (all, if none is named).
+    """Return the rows of a task of a store, of these recordings (all, if none is named).
 
     `robot` is whose they are; None: that of the profile that the store keeps.
 
@@ -153,7 +153,7 @@ def logged_steps(
 
 
 def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
-    """The ids of the store's recordings of a task, or those of them that are wanted.
+    """Return the ids of the store's recordings of a task, or those of them that are wanted.
 
     Raises:
         ConfigError: one that is wanted is not there.
@@ -189,7 +189,7 @@ def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32
 
 
 def sector_clearance(task: Task, observation: F32) -> F64:
-    """The sector clearances (n, sectors) in metres that an observation (n, D) was made of.
+    """Return the sector clearances (n, sectors) in metres that an observation (n, D) was made of.
 
     Those beyond the task's range read as its range: an observation does not tell them apart.
     """
@@ -203,7 +203,7 @@ def sector_clearance(task: Task, observation: F32) -> F64:
 
 
 def previous_action(task: Task, observation: F32) -> Ints:
-    """The action before t (n,), from the observation at t."""
+    """Return the action before t (n,), from the observation at t."""
     first = task.observation_names.index("previous_action_0")
     one_hot = observation[:, first : first + len(task.actions)]
     chosen: Ints = np.argmax(one_hot, axis=1).astype(np.int64)

@@ -87,7 +87,7 @@ class LoggedSegments:
         return np.stack([self.signals[name] for name in POSE], axis=-1)
 
     def take(self, which: NDArray[Any]) -> LoggedSegments:
-        """The segments of an index or mask (S,), `left_out` as it was."""
+        """Return the segments of an index or mask (S,), `left_out` as it was."""
         arrays = {
             name: value[which]
             for name, value in vars(self).items()
@@ -378,13 +378,13 @@ def drive_open_loop(
 
 
 def empty_floor() -> Warehouse:
-    """A floor without racks."""
+    """Return a floor without racks."""
     middle = (EMPTY_M / 2, EMPTY_M / 2)
     return Warehouse(EMPTY_M, EMPTY_M, racks=(), segments=(), goals_m=(middle,), name="empty")
 
 
 def see_sectors(simulation: Simulation) -> F64:
-    """The sector clearances (N, sectors) that robots sense now, without noise."""
+    """Return the sector clearances (N, sectors) that robots sense now, without noise."""
     sensing = Sensing(simulation, simulation.task)  # its noise is zero until an episode is drawn
     ids = np.arange(simulation.num_envs)
     return np.asarray(sensing.sense(ids, np.zeros(len(ids), np.int64))["sector_clearance_m"])

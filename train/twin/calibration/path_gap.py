@@ -144,7 +144,7 @@ def measured_noise(steps: LoggedSteps, twin: Perturbation) -> SensorNoise:
 
 
 def _spread(values: F64) -> float:
-    """A standard deviation that a few outliers do not move."""
+    """Return a standard deviation that a few outliers do not move."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
@@ -246,7 +246,7 @@ def _sense(
     period_s: float,
     rng: np.random.Generator,
 ) -> dict[str, F64]:
-    """The signals that sensors would make of true ones."""
+    """Return the signals that sensors would make of true ones."""
     shape = path.shape[:2]
     wheels = rng.standard_normal((2, *shape)) * noise.encoder_radps
     speed, rate = robot.body_velocity(wheels[0], wheels[1])

@@ -76,7 +76,7 @@ class GapConfig(Checked, frozen=True):
     nthread: Annotated[int, Meta(ge=1)] = 1
 
     def check(self) -> None:
-        """Raises ValueError where trust is judged at a horizon that is not driven."""
+        """Raise ValueError where trust is judged at a horizon that is not driven."""
         if self.limits.horizon_s not in self.horizons_s:
             raise ValueError(
                 f"the horizon of the verdict, {self.limits.horizon_s:g} s, is not driven: add it "
@@ -106,7 +106,7 @@ def trust_verdict(
     position_p90: ConfidenceInterval,
     reward_ratio: ConfidenceInterval,
 ) -> Verdict:
-    """The verdict on one condition."""
+    """Return the verdict on one condition."""
     beyond, open_ = [], []
     for interval, limit, reason in (
         (
@@ -175,7 +175,7 @@ class TwinGap:
 
 
 def check_place(folder: Path) -> None:
-    """Raises RunError where `folder` is something else than a gap measured before."""
+    """Raise RunError where `folder` is something else than a gap measured before."""
     if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
         if folder.is_dir() and not any(folder.iterdir()):
             return

@@ -264,7 +264,7 @@ class Operator(SoftPolicy, Stateful):
         return np.asarray(chosen[:, 0], np.int64)
 
     def _near_pallets(self, env: WarehouseVectorEnv, pose: F64) -> Ints:
-        """The robots (n,) that a lattice of their episode guides here."""
+        """Return the robots (n,) that a lattice of their episode guides here."""
         guided = np.zeros(len(pose), np.bool_)
         for index in range(len(pose)):
             lattice = self._lattice(env, index)
@@ -368,7 +368,7 @@ class Operator(SoftPolicy, Stateful):
             self._ways[index] = self._way(env, int(index), pose[index])
 
     def _way(self, env: WarehouseVectorEnv, index: int, pose: F64) -> F64:
-        """A robot's way (PLAN_POINTS, 2) past the pallets, from a pose (3,)."""
+        """Return a robot's way (PLAN_POINTS, 2) past the pallets, from a pose (3,)."""
         x, y, yaw = pose.tolist()
         goal_x, goal_y = env.navigation.goals_m[index].tolist()
         planner = env.navigation.planner_of(index)
@@ -414,7 +414,7 @@ def _moved(env: WarehouseVectorEnv) -> F64:
 
 
 def _motion(env: WarehouseVectorEnv) -> Motion | None:
-    """What a lattice must know of the robot; None of one that does not turn on the spot."""
+    """Return what a lattice must know of the robot; None of one that does not turn on the spot."""
     table = np.asarray(env.task.actions, np.float64)
     turn = float(np.abs(table[table[:, 0] == 0.0, 1]).max(initial=0.0))
     ahead, back = float(table[:, 0].max()), float(-table[:, 0].min())

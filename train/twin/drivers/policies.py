@@ -52,7 +52,7 @@ class SoftPolicy:
         self.acting_version = np.array([], "U16")
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """The action (N,) it would take without exploration."""
+        """Return the action (N,) it would take without exploration."""
         raise NotImplementedError
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
@@ -99,7 +99,7 @@ class PlannerFollower(SoftPolicy):
         super().__init__(epsilon=epsilon, seed=seed)
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """The action whose velocity is nearest to the plan's."""
+        """Return the action whose velocity is nearest to the plan's."""
         return self._follower(env).choose(env.signals)
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
@@ -146,7 +146,7 @@ class Handover:
         self._anchor = np.zeros((count, 3))
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """The actions of whoever drives each robot, and their probabilities."""
+        """Return the actions of whoever drives each robot, and their probabilities."""
         if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)
         self._watch(env)

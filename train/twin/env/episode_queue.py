@@ -65,7 +65,7 @@ class MissionOrders:
         self.shares = amounts / amounts.sum()
 
     def spec(self, number: int, seed: int) -> EpisodeSpec:
-        """An episode of an order: the same for the same seed.
+        """Return an episode of an order: the same for the same seed.
 
         Raises:
             ConfigError: no way came through its zone.
@@ -138,7 +138,7 @@ class MissionOrders:
 
 
 def _zone_on(floor: Warehouse, zone: str) -> str | None:
-    """A zone's name on a floor; rows of other floors than the default say `FLOOR/ZONE`."""
+    """Return a zone's name on a floor; rows of other floors than the default say `FLOOR/ZONE`."""
     bare = zone.removeprefix(f"{floor.name}/")
     return bare if bare in floor.zones else None
 
@@ -236,7 +236,7 @@ class MissionArms:
         self.arms: list[MissionArm] = arms
 
     def spec(self, number: int, seed: int) -> EpisodeSpec:
-        """A mission of an arm, with its perturbation: the same for the same seed.
+        """Return a mission of an arm, with its perturbation: the same for the same seed.
 
         Raises:
             ConfigError: none of many seeds had the arm's block.
@@ -288,7 +288,7 @@ class MissionArms:
         ]
 
     def _blocks(self, arm: MissionArm) -> list[str]:
-        """The blocks that an arm's floors have room for."""
+        """Return the blocks that an arm's floors have room for."""
         found: set[str] = set()
         blocks = list(MISSIONS[arm.kind].blocks)
         for seed in range(_PROBES):
@@ -316,7 +316,7 @@ def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[Mi
 
 
 def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
-    """An episode with what a schedule draws by its seed; as it is without a schedule."""
+    """Return an episode with what a schedule draws by its seed; as it is without a schedule."""
     if schedule is None:
         return spec
     rng = np.random.default_rng([spec.seed, 1])
@@ -465,6 +465,6 @@ class EpisodeQueue(Stateful):
 
 
 def _drawn(cumulative: F64, draw: np.integer[Any]) -> int:
-    """The place among cumulative shares that 32 random bits fall into."""
+    """Return the place among cumulative shares that 32 random bits fall into."""
     place = int(np.searchsorted(cumulative, draw / 2**32, side="right"))
     return min(place, len(cumulative) - 1)  # their sum may fall short of 1 by rounding

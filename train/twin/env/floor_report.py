@@ -44,7 +44,7 @@ def describe_floor(floor: Warehouse) -> dict[str, Any]:
 
 
 def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
-    """Raises ConfigError for a kind of episode that is none, or that a floor has no room for."""
+    """Raise ConfigError for a kind of episode that is none, or that a floor has no room for."""
     kinds = tuple(kinds)
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise ConfigError(
@@ -64,7 +64,7 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
 
 
 def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
-    """Raises ConfigError where a robot is wider than an aisle, with `AISLE_ROOM_M` to spare."""
+    """Raise ConfigError where a robot is wider than an aisle, with `AISLE_ROOM_M` to spare."""
     for floor in floors:
         narrowest = min(floor.segments, key=lambda segment: segment.width_m, default=None)
         if narrowest is not None and body.width_m + AISLE_ROOM_M > narrowest.width_m:
@@ -78,12 +78,12 @@ def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
 
 
 def names_and_hashes(floors: Iterable[Warehouse]) -> list[list[str]]:
-    """What a saved state holds of the floors that it is of."""
+    """Return what a saved state holds of the floors that it is of."""
     return [[floor.name, floor.hash] for floor in floors]
 
 
 def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehouse]) -> None:
-    """Raises RunError where a saved state, by its `names_and_hashes`, is not of these floors."""
+    """Raise RunError where a saved state, by its `names_and_hashes`, is not of these floors."""
     here = names_and_hashes(floors)
     if saved != here:
         changed = [floor[0] for floor in saved if floor not in here]
@@ -106,7 +106,7 @@ def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
 
 
 def sealed(floors: Iterable[Warehouse]) -> list[str]:
-    """A line a floor that has goals which no robot reaches: its episodes never go there."""
+    """Return a line a floor that has goals which no robot reaches: its episodes never go there."""
     return [
         f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"
         for floor in floors

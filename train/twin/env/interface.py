@@ -127,7 +127,7 @@ def _make_again(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) 
 def refuse_other_type(
     name: str, given: object, kind: type | tuple[type, ...], such_as: str
 ) -> None:
-    """Raises ConfigError for an environment's argument that is neither None nor of its type."""
+    """Raise ConfigError for an environment's argument that is neither None nor of its type."""
     if given is not None and not isinstance(given, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         raise ConfigError(

@@ -121,7 +121,7 @@ class BlockFinder(Stateful):
         heading: F64,
         turned: Bools,
     ) -> tuple[Ints, F64]:
-        """The aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
+        """Return the aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
 
         With its edges (n, 4), x and y exchanged for robots that are `turned`. Only segments that
         run the robot's way count.
@@ -179,7 +179,7 @@ class Navigation(Stateful):
         self.plan_number = np.zeros(num_envs, np.int64)  # rises with every new plan
 
     def planner_of(self, env: int) -> Planner:
-        """The planner of the floor that a robot is on."""
+        """Return the planner of the floor that a robot is on."""
         return self.planners[int(self.floor[env])]
 
     def reset(self, env: int, episode: Episode, floor: int = 0) -> None:
@@ -301,7 +301,7 @@ class PathFollower:
         self._back = np.array([0, self._index(-0.4, 0.6), self._index(-0.4, -0.6)])
 
     def choose(self, signals: Signals) -> Ints:
-        """The action (N,) whose velocity is nearest to what the plan asks for."""
+        """Return the action (N,) whose velocity is nearest to what the plan asks for."""
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
         front, bend = self.front(signals), np.abs(near)
@@ -347,7 +347,7 @@ class PathFollower:
         )
 
     def _index(self, speed_mps: float, yaw_rate_radps: float) -> int:
-        """The action nearest to a velocity of the stand-in's, at this robot's pace."""
+        """Return the action nearest to a velocity of the stand-in's, at this robot's pace."""
         wanted = self._pace * (speed_mps, yaw_rate_radps)
         return int(np.abs(self.table - wanted).sum(axis=1).argmin())
 

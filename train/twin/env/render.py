@@ -149,7 +149,7 @@ class _Canvas:
 
 
 def _dense(plan_m: F64) -> F64:
-    """A polyline with three points more in every segment."""
+    """Return a polyline with three points more in every segment."""
     share = np.arange(4)[None, :, None] / 4
     return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)
 
@@ -274,7 +274,7 @@ class Camera:
         self._renderer: Any = None
 
     def frame(self, env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
-        """What it sees of one environment now, (H, W, 3) uint8."""
+        """Return what it sees of one environment now, (H, W, 3) uint8."""
         self._context.make_current()
         floor = env.floor_of(index)
         if floor is not self._floor:
@@ -478,7 +478,7 @@ def _walls(floor: Warehouse) -> Iterator[Part]:
 
 
 def _route(plan_m: F64) -> Iterator[Part]:
-    """The plan as a band on the floor, piece by piece."""
+    """Yield the plan as a band on the floor, piece by piece."""
     step = np.diff(plan_m, axis=0)
     length = np.hypot(step[:, 0], step[:, 1])
     for start, (dx, dy), long in zip(plan_m[:-1], step, length, strict=True):

@@ -70,7 +70,7 @@ EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
 
 
 def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
-    """The text of every set of names: bit i of its place is names[i]."""
+    """Return the text of every set of names: bit i of its place is names[i]."""
     sets = range(1 << len(names))
     return np.array([truth_text(n for bit, n in enumerate(names) if s >> bit & 1) for s in sets])
 
@@ -154,7 +154,7 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
 
 
 def info_now(env: WarehouseVectorEnv) -> Info:
-    """What runs in each environment, and the signals that are there."""
+    """Return what runs in each environment, and the signals that are there."""
     return {
         "signals": {name: column.copy() for name, column in env.signals.items()},
         "episode_condition": env.episode_condition.copy(),

@@ -75,7 +75,7 @@ class DiscreteActions:
         self.space = gymnasium.spaces.Discrete(len(task.actions))
 
     def read(self, actions: NDArray[Any]) -> Chosen:
-        """What these actions (N,) are. Raises ConfigError for one that is not in the table."""
+        """Read what these actions (N,) are. Raises ConfigError for one that is not in the table."""
         given = _shaped(actions, (self._num_envs,))
         with np.errstate(invalid="ignore"):
             action = given.astype(np.int64)
@@ -132,7 +132,7 @@ def _shaped(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
 def action_space(
     kind: ActionKind, task: Task, num_envs: int
 ) -> DiscreteActions | ContinuousActions:
-    """The action space by name. Raises ConfigError for another name."""
+    """Return the action space by name. Raises ConfigError for another name."""
     if kind == "discrete":
         return DiscreteActions(task, num_envs)
     if kind == "continuous":
@@ -304,7 +304,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.floors[0]
 
     def floor_of(self, env: int) -> Warehouse:
-        """The floor that an environment's episode is on."""
+        """Return the floor that an environment's episode is on."""
         return self.floors[int(self.layout[env])]
 
     # -- episodes -------------------------------------------------------------------------------
@@ -314,7 +314,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         self.queue.set_conditions(conditions)
 
     def mission_arms(self, by: Sequence[str]) -> list[MissionArm]:
-        """The arms that drawn episodes can be chosen by, each with its natural share.
+        """Return the arms that drawn episodes can be chosen by, each with its natural share.
 
         `by` splits them: "block" (of a blocked aisle), "layout", a field of the schedule's ranges.
 
@@ -451,7 +451,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.observation.copy(), earned, terminated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
+        """Return a frame of every environment, (H, W, 3) uint8 each; the top-down map needs no GL.
 
         Raises:
             ConfigError: it is a camera's, and EGL is unavailable.

@@ -38,7 +38,7 @@ class _Corridor:
 
 
 def cells_of(floor: Warehouse, cell_m: float) -> Cells:
-    """The free cells (X, Y) of a floor: those whose middle no rack holds."""
+    """Return the free cells (X, Y) of a floor: those whose middle no rack holds."""
     x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
     y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
     free = np.ones((len(x), len(y)), np.bool_)
@@ -186,7 +186,7 @@ def cover(blocked: Cells, limit: int) -> list[Box] | None:
 
 
 def _grow(total: Ints, i: int, j: int, order: tuple[int, int]) -> Box:
-    """The rectangle of blocked cells around one, grown along the axes in this order."""
+    """Return the rectangle of blocked cells around one, grown along the axes in this order."""
     box = [i, i + 1, j, j + 1]
     for axis in order:
         for side, step in ((2 * axis, -1), (2 * axis + 1, 1)):

@@ -83,7 +83,7 @@ class FloorFile(Checked, frozen=True):
 
 
 def read_floor(path: Path) -> Warehouse:
-    """The floor that a TOML file describes.
+    """Read the floor that a TOML file describes.
 
     Raises:
         ConfigError: no such file, an unknown or missing key, or numbers that do not make a floor.
@@ -125,7 +125,7 @@ def read_floor(path: Path) -> Warehouse:
 
 
 def floor_toml(floor: Warehouse, remarks: Sequence[str] = ()) -> str:
-    """A floor as TOML that reads back equal, with remarks as comments on top."""
+    """Return a floor as TOML that reads back equal, with remarks as comments on top."""
     values = {
         "name": floor.name,
         "width_m": float(floor.width_m),

@@ -70,7 +70,7 @@ RECIPES: dict[str, Recipe] = {
 
 
 def split_of(seed: int) -> Split:
-    """The split that a seed's floor belongs to."""
+    """Return the split that a seed's floor belongs to."""
     tenth = int.from_bytes(blake2b(str(seed).encode(), digest_size=8).digest()) % 10
     for split in SPLITS:
         tenth -= _TENTHS[split]
@@ -80,12 +80,12 @@ def split_of(seed: int) -> Split:
 
 
 def seeds_of(split: Split) -> Iterator[int]:
-    """The seeds of a split, rising, without end."""
+    """Yield the seeds of a split, rising, without end."""
     return (seed for seed in count() if split_of(seed) == split)
 
 
 def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None) -> Warehouse:
-    """The floor of a seed: the same for the same seed and recipe, always.
+    """Return the floor of a seed: the same for the same seed and recipe, always.
 
     Raises:
         ConfigError: a seed out of range, or a recipe whose floors would be too large.
@@ -170,7 +170,7 @@ def transposed(floor: Warehouse) -> Warehouse:
 
 
 def open_floors(text: str) -> tuple[Warehouse, ...]:
-    """The floors of a name, file or comma-separated list; `docs/layouts.md` lists them.
+    """Open the floors of a name, file or comma-separated list; `docs/layouts.md` lists them.
 
     Raises:
         ConfigError: no such floor, or a file that is not a floor; says which and what to write.

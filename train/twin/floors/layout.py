@@ -169,7 +169,7 @@ class Warehouse:
     starts_m: tuple[tuple[float, float], ...] = ()  # where missions begin, where that is known
 
     def __post_init__(self) -> None:
-        """Raises ConfigError where the numbers do not make a floor."""
+        """Raise ConfigError where the numbers do not make a floor."""
         where = f"layout {self.name}"
         for side in (self.width_m, self.depth_m):
             if not MIN_SIDE_M <= side <= MAX_SIDE_M:
@@ -248,7 +248,7 @@ class Warehouse:
         return named | {segment.name: segment.area for segment in self.segments}
 
     def zone_of(self, x_m: F64, y_m: F64) -> list[str]:
-        """The name of the first zone that holds each point (N,), or `elsewhere`."""
+        """Return the name of the first zone that holds each point (N,), or `elsewhere`."""
         names = np.array([*self.zones, ELSEWHERE], object)
         boxes = np.array([area.edges for area in self.zones.values()])
         inside = np.ones((len(x_m), len(names)), np.bool_)
@@ -256,7 +256,7 @@ class Warehouse:
         return [str(name) for name in names[inside.argmax(axis=1)]]
 
     def segment_of(self, x_m: F64, y_m: F64) -> Ints:
-        """The index of the aisle segment each point lies in, (N,); -1 for none."""
+        """Return the index of the aisle segment each point lies in, (N,); -1 for none."""
         if not self.segments:
             return np.full(np.shape(x_m), -1, np.int64)
         inside = _inside(self.segment_edges, x_m, y_m)
@@ -358,7 +358,7 @@ def strip_warehouse(
 
 
 def bays(segments: tuple[AisleSegment, ...]) -> tuple[tuple[float, float], ...]:
-    """The goals along aisle segments, in their middle."""
+    """Return the goals along aisle segments, in their middle."""
     places_m: list[tuple[float, float]] = []
     for segment in segments:
         area = segment.lengthwise

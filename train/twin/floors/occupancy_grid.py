@@ -60,7 +60,7 @@ class Places:
 def find_places(
     free: Bools, reachable: Bools, cell_m: float, visited_m: F64, room_m: float, turn_m: float
 ) -> Places:
-    """The places among those visited (N, 2), in the floor's frame.
+    """Return the places among those visited (N, 2), in the floor's frame.
 
     `free` and `reachable` (X, Y) are the floor's cells, `room_m` is what driving needs around a
     robot's middle, `turn_m` what turning does. Without two places there are none.
@@ -142,7 +142,7 @@ def _ways(floor: Warehouse) -> tuple[F64, F64]:
 
 
 def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
-    """The floor with missions of these lengths, where the usual ones are not among them."""
+    """Return the floor with missions of these lengths, where the usual ones are not among them."""
     if not len(length):
         return floor
     low, high = WAY_M
@@ -254,7 +254,7 @@ def floor_of_grid(
     turn_m: float = GOAL_ROOM_M,
     visited_m: F64 | None = None,
 ) -> GridFloor:
-    """The floor of a grid: the part that a robot was in, or the largest that it fits in.
+    """Return the floor of a grid: the part that a robot was in, or the largest that it fits in.
 
     Args:
         name: of the floor.
@@ -397,7 +397,7 @@ def _metres(grid: OccupancyGrid) -> str:
 def _cells_in(
     grid: OccupancyGrid, visited_m: F64 | None, cell_m: float | None = None
 ) -> NDArray[np.int64] | None:
-    """The cells (N, 2) of this size in which the robot was, which may be off the grid."""
+    """Return the cells (N, 2) of this size in which the robot was, which may be off the grid."""
     if visited_m is None:
         return None
     return np.floor(grid.within(visited_m) / (cell_m or grid.cell_m)).astype(np.int64)

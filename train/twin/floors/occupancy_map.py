@@ -69,7 +69,7 @@ class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
 
 
 def read_map(path: Path) -> Warehouse:
-    """The floor of an occupancy map.
+    """Read the floor of an occupancy map.
 
     Raises:
         ConfigError: as `read_grid`, or a map without room for the robot.
@@ -78,7 +78,7 @@ def read_map(path: Path) -> Warehouse:
 
 
 def read_grid(path: Path) -> OccupancyGrid:
-    """The occupancy grid of a `map.yaml`.
+    """Read the occupancy grid of a `map.yaml`.
 
     Raises:
         ConfigError: files that cannot be read, a key that is missing or out of range, an image

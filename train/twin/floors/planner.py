@@ -63,7 +63,7 @@ class Planner:
         goal: tuple[float, float],
         closures: Sequence[Closure] = (),
     ) -> F64:
-        """The plan from a place to a goal, (PLAN_POINTS, 2), first point near the place.
+        """Return the plan from a place to a goal, (PLAN_POINTS, 2), first point near the place.
 
         Where closures leave no way, those that shut the robot off are opened again: a robot
         that believed everything shut would stand for ever. A free place without a way by the
@@ -152,7 +152,7 @@ class Planner:
         return i * self.shape[1] + j
 
     def _nearest(self, cell: int, distance: F64) -> int:
-        """The reachable cell nearest to one that is not, such as one too near to a rack."""
+        """Return the reachable cell nearest to one that is not, such as one too near to a rack."""
         i, j = divmod(cell, self.shape[1])
         low_i, low_j = max(i - 8, 0), max(j - 8, 0)
         window = distance.reshape(self.shape)[low_i : i + 9, low_j : j + 9]
@@ -246,7 +246,7 @@ def _allowed(
 
 
 def planners(floors: Sequence[Warehouse]) -> list[Planner]:
-    """A planner a floor; together their caches stay within some 500 MB."""
+    """Return a planner a floor; together their caches stay within some 500 MB."""
     cells = max(round(f.width_m / CELL_M) * round(f.depth_m / CELL_M) for f in floors)
     kept = _TREES_KEPT_BYTES // (12 * max(cells, 1) * len(floors))
     return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
@@ -283,12 +283,12 @@ def box_distance(
 
 
 def smooth_plan(way: NDArray[Any]) -> F64:
-    """A plan (PLAN_POINTS, 2) along the cells' middles (C, 2) of a way."""
+    """Return a plan (PLAN_POINTS, 2) along the cells' middles (C, 2) of a way."""
     return _resample(_smooth(way))
 
 
 def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
-    """A moving average over the cells of a way, which takes off the grid's corners."""
+    """Return a moving average over the cells of a way, which takes off the grid's corners."""
     if len(way) < 3:
         return way
     padded = np.concatenate(

@@ -127,7 +127,7 @@ class StateLattice:
         return total
 
     def plan(self, x_m: float, y_m: float, yaw_rad: float) -> F64 | None:
-        """The plan (PLAN_POINTS, 2) from a pose; None where no way leads to the goal."""
+        """Return the plan (PLAN_POINTS, 2) from a pose; None where no way leads to the goal."""
         node = self._nearest(x_m, y_m, yaw_rad)
         if node < 0:
             return None
@@ -140,7 +140,7 @@ class StateLattice:
         return smooth_plan(places[np.append(moved, True)])
 
     def _nearest(self, x_m: float, y_m: float, yaw_rad: float) -> int:
-        """The node nearest to a pose from which there is a way, within .6 m; -1: none."""
+        """Return the node nearest to a pose from which there is a way, within .6 m; -1: none."""
         inside = self.window.covers(x_m, y_m)
         pose = np.array([x_m, y_m, yaw_rad])
         x, y, turned = (float(value) for value in self._place(pose))
@@ -186,7 +186,7 @@ def lattice_around(
     motion: Motion,
     window: Window,
 ) -> StateLattice:
-    """A lattice over a window of a floor with boxes (K, 2) of half sizes (K, 2) on it.
+    """Return a lattice over a window of a floor with boxes (K, 2) of half sizes (K, 2) on it.
 
     `graph` joins the floor's cells past the boxes, in metres, against the robot's way
     (`Planner.graph_around`): outside the window it goes on with that.

@@ -56,12 +56,12 @@ class Mission:
 
 
 def length_m(plan: F64) -> float:
-    """The length of a polyline (P, 2)."""
+    """Return the length of a polyline (P, 2)."""
     return float(np.hypot(*np.diff(plan, axis=0).T).sum())
 
 
 def point_along(plan: F64, at_m: float) -> F64:
-    """The point `at_m` along an evenly spaced polyline (P, 2), clipped to its ends."""
+    """Return the point `at_m` along an evenly spaced polyline (P, 2), clipped to its ends."""
     total = length_m(plan)
     place = np.clip(at_m / max(total, 1e-9), 0.0, 1.0) * (len(plan) - 1)
     first = min(int(place), len(plan) - 2)

@@ -66,7 +66,7 @@ class Episode:
 
 
 def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> Episode:
-    """The episode that `spec` determines: the same spec always gives the same episode."""
+    """Draw the episode that `spec` determines: the same spec always gives the same episode."""
     entropy = [spec.seed, zlib.crc32(spec.condition.encode())]
     layout, noise = np.random.SeedSequence(entropy).spawn(2)
     rng = np.random.Generator(np.random.PCG64(layout))

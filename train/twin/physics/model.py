@@ -66,7 +66,7 @@ class Handles:
 def build_model(
     warehouse: Warehouse, robot: RobotModel, timestep_s: float = 0.01, rack_slots: int | None = None
 ) -> tuple[mujoco.MjModel, Handles]:
-    """The compiled model. State: free joint of the chassis, left and right wheel hinge(s).
+    """Build the compiled model. State: free joint of the chassis, left and right wheel hinge(s).
 
     With `rack_slots` there are boxes for so many racks: those that the floor has none for lie
     `PARKED_RACK_M` away, to be placed by `building_boxes`.
@@ -82,7 +82,7 @@ def build_model(
 
 
 def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjModel:
-    """The robot on a floor without an end."""
+    """Build the robot on a floor without an end."""
     spec = _spec(timestep_s)
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=FLOOR, **FLOOR_MASK
@@ -206,7 +206,7 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
 
 
 def passed_over(lidar_z_m: float) -> list[str]:
-    """What a lidar at this height never sees, with its own height."""
+    """Return what a lidar at this height never sees, with its own height."""
     heights = {
         "pallets": PALLET_HALF_M[2],
         "forklifts": FORKLIFT_HALF_M[2],

@@ -57,7 +57,7 @@ class Perturbation(Checked, frozen=True):
     timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one per vector environment
 
     def changed(self) -> dict[str, float]:
-        """The fields that are not the nominal twin's: what every transition keeps."""
+        """Return the fields that are not the nominal twin's: what every transition keeps."""
         values = {field: getattr(self, field) for field in RANGES}
         return {field: value for field, value in values.items() if value != NOMINAL[field]}
 
@@ -110,7 +110,7 @@ def load_perturbation(path: Path | str) -> Perturbation:
 
 
 def is_schedule(where: str) -> ConfigError:
-    """The refusal of a schedule where one set of parameters is needed."""
+    """Return the refusal of a schedule where one set of parameters is needed."""
     return ConfigError(
         "is a schedule, whose parameters differ from episode to episode: here they must be fixed",
         where=where,
@@ -129,7 +129,7 @@ def load_schedule(path: Path) -> Schedule:
 
 
 def find_perturbation(given: str | Mapping[str, Any], *, where: str) -> Perturbation | Schedule:
-    """A ready-made perturbation by its name, what a TOML file holds, or what a table says.
+    """Return a ready-made perturbation by its name, what a TOML file holds, or what a table says.
 
     Raises:
         ConfigError: there is no such perturbation or file, or a value is not valid.

@@ -160,7 +160,7 @@ class RobotModel:
 
 
 def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
-    """The twin's own robot, in this outline."""
+    """Return the twin's own robot, in this outline."""
     bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
     return RobotModel(
         length_m=body.length_m,
@@ -193,7 +193,7 @@ def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
 
 
 def design(robot: Robot, body: Body) -> RobotModel:
-    """A profile's robot, before it was tried.
+    """Return a profile's robot, before it was tried.
 
     Raises:
         ConfigError: parts that do not go together.

@@ -116,7 +116,7 @@ def attach_own(spec: Any, robot: RobotModel) -> Any:
 
 
 def wheel_joints(model: mujoco.MjModel, drive: Drive, prefix: str = PREFIX) -> list[int]:
-    """The joints of the wheels, left before right and front before rear, as everywhere."""
+    """Return the joints of the wheels, left before right and front before rear, as everywhere."""
     rolling = [
         int(model.actuator_trnid[model.actuator(prefix + name).id, 0])
         for name in ROLES[drive]
@@ -128,7 +128,7 @@ def wheel_joints(model: mujoco.MjModel, drive: Drive, prefix: str = PREFIX) -> l
 
 
 def steering_joints(model: mujoco.MjModel, prefix: str = PREFIX) -> list[int]:
-    """The joints that the front wheels steer about, left and right."""
+    """Return the joints that the front wheels steer about, left and right."""
     return [
         int(model.actuator_trnid[model.actuator(f"{prefix}steer_{side}").id, 0])
         for side in ("left", "right")
@@ -141,7 +141,7 @@ def actuators(model: mujoco.MjModel, robot: RobotModel) -> list[int]:
 
 
 def wheel_geom(model: mujoco.MjModel, body: int) -> int | None:
-    """The one geom of a wheel that touches; None: there is not one."""
+    """Return the one geom of a wheel that touches; None: there is not one."""
     geoms = [
         int(geom)
         for geom in np.flatnonzero(model.geom_bodyid == body)
@@ -153,7 +153,7 @@ def wheel_geom(model: mujoco.MjModel, body: int) -> int | None:
 def _problems(
     model: mujoco.MjModel, robot: Robot, body: Body, built: RobotModel
 ) -> tuple[list[str], list[int]]:
-    """What is wrong, by name, and the wheels' bodies."""
+    """Return what is wrong, by name, and the wheels' bodies."""
     free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
     bases = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
     if len(bases) != 1 or len(free) != 1 or model.jnt_bodyid[free[0]] != bases[0]:
@@ -229,7 +229,7 @@ def _place_problems(model: mujoco.MjModel, wheels: list[int], steers: bool) -> l
 
 
 def _rolling_of(model: mujoco.MjModel, steering: int) -> int:
-    """The hinge that comes after a steering one on the same body; -1: none."""
+    """Return the hinge that comes after a steering one on the same body; -1: none."""
     after = steering + 1
     same = after < model.njnt and model.jnt_bodyid[after] == model.jnt_bodyid[steering]
     return after if same else -1
@@ -418,7 +418,7 @@ class Wheels(NamedTuple):
 
 
 def wheels_of(model: mujoco.MjModel, robot: RobotModel) -> Wheels:
-    """The wheels of a compiled model."""
+    """Return the wheels of a compiled model."""
     if robot.mjcf is not None:
         return _own_wheels(model, robot)
     names = [f"{name}_wheel" for name in _wheel_names(robot)]

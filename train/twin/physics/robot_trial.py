@@ -32,7 +32,7 @@ TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
 
 
 def robot_model(robot: Robot | None, body: Body) -> RobotModel:
-    """The model of a profile's `[robot]`; the stand-in where it has none.
+    """Return the model of a profile's `[robot]`; the stand-in where it has none.
 
     Raises:
         ConfigError: a drive that the twin does not have, parts that do not go together, or a robot
@@ -77,14 +77,14 @@ def _tried(key: _Key) -> RobotModel:
 
 
 def _rolling_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
-    """The radius that its wheels roll on, by how fast it drives at a commanded speed."""
+    """Return the radius that its wheels roll on, by how fast it drives at a commanded speed."""
     if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
         raise _unfit(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
     return robot.wheel_radius_m * ahead_mps / speed_mps
 
 
 def _settled(robot: RobotModel) -> RobotModel:
-    """The robot with the height at which it comes to rest."""
+    """Return the robot with the height at which it comes to rest."""
     model = build_robot_alone(replace(robot, rest_z_m=robot.contact_radius_m), TIMESTEP_S)
     data = mujoco.MjData(model)
     _run(model, data, SETTLE_S)
@@ -114,7 +114,7 @@ def driven_actions(
 
 
 def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
-    """The values of a robot in the twin: name, value, and where it is from."""
+    """Return the values of a robot in the twin: name, value, and where it is from."""
     own = robot is not None and robot.mjcf is not None
     lidar = Lidar() if robot is None else robot.lidar
     of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
@@ -167,7 +167,7 @@ def outlined(body: Body) -> list[tuple[str, Any, str]]:
 
 
 def outside(model: RobotModel, body: Body) -> list[str]:
-    """The parts of a robot that are not within its outline, and by how much."""
+    """Return the parts of a robot that are not within its outline, and by how much."""
     places = {"the lidar": (body.lidar_x_m, 0.0)}
     for number, (x, y) in enumerate(model.casters_m):
         places[f"caster {number + 1}"] = (x + model.axle_x_m, y)
@@ -186,7 +186,7 @@ def _known(limit: float) -> float | None:
 def _driven(
     robot: RobotModel, speed_mps: float, yaw_rate_radps: float, friction: float = FLOOR_FRICTION
 ) -> tuple[float, float]:
-    """The steady speed (m/s) and yaw rate (rad/s) under a command."""
+    """Return the steady speed (m/s) and yaw rate (rad/s) under a command."""
     model = build_robot_alone(robot, TIMESTEP_S)
     for geom in wheels_of(model, robot).geoms:
         model.geom_friction[geom, 0] = friction

@@ -77,7 +77,7 @@ class BaseController(Stateful):
         self.commands[:, 0] = _limit(np.asarray(command, np.float64), self._speed_limit)
 
     def controls(self, since_s: float) -> F64:
-        """What the actuators are told over a block that begins `since_s` into a period.
+        """Return what the actuators are told over a block that begins `since_s` into a period.
 
         (N, substeps, actuators), in the model's order: wheel speeds in rad/s. The controller ramps
         toward the command in force.
@@ -167,7 +167,7 @@ class SteeringController(BaseController):
 def base_controller(
     num_envs: int, robot: RobotModel, period_s: float, timestep_s: float, substeps: int
 ) -> BaseController:
-    """The controllers that robots of this model have."""
+    """Return the controllers that robots of this model have."""
     kind = SteeringController if robot.steers else BaseController
     return kind(num_envs, robot, period_s, timestep_s, substeps)
 
@@ -437,7 +437,7 @@ class Simulation(Stateful):
         return touched
 
     def body_state(self, accel: F64, pressed: Bools) -> BodyState:
-        """The true state now."""
+        """Return the true state now."""
         pose = self.pose()
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         vx, vy = self.qvel[:, 0], self.qvel[:, 1]

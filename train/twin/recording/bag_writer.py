@@ -107,7 +107,7 @@ def recording_sink(
 
 
 def refuse_existing(path: Path) -> None:
-    """Raises RecordingError where something stands at `path` already."""
+    """Raise RecordingError where something stands at `path` already."""
     if path.exists() or path.is_symlink():
         raise RecordingError(
             "it already exists, and recordings are never overwritten",
@@ -229,7 +229,7 @@ def _qos(topic: Topic) -> Qos:
 
 
 def _qos_yaml(topic: Topic) -> str:
-    """The profile as rosbag2's MCAP storage writes it into a channel's metadata."""
+    """Return the profile as rosbag2's MCAP storage writes it into a channel's metadata."""
     qos = _qos(topic)
     lines = [
         f"- history: {qos.history.name.lower()}",

@@ -97,7 +97,7 @@ class Odometer:
     wheel_angle_rad: F64 = field(default_factory=lambda: np.zeros(2))
 
     def dead_reckoning(self, motion: Motion) -> F64:
-        """The pose at every time of the motion, (M, 3)."""
+        """Return the pose at every time of the motion, (M, 3)."""
         ticks = np.floor((self.wheel_angle_rad + motion.wheel_angle_rad) / ENCODER_LSB_RAD)
         rolled = np.diff(ticks, axis=0) * (ENCODER_LSB_RAD * self.wheel_radius_m)  # (M - 1, 2)
         turn = (rolled[:, 1] - rolled[:, 0]) / self.track_m
@@ -121,7 +121,7 @@ class Odometer:
         return speed, turn
 
     def wheel_angles(self, motion: Motion, time_s: F64) -> F64:
-        """What the encoders read at these times, (n, 2)."""
+        """Return what the encoders read at these times, (n, 2)."""
         angle = self.wheel_angle_rad + motion.at(motion.wheel_angle_rad, time_s)
         return np.floor(angle / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
 

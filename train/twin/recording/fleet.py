@@ -314,7 +314,7 @@ class Fleet:
             log.plan_number = number
 
     def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
-        """A scan between ticks: the same noise and dropout, drawn for itself."""
+        """Return a scan between ticks: the same noise and dropout, drawn for itself."""
         hardware = log.hardware
         ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
         lost = log.rng.random(len(ranges)) < hardware.lidar_dropout

@@ -30,12 +30,12 @@ _TIME = "builtin_interfaces/msg/Time"
 
 @functools.cache
 def typestore() -> Typestore:
-    """The message definitions of every recording Restock writes: ROS 2 Jazzy's."""
+    """Return the message definitions of every recording Restock writes: ROS 2 Jazzy's."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def build(type_name: str, /, **fields: Any) -> Any:
-    """A message of `type_name` with every field zero, empty or identity, but for `fields`.
+    """Build a message of `type_name` with every field zero, empty or identity, but for `fields`.
 
     A dict for a field that is itself a message fills that message in the same way.
     """
@@ -76,7 +76,7 @@ class MessageLayout:
 
     @classmethod
     def of(cls, exemplar: Any) -> MessageLayout:
-        """The layout of every message with the exemplar's strings and sequence lengths."""
+        """Return the layout of every message with the exemplar's strings and sequence lengths."""
         places: dict[str, Place] = {}
         data = serialise(exemplar)
         end = _walk(exemplar, "", ENCAPSULATION_BYTES, places)
@@ -109,7 +109,7 @@ class MessageLayout:
         return [whole[start : start + size] for start in range(0, len(whole), size)]
 
     def _slots(self, path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
-        """The offset of every number that a path names, and their type."""
+        """Return the offset of every number that a path names, and their type."""
         if "[]" not in path:
             place = self.places[path]
             step = place.dtype.itemsize
@@ -198,7 +198,7 @@ def _align(at: int, size: int) -> int:
 
 
 def _value(kind: Any, details: Any, given: Any) -> Any:
-    """A field's value: what was given, in the type rosbags wants, or the field's nothing."""
+    """Return a field's value: what was given, in the type rosbags wants, or the field's nothing."""
     if kind.name == "NAME":
         if given is None or isinstance(given, Mapping):
             defaults = {"w": 1.0} if details.endswith("/Quaternion") else {}

@@ -51,7 +51,7 @@ def schedule(
     *,
     version: str = "1",
 ) -> Iterator[Mission]:
-    """The missions of a recording, without end; the same for the same arguments.
+    """Yield the missions of a recording, without end; the same for the same arguments.
 
     `driver` is `handover` (the fleet) or the name of whoever drives all of them.
     """

@@ -142,7 +142,7 @@ class Robot:
         ]
 
     def _announcements(self, drive: Drive) -> list[Message]:
-        """The goal, the plans (on change and about once a second), and who drives."""
+        """Return the goal, the plans (on change and about once a second), and who drives."""
         sent = self._send("/goal_pose", np.zeros(1), [topics.goal(self._stamp(0.0), *drive.goal_m)])
         end_s = float(drive.tick_s[-1])
         starts = [float(drive.tick_s[tick]) for tick, _ in drive.plans]
@@ -348,7 +348,7 @@ def _rounded(values: F64, lsb: float) -> F64:
 
 
 def _f32(values: F64) -> F64:
-    """The values as the robot's controllers compute them, in single precision."""
+    """Return the values as the robot's controllers compute them, in single precision."""
     return values.astype(np.float32).astype(np.float64)
 
 
@@ -358,7 +358,7 @@ def _pose(rows: F64) -> tuple[F64, F64, F64]:
 
 
 def _between(inner: F64, outer: F64) -> F64:
-    """The frame (n, 3) in which poses `inner` (n, 3) are poses `outer` (n, 3)."""
+    """Return the frame (n, 3) in which poses `inner` (n, 3) are poses `outer` (n, 3)."""
     yaw = outer[:, 2] - inner[:, 2]
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack(

@@ -106,7 +106,7 @@ class RecordingPlan:
     tags: Mapping[str, str] = field(default_factory=dict)  # whose drive it is: robot, site, …
 
     def __post_init__(self) -> None:
-        """Raises ConfigError where the recording would have no end, or nothing in it."""
+        """Raise ConfigError where the recording would have no end, or nothing in it."""
         if self.format not in get_args(Format):
             has = ", ".join(get_args(Format))
             raise ConfigError(f"no format {self.format!r}", where="recording", remedy=f"give {has}")
@@ -146,7 +146,7 @@ class RecordingPlan:
         return dict(amounts)
 
     def orders(self) -> list[MissionOrder]:
-        """The file's missions that are for this robot, or for any.
+        """Return the file's missions that are for this robot, or for any.
 
         Raises:
             ConfigError: they are for other robots, or for some and no tag says which this is.
@@ -319,7 +319,7 @@ def record(
 def ordered(
     plan: RecordingPlan, floors: Sequence[Warehouse], planners: Sequence[Planner]
 ) -> MissionOrders:
-    """The missions of a plan's file, on these floors.
+    """Return the missions of a plan's file, on these floors.
 
     Raises:
         ConfigError: one that the twin, or one of the floors, cannot hold.
@@ -357,7 +357,7 @@ def parse_start(text: str) -> int:
 
 
 def date_text(moment_ns: int) -> str:
-    """A moment as ISO has it, UTC."""
+    """Return a moment as ISO has it, UTC."""
     moment = datetime.fromtimestamp(moment_ns // 10**9, UTC)
     return moment.isoformat().replace("+00:00", "Z")
 

@@ -214,7 +214,7 @@ def bumpers(pressed: Bools) -> list[bytes]:
 
 @functools.lru_cache(maxsize=256)
 def text(content: str) -> bytes:
-    """A string."""
+    """Return a string."""
     return serialise(build("std_msgs/msg/String", data=content))
 
 
@@ -225,7 +225,7 @@ def behaviour_policy(name: str, version: str, probability: float) -> bytes:
 
 
 def goal(stamp_ns: int, x_m: float, y_m: float) -> bytes:
-    """A navigation goal in `map`."""
+    """Return a navigation goal in `map`."""
     return serialise(
         build(
             "geometry_msgs/msg/PoseStamped",
@@ -236,7 +236,7 @@ def goal(stamp_ns: int, x_m: float, y_m: float) -> bytes:
 
 
 def plan(stamp_ns: int, points_m: F64) -> bytes:
-    """A plan in `map`: (P, 2) points, each facing the next."""
+    """Return a plan in `map`: (P, 2) points, each facing the next."""
     step = np.diff(points_m, axis=0, append=points_m[-1:])
     if len(step) > 1:
         step[-1] = step[-2]
@@ -263,7 +263,7 @@ def occupancy_map(
     resolution_m: float,
     origin_m: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:
-    """The known map: cells (rows north, columns east from `origin_m`), occupied or free."""
+    """Return the known map: cells (rows north, columns east from `origin_m`), occupied or free."""
     return serialise(
         build(
             "nav_msgs/msg/OccupancyGrid",
@@ -413,7 +413,7 @@ def _marker(
     frame: str = "map",
     frame_locked: bool = False,
 ) -> dict[str, Any]:
-    """A marker that stands on the floor."""
+    """Return a marker that stands on the floor."""
     x, y, yaw = place
     return {
         "header": {"frame_id": frame, "stamp": stamp(stamp_ns)},

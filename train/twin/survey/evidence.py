@@ -63,7 +63,7 @@ _FRAME = "header.frame_id"
 
 
 def map_topic(recording: Recording) -> TopicInfo | None:
-    """The topic of the recording's map: `/map` before any other."""
+    """Return the topic of the recording's map: `/map` before any other."""
     found = [
         topic
         for topic in recording.topics.values()
@@ -74,7 +74,7 @@ def map_topic(recording: Recording) -> TopicInfo | None:
 
 
 def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
-    """The last map of the recording and where it is from, in words; None where it has none.
+    """Return the last map of the recording and where it is from, in words; None where it has none.
 
     Raises:
         RecordingError: the message is not a map: its size, resolution or origin are not.
@@ -140,7 +140,7 @@ class StoredDrive:
 
 
 def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
-    """The recording with the most rows, of those that are still there if any is.
+    """Return the recording with the most rows, of those that are still there if any is.
 
     Args:
         recording: which one instead: its id, or its file's name or the end of its path.
@@ -176,7 +176,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
 
 
 def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
-    """The one row of the recordings that this names.
+    """Return the one row of the recordings that this names.
 
     Raises:
         StoreError: none, or several.

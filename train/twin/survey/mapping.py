@@ -38,7 +38,7 @@ _SUB = 3  # points a cell and axis that a turned cell is looked up at
 
 
 def main_direction(angles_rad: F64, weights: F64) -> float:
-    """The main direction in (-pi/4, pi/4], 0 where they do not agree on one."""
+    """Return the main direction in (-pi/4, pi/4], 0 where they do not agree on one."""
     total = float(weights.sum())
     if total <= 0:
         return 0.0
@@ -47,14 +47,14 @@ def main_direction(angles_rad: F64, weights: F64) -> float:
 
 
 def walls_direction(grid: OccupancyGrid) -> float:
-    """The direction of a grid's walls against its axes."""
+    """Return the direction of a grid's walls against its axes."""
     walls = ndimage.gaussian_filter((grid.occupancy == OCCUPIED).astype(np.float32), 1.5)
     across_x, across_y = np.gradient(walls)
     return main_direction(np.arctan2(across_y, across_x), np.hypot(across_x, across_y))
 
 
 def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
-    """The grid with its axes along its walls, and by how much it was turned (rad).
+    """Return the grid with its axes along its walls, and by how much it was turned (rad).
 
     A turned cell is occupied where any part of it was, so that no wall gets a hole.
     """
@@ -99,7 +99,7 @@ MARGIN_M = 0.25  # around the circle in which the robot turns
 
 
 def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
-    """The corridor, along the directions that were mostly driven.
+    """Return the corridor, along the directions that were mostly driven.
 
     `turn_m` is what the robot needs around its middle to turn.
     """
@@ -159,7 +159,7 @@ def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
 
 
 def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
-    """The share of a lidar's returns that lie within NEAR_M of an occupied cell of a map.
+    """Return the share of a lidar's returns that lie within NEAR_M of an occupied cell of a map.
 
     Returns farther than `WITHIN_M` from the lidar do not count: an error of the pose's yaw moves
     them. None where there are too few to say.
@@ -177,7 +177,7 @@ def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
 
 
 def _wall_middles(grid: OccupancyGrid) -> F64:
-    """The middles (N, 2) of the occupied cells, in the map's frame."""
+    """Return the middles (N, 2) of the occupied cells, in the map's frame."""
     cells = np.argwhere(grid.occupancy == OCCUPIED)
     return out_of_frame(np.asarray((cells + 0.5) * grid.cell_m, np.float64), grid.origin)
 

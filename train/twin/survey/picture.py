@@ -33,7 +33,7 @@ INK: Color = (40, 44, 50, 255)
 
 
 def draw_survey(surveyed: Surveyed) -> Image.Image:
-    """The picture, north up along the floor's own axes."""
+    """Draw the picture, north up along the floor's own axes."""
     return _Picture(surveyed).image()
 
 
@@ -88,7 +88,7 @@ class _Picture:
         return self.margin + x_m * self.scale, self.top + self.height - y_m * self.scale
 
     def _occupancy(self) -> Image.Image:
-        """The grid as the floor was made of it, on the floor's extent."""
+        """Return the grid as the floor was made of it, on the floor's extent."""
         grid: OccupancyGrid = self.surveyed.grid
         colors = np.full((*grid.occupancy.shape, 3), UNKNOWN_GREY, np.uint8)
         colors[grid.occupancy == FREE] = FREE_WHITE

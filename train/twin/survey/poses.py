@@ -52,7 +52,7 @@ class Times:
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Times:
-        """The clocks of a topic's messages."""
+        """Return the clocks of a topic's messages."""
         stamp = columns.fields.get(STAMP)
         none = np.zeros(len(columns), np.int64)
         stamps = np.asarray(stamp).astype(np.int64) if isinstance(stamp, np.ndarray) else none
@@ -131,7 +131,7 @@ def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bool
 
 
 def candidate_poses(recording: Recording, profile: Profile | None = None) -> list[Poses]:
-    """What may say where the recording's robot was, best first; nothing where nothing does.
+    """Return what may say where the recording's robot was, best first; nothing where nothing does.
 
     Only what the profile says, where there is one. Else transforms that lead to a map, pose topics,
     localised ones first, and other transforms.

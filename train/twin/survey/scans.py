@@ -123,7 +123,7 @@ def _placed(
 
 
 def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Kind] | None:
-    """The topic of the lidar's scans, and their fields."""
+    """Return the topic of the lidar's scans, and their fields."""
     if profile is not None:
         scan = profile.inputs.scan
         named = None if scan is None else recording.topics.get(scan.topic)

@@ -108,7 +108,7 @@ def survey(
     footprint: Footprint | None = None,
     typestore: str | None = None,
 ) -> Surveyed:
-    """The floor that a recording shows, or one of a store.
+    """Return the floor that a recording shows, or one of a store.
 
     Args:
         path: of the recording or store.
@@ -169,7 +169,7 @@ def survey(
 def _grid(
     evidence: Evidence, by: Source | None, body: Footprint | None, where: str, notes: list[str]
 ) -> tuple[Source, OccupancyGrid, str]:
-    """What the floor is made from: how, the grid, and where that is from in words."""
+    """Return what the floor is made from: how, the grid, and where that is from in words."""
     poses = evidence.poses
     if by in (None, "map") and evidence.known is not None:
         grid, source = evidence.known
@@ -226,7 +226,7 @@ class _Scanned:
 
 
 def _scanned(usable: list[PlacedScans], poses: Poses, room_m: float) -> _Scanned:
-    """The map of the scans by header stamps; by log time where they agree better so."""
+    """Return the map of the scans by header stamps; by log time where they agree better so."""
     best: _Scanned | None = None
     for scans in usable:
         said = list(scans.notes)
@@ -249,7 +249,7 @@ def _turn_m(body: Footprint) -> float:
 
 
 def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
-    """A robot whose size nothing says is no larger than the gaps that it went through."""
+    """Return a robot whose size nothing says is no larger than the gaps that it went through."""
     if poses is None:
         return STAND_IN
     cells, inside = grid.cells_at(poses.places_m)
