@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from restock.replay.fleet.drift import measure_drift as measure_drift
     from restock.replay.fleet.gaps import find_gaps as find_gaps
     from restock.replay.fleet.store_difference import diff_stores as diff_stores
-    from restock.replay.mixture.mixture import Mixture as Mixture
     from restock.replay.mixture.mixture import load_mixture as load_mixture
     from restock.replay.panel.build import build_panel as build_panel
     from restock.replay.panel.iterable import PanelDataset as PanelDataset
