@@ -31,7 +31,7 @@ LATE = Perturbation(name="late", latency_s=0.15, wheel_radius_scale=0.96, gyro_b
 
 
 def slower(profile: Profile) -> Profile:
-    """Steps .3 s apart, at a steady rate instead of one a command."""
+    """Return the profile with steps .3 s apart, at a steady rate instead of one per command."""
     task = msgspec.structs.replace(profile.task, control_period_s=0.3)
     clock = msgspec.structs.replace(profile.clock, steps="rate")
     return msgspec.structs.replace(profile, task=task, clock=clock)

@@ -178,8 +178,10 @@ def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends
 
 
 def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
-    """At .28 m/s it makes less than .1 m in the steps after which the operator takes it for stuck:
-    backing off was what it taught in most states, and agents learned to."""
+    """Drive at .28 m/s, less than .1 m in the steps after which a robot counts as stuck.
+
+    The operator used to back off in most states, and agents learned that from it.
+    """
     task = load_profile("warehouse_amr").task
     slow = tuple((0.28 * v, w) for v, w in task.actions)
     task = msgspec.structs.replace(task, actions=slow)

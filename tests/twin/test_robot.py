@@ -104,8 +104,10 @@ def test_it_drives_what_it_is_commanded(name: str) -> None:
 
 
 def test_a_skid_steer_robot_slides_where_one_axle_rolls() -> None:
-    """Its wheels scrub in every turn, so by their contact points they turn it too far; and a
-    turn while driving on slippery floor, which one axle follows, goes wide."""
+    """Compare skid steer with one axle: its scrubbing wheels turn it further.
+
+    On slippery floor, a turn while driving goes wide, which one axle follows.
+    """
     sim, _ = driven(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)
     one_axle = msgspec.structs.replace(HUSKY, drive="differential", wheelbase_m=None)

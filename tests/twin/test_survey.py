@@ -95,7 +95,7 @@ def write_bag(
     scan_frame: str = "laser",
     clockwise: bool = False,
 ) -> Path:
-    """A rosbag2 folder with /amcl_pose every .2 s, and /map; `data` in place of the grid's own.
+    """Write a rosbag2 folder with /amcl_pose every .2 s, and /map with the grid or `data`.
 
     `scanned` are cells (X, Y) that a lidar of 120 beams sees from each pose, by ray marching; its
     stamps may be late, and its angles those of one that hangs upside down.

@@ -241,7 +241,7 @@ def search(problem: FitProblem, points: int, best: int, seed: int) -> F64:
 
 
 def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float, bool]:
-    """The least-squares solution (n,) from a start (n,), its cost, and whether it converged."""
+    """Solve least squares from a start (n,); return the solution, its cost, and if it converged."""
     size = len(problem.coordinates)
     steps: list[minimize.IterLog] = []
 

@@ -283,7 +283,7 @@ def unidentified(
 def _kept_as_in_base(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty, index: int
 ) -> ParameterEstimate | None:
-    """A parameter that is known little, with the reason why it stays; None where it does not."""
+    """Return a poorly identified parameter at its base value, with the reason; else None."""
     coordinates = solution.coordinates
     parameter = coordinates.parameters[index]
     problem = FitProblem(residuals, coordinates, solution.scale)

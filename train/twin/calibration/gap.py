@@ -174,7 +174,10 @@ def _sensed(driven: OpenLoopResult, twin: int) -> Signals:
 
 
 def _localise(period_s: float, now: Signals, after: Signals, twin: Signals) -> None:
-    """The twin's pose as localisation would report it: as old as the log's, and speeds from it."""
+    """Replace the twin's pose by what localisation would report, in place.
+
+    The pose is made as old as the logged one, and the localised speeds are computed from it.
+    """
     elapsed_s = (after["pose_stamp_ns"] - now["pose_stamp_ns"]) * 1e-9
     share = np.clip(elapsed_s / period_s, 0.0, 2.0)
     for name in ("pose_x_m", "pose_y_m"):

@@ -211,7 +211,7 @@ def previous_action(task: Task, observation: F32) -> Ints:
 
 
 def rows_of(columns: Signals, rows: NDArray[Any]) -> Signals:
-    """Some rows of every column."""
+    """Return these rows of every column."""
     return {name: column[rows] for name, column in columns.items()}
 
 
@@ -257,8 +257,10 @@ def _vectors(column: pa.ChunkedArray, size: int) -> F32:
 
 
 def robot_of_store(store: Store, task_hash: str) -> Robot | None:
-    """The robot of the newest profile that read the rows of a task; None where it has none, or
-    where an older Restock kept no profile."""
+    """Return the robot of the newest profile that read a task's rows, or None.
+
+    It is None if the profile has no robot, or if an older Restock kept no profile.
+    """
     for stored in profiles_of(store.connection, task_hash):
         if not stored.toml:
             continue

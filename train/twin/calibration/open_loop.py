@@ -168,8 +168,10 @@ def log_segments(
 
 
 def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
-    """Of the ticks (N,) of a stretch, which of the first N - horizon have `horizon` more, each
-    where it is due."""
+    """Return which of the first N - horizon ticks have `horizon` evenly spaced ones after them.
+
+    The stamps (N,) are those of one stretch.
+    """
     off = stamp_ns - np.arange(len(stamp_ns)) * period_ns
     windows = np.lib.stride_tricks.sliding_window_view(off, horizon + 1)
     most, begin = EVEN * period_ns, off[: len(windows)]
@@ -251,8 +253,7 @@ def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
 
 
 def whole_periods_s(task: Task, seconds: float) -> float:
-    """The nearest length that is some control periods; `seconds` itself where that is more than
-    a twentieth away."""
+    """Round a length to whole control periods; return it unchanged if that is over 5 % off."""
     period_s = task.control_period_s
     whole = round(max(round(seconds / period_s), 1) * period_s, 6)
     return whole if abs(whole - seconds) <= 0.05 * seconds else seconds

@@ -113,11 +113,11 @@ def overlapping_segments(
 
 
 def measured_noise(steps: LoggedSteps, twin: Perturbation) -> SensorNoise:
-    """The noise of a log: localisation's white part from the log, the rest as the twin assumes.
+    """Estimate a log's sensor noise: white localisation noise from the log, the rest as assumed.
 
     Over one step, the distance between the motion of the localised pose and that of the wheels is
-    mostly noise (in the median over nominal steps). Where it is next to nothing, the pose is the
-    odometry itself, and is taken to have no noise.
+    mostly noise (in the median over nominal steps). If it is close to zero, the pose is the
+    odometry itself and counts as free of noise.
     """
     now, after, period = steps.now, steps.after, steps.task.control_period_s
     elapsed = (after["pose_stamp_ns"] - now["pose_stamp_ns"]) * 1e-9

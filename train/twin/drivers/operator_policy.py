@@ -40,8 +40,7 @@ STANDING_MARGIN_M = 0.2
 
 
 def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> tuple[F64, F64]:
-    """Where robots (n,) get to by commands (n, A, T, 2): poses (n, A, T, 3) and speeds
-    (n, A, T)."""
+    """Predict poses (n, A, T, 3) and speeds (n, A, T) of robots under commands (n, A, T, 2)."""
     period = env.task.control_period_s
     shape = commands.shape[:3]
     x, y, yaw = (np.broadcast_to(pose[:, axis, None], shape[:2]) for axis in range(3))
@@ -186,7 +185,7 @@ class Operator(SoftPolicy, Stateful):
         self._lattices = {}
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """The action that comes farthest along the way without coming too near to anything."""
+        """Return the action that gets farthest along the way and keeps enough clearance."""
         pose = env.simulation.pose()
         self._find_ways(env, pose)
         table = np.asarray(env.task.actions, np.float64)
@@ -233,8 +232,10 @@ class Operator(SoftPolicy, Stateful):
         return action
 
     def _past_pallets(self, env: WarehouseVectorEnv, ids: Ints, pose: F64, table: F64) -> Ints:
-        """Of robots (n,) that a lattice guides: the first action of the pair that leaves the
-        least time, and touches nothing."""
+        """Return the first action of the best pair of actions for robots (n,) guided by a lattice.
+
+        The best pair leaves the least time to the goal and touches nothing.
+        """
         first, then = (part.ravel() for part in np.indices((len(table),) * 2))
         horizon, begun = steps_of(env, PAIR_S), steps_of(env, FIRST_S)
         touch_m, roomy_m = margins_of(env)
@@ -273,8 +274,10 @@ class Operator(SoftPolicy, Stateful):
         return np.flatnonzero(guided)
 
     def _lattice(self, env: WarehouseVectorEnv, index: int) -> StateLattice | None:
-        """That of the robot's episode, about the pallets and where it was stuck; None where
-        neither is, and for robots that do not turn on the spot."""
+        """Return the lattice of a robot's episode, around its pallets and where it was stuck.
+
+        None if there is neither, and for robots that do not turn on the spot.
+        """
         episode = int(self._episode[index])
         kept, lattice = self._lattices.get(index, (-1, None))
         if kept == episode:
@@ -355,7 +358,7 @@ class Operator(SoftPolicy, Stateful):
         return self._backing > 0
 
     def _find_ways(self, env: WarehouseVectorEnv, pose: F64) -> None:
-        """A plan past the pallets at the start of each episode, and again off that plan."""
+        """Plan past the pallets at the start of each episode, and again if a robot is off plan."""
         if len(self._ways) != env.num_envs:
             self._prepare(env.num_envs, steps_of(env, PAIR_S))
         serial = env.episodes_begun
@@ -403,10 +406,10 @@ def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:
 
 
 def _moved(env: WarehouseVectorEnv) -> F64:
-    """Changes of x, y (m) and yaw (rad) from which on a robot has moved.
+    """Return the changes of x, y (m) and yaw (rad) above which a robot counts as moving.
 
-    A slower robot's are smaller, by its highest speeds: else one that creeps, or that has just been
-    told to drive, is taken for stuck.
+    They are smaller for slow robots, by their highest speeds: else one that creeps, or that has
+    just been commanded to drive, counts as stuck.
     """
     fastest = np.abs(np.asarray(env.task.actions, np.float64)).max(axis=0)
     slower = np.minimum(fastest * env.task.control_period_s / MOVED_STEP, 1.0)

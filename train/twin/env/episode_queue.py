@@ -257,7 +257,7 @@ class MissionArms:
         )
 
     def _narrowed(self, arm: MissionArm) -> Schedule | None:
-        """What draws an arm's perturbations: the schedule, in the arm's part of its ranges."""
+        """Return the schedule for an arm's perturbations, its ranges narrowed to the arm's."""
         ranges = {name: (low, high) for name, low, high in arm.ranges}
         if self._schedule is None or not ranges:
             return self._schedule
@@ -416,7 +416,7 @@ class EpisodeQueue(Stateful):
         self._arms, self._arm_shares = arms, np.cumsum(parts) / parts.sum()
 
     def arms(self, by: Sequence[str], planners: Sequence[Planner]) -> list[MissionArm]:
-        """The arms that its drawn episodes can be of. Raises ConfigError as `MissionArms`."""
+        """Return the arms of its drawn episodes. Raises ConfigError as `MissionArms` does."""
         self._asked = MissionArms(
             self._layouts,
             planners,
@@ -429,20 +429,23 @@ class EpisodeQueue(Stateful):
         return self._asked.arms
 
     def restored(self) -> None:
-        """What the shares add up to follows from them."""
+        """Recompute the cumulative shares after a state was restored."""
         self.set_conditions(self.conditions)
 
     def set_fixed(self, specs: Iterable[EpisodeSpec]) -> None:
-        """These are next, in order, for any environment. Raises ArgumentError for other things."""
+        """Run these episodes next, in order, in any environment.
+
+        Raises ArgumentError if one is not an EpisodeSpec.
+        """
         fixed = list(specs)
         for spec in fixed:
             expect("an episode", spec, EpisodeSpec, 'such as EpisodeSpec("nominal", seed=1)')
         self.fixed, self.next_fixed = fixed, 0
 
     def next(self, env: int) -> tuple[EpisodeSpec, int, int]:
-        """The episode that an environment begins now, its place among the fixed, and its arm.
+        """Return the episode that an environment begins now, its index in `fixed`, and its arm.
 
-        The place is -1 of a drawn one, the arm -1 where none was asked for.
+        The index is -1 for a drawn episode; the arm is -1 unless arms were requested.
         """
         if self.next_fixed < len(self.fixed):
             self.next_fixed += 1

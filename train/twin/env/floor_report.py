@@ -96,7 +96,7 @@ def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehou
 
 
 def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
-    """The kinds of episodes that some floor has no room for, and the names of those floors."""
+    """Return the kinds of episodes that some floor has no room for -> names of those floors."""
     unfit: dict[str, list[str]] = {}
     for floor in floors:
         for kind in KINDS:
@@ -123,7 +123,7 @@ def unreachable_goals(floor: Warehouse) -> int:
 
 @lru_cache(maxsize=1024)
 def fitting_kinds(floor: Warehouse) -> tuple[str, ...]:
-    """The kinds of episodes that could be drawn on a floor, whatever their seed (of three)."""
+    """Return the kinds of episodes that fit on a floor with each of three seeds."""
     planner = Planner(floor)
     return tuple(
         kind for kind in KINDS if all(_fits(kind, seed, floor, planner) for seed in range(3))

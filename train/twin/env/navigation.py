@@ -320,8 +320,10 @@ class PathFollower:
     def _turned_in_moves(
         self, signals: Signals, action: Ints, front: F64, bend: F64, side: Ints
     ) -> Ints:
-        """The actions (N,) of robots that steer: forward and back in turns, toward the plan, where
-        it leads elsewhere than they drive."""
+        """Return the actions (N,) of steered robots that turn by driving forward and back.
+
+        They do so if the plan leads elsewhere than they are heading; others keep `action`.
+        """
         backs = signals["wheel_speed_mps"] < -0.05  # what it began it goes on with
         behind = self._nearest(signals, self._behind)
         turns = (bend > 0.9) | ((bend > 0.3) & (backs | (front < self.stop_m)))
@@ -331,7 +333,7 @@ class PathFollower:
         return np.where(turns, np.where(back, self._back[side], forward), action)
 
     def front(self, signals: Signals) -> F64:
-        """The smallest clearance (N,) within 30 degrees of straight ahead; inf without a lidar."""
+        """Return the clearance (N,) within 30 degrees of straight ahead; inf without a lidar."""
         return self._nearest(signals, self._ahead)
 
     def _nearest(self, signals: Signals, sectors: slice | NDArray[np.intp]) -> F64:

@@ -110,7 +110,7 @@ class _Canvas:
         self._y = (np.arange(height) + 0.5) / pixels_per_m
 
     def fill(self, area: Rect, color: Pixel) -> None:
-        """An axis-aligned box, its edges rounded to whole pixels."""
+        """Fill an axis-aligned box, its edges rounded to whole pixels."""
         x0, y0, x1, y1 = (round(edge * self._scale) for edge in area.edges)
         self._image[y0:y1, x0:x1] = color
 
@@ -127,7 +127,7 @@ class _Canvas:
         self._image[window][dx * dx + dy * dy <= radius * radius] = color
 
     def arrow(self, x: float, y: float, heading: tuple[int, int], color: Pixel) -> None:
-        """A triangle around a place that points the way."""
+        """Draw a triangle around a place, pointing along `heading`."""
         window, dx, dy = self._window(x, y, 0.4)
         ahead = heading[0] * dx + heading[1] * dy
         aside = np.abs(heading[1] * dx - heading[0] * dy)
@@ -448,7 +448,7 @@ def _forklift(x: float, y: float, yaw: float) -> Iterator[Part]:
 
 
 def _rack(rack: Rect) -> Iterator[Part]:
-    """Posts, two shelves above the floor, and cartons on each of the three levels."""
+    """Yield a rack's posts, two shelves above the floor, and cartons on each of three levels."""
     x, y = rack.center
     half_x, half_y = rack.half_size
     top = 2 * RACK_HALF_HEIGHT_M

@@ -143,9 +143,9 @@ def action_space(
 
 
 def behind_limiter(limits: Limits, task: Task, now: Signals, chosen: Chosen) -> Chosen:
-    """What becomes of the chosen actions behind a limiter; `info["limiter"]` has the rule of each.
+    """Limit the chosen actions; `info["limiter"]` has the rule that held each back.
 
-    The action of a command that was held back is the nearest, as a log of it would have it.
+    A command that was held back gets the action nearest to it, as ingest would label its log.
     """
     action, command, reported = chosen
     before = np.stack([now["command_speed_mps"], now["command_yaw_rate_radps"]], axis=-1)
@@ -552,7 +552,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
         )
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A top-down map, or the frame of the `camera` that was asked for, (H, W, 3) uint8."""
+        """Return a top-down map, or a frame of the requested `camera`, (H, W, 3) uint8."""
         frames = self.vector.render()
         return frames[0] if frames else None
 

@@ -50,7 +50,7 @@ def cells_of(floor: Warehouse, cell_m: float) -> Cells:
 
 
 def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
-    """The aisle segments of a floor's free cells, from the south-west, longest aisles kept."""
+    """Find the aisle segments of a floor's free cells, from the south-west; keep the longest."""
     corridors: list[tuple[Axis, _Corridor]] = [("x", c) for c in _corridors(free, cell_m)]
     corridors += [("y", c) for c in _corridors(free.T, cell_m)]
     corridors.sort(key=lambda item: item[1].first - item[1].last)

@@ -199,7 +199,7 @@ def floors_of(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]
 
 
 def layouts_of_split(text: str, split: Split) -> str:
-    """What `open_floors` reads, with the training floors replaced by those of another split."""
+    """Replace the training floors in a text for `open_floors` by those of another split."""
     parts = [part.strip() for part in text.split(",")]
     return ",".join(
         f"{kind}:{split}" if kind in RECIPES and rest.partition(":")[0] == "train" else part

@@ -232,8 +232,7 @@ class Warehouse:
 
     @cached_property
     def starts(self) -> tuple[AisleSegment, ...]:
-        """Where episodes begin: the places that are known for it, else aisle segments, else around
-        the goals."""
+        """Return where episodes begin: known places, else aisle segments, else around goals."""
         if self.starts_m:
             here = (Rect(x - 0.46, y - 0.46, x + 0.46, y + 0.46) for x, y in self.starts_m)
             return tuple(AisleSegment("start", 0, area) for area in here)

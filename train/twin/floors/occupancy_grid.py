@@ -100,8 +100,10 @@ def find_places(
 def with_missions(
     floor: Warehouse, elsewhere: tuple[tuple[float, float], ...], notes: list[str]
 ) -> Warehouse:
-    """The floor with the lengths of its missions; where the places that the robot was at are all
-    near to each other, missions go from them to others, too."""
+    """Return the floor with lengths of missions that fit its places.
+
+    If the visited places are all close together, missions also go to places in `elsewhere`.
+    """
     near = connected(floor)
     ways = _ways(near)
     made = _long_as(near, *ways)
@@ -121,7 +123,7 @@ def with_missions(
 
 
 def missions_way(floor: Warehouse) -> Warehouse:
-    """The floor with lengths of missions that its places allow: the usual ones where they do."""
+    """Return the floor with mission lengths that its places allow: the usual ones if possible."""
     return _long_as(floor, *_ways(floor))
 
 
@@ -155,7 +157,7 @@ def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
 
 
 def connected(floor: Warehouse) -> Warehouse:
-    """The floor with those goals and starts alone that a robot gets to from most of the others."""
+    """Return the floor with only the goals and starts of the part that holds most goals."""
     planner = Planner(floor, trees_kept=1)
     part = planner.parts()
     goals = part[[planner.cell(x, y) for x, y in floor.goals_m]]
@@ -198,7 +200,7 @@ class OccupancyGrid:
         return found
 
     def cells_at(self, places_m: F64) -> tuple[NDArray[np.int64], Bools]:
-        """The cells (N, 2) of places (N, 2) of the map's frame, and which are on the map (N,)."""
+        """Return the cells (N, 2) of places (N, 2) of the map, and which are on it (N,)."""
         cells = np.floor(self.within(places_m) / self.cell_m).astype(np.int64)
         inside = ((cells >= 0) & (cells < self.occupancy.shape)).all(axis=1)
         return cells, np.asarray(inside, np.bool_)
@@ -406,7 +408,7 @@ def _cells_in(
 def _racks(
     free: Cells, cell_m: float, where: str, notes: list[str]
 ) -> tuple[Cells, float, tuple[Rect, ...]]:
-    """The obstacles as boxes; cells are made coarser, and never freer, until few boxes do."""
+    """Cover the obstacles with boxes, with coarser (never freer) cells until few boxes suffice."""
     fine, fine_m = free, cell_m
     while cell_m <= COARSEST_M:
         boxes = cover(~free, MAX_RACKS)
@@ -435,8 +437,10 @@ def _racks(
 def drivable_part(
     free: Cells, cell_m: float, room_m: float, visited: NDArray[np.int64] | None = None
 ) -> Cells:
-    """The part that a robot's middle can be in: the one with most of the cells `visited` (N, 2),
-    else the largest."""
+    """Return the connected cells that a robot's centre can be in.
+
+    It is the part with most of the cells `visited` (N, 2), else the largest.
+    """
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     parts, count = ndimage.label(room >= room_m)
     if not count:

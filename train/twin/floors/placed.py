@@ -108,7 +108,7 @@ def logged_drives(
 
 
 def drive_of(task: Task, poses: F64, clearance_m: F64) -> Drive:
-    """A drive by its poses (N, 3), where known, and the clearances (N, K) that were seen there."""
+    """Build a drive from its known poses (N, 3) and the clearances (N, K) seen there."""
     clearance_m, poses = clearance_m[np.isfinite(poses).all(axis=1)], _known(poses)
     x, y = sector_returns(task, clearance_m)
     cos, sin = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])

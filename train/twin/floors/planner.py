@@ -89,9 +89,9 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> F64 | None:
-        """A plan past boxes as `graph_around` takes them; None where there is no way. Not cached.
+        """Plan past boxes as `graph_around` takes them; None if there is no way. Not cached.
 
-        Without boxes it is that of `plan`.
+        Without boxes the result is that of `plan`.
         """
         if not len(boxes):
             return self.plan(x_m, y_m, goal)
@@ -111,11 +111,13 @@ class Planner:
         boxes: F64,
         half_m: tuple[float, float],
     ) -> sparse.csr_matrix:
-        """Cells joined at the cost of driving between them past boxes (K, 3) (x, y, yaw) that
-        the map does not know; edges run against the robot's way, in weighted metres.
+        """Return the graph of cells for driving past boxes that the map does not know.
 
-        For those who see more than the robot does: without one-way rules where boxes leave no
-        other way from a place to the goal, as in `plan`. Not cached.
+        The boxes (K, 3) are x, y, yaw. Edges run against the robot's direction, in cost-weighted
+        metres.
+
+        It is for drivers that see more than the robot does. One-way rules are dropped if boxes
+        leave no other way from a place to the goal, as in `plan`. Not cached.
         """
         clearance = self._clearance_m
         for x, y, yaw in boxes:
@@ -146,7 +148,7 @@ class Planner:
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:
-        """The index of the cell that holds a place; the nearest one for a place off the map."""
+        """Return the index of the cell at a place, or of the nearest cell if it is off the map."""
         i = min(max(int(x_m / CELL_M), 0), self.shape[0] - 1)
         j = min(max(int(y_m / CELL_M), 0), self.shape[1] - 1)
         return i * self.shape[1] + j

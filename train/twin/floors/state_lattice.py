@@ -301,7 +301,7 @@ def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: 
 
 
 def _filled(times: F64) -> F64:
-    """Times (nx, ny) of one heading; off the free states that of the nearest, and more."""
+    """Fill unknown times (nx, ny) of one heading with the nearest known one plus a penalty."""
     known = np.isfinite(times)
     if not known.any():
         return np.full(times.shape, _NO_WAY_S)

@@ -58,15 +58,17 @@ class FloorFriction:
         self._has_patches[env] = (patches[:, 2] > 0).any()
 
     def set_floor(self, env: int, friction: float) -> None:
-        """The floor's friction coefficient where no patch lies."""
+        """Set the floor's friction coefficient outside patches."""
         self.base[env] = friction
         for wheel, geom in enumerate(self._geoms):
             left = self.left[env] if wheel % 2 == 0 else 1.0
             self._written[env, geom, 0] = friction * left
 
     def write(self, ids: Ints, pose: F64) -> Bools:
-        """Friction under the wheels of `ids` at poses (n, 3); returns (n, W) which of them stand
-        on a patch."""
+        """Write the friction under the wheels of `ids` at poses (n, 3).
+
+        Returns which wheels (n, W) stand on a patch.
+        """
         friction = self._under(ids, pose)
         for wheel, geom in enumerate(self._geoms):
             left = self.left[ids] if wheel % 2 == 0 else 1.0

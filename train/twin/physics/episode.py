@@ -88,12 +88,12 @@ def draw_episode(spec: EpisodeSpec, warehouse: Warehouse, planner: Planner) -> E
 
 
 def with_room(episode: Episode, warehouse: Warehouse, outline_m: F64) -> Episode:
-    """The episode, its robot turned where as drawn its outline would stand in a rack or wall.
+    """Return the episode, its robot turned if its outline would stand in a rack or wall.
 
-    `outline_m` (K, 2) are points on the outline, about the pose. Drawn are starts for the twin's
-    own robot: a longer one is turned along its way or the aisle, and where that is not enough
-    stands in the aisle's middle. A place with room for none of that is left as it is, and so is
-    a start that was asked for.
+    `outline_m` (K, 2) are points on the outline, about the pose. Starts are drawn for the twin's
+    own robot. A longer one is turned along its way or the aisle, and if that is not enough it is
+    moved to the aisle's middle. A start without room for any of these is kept, and so is one that
+    was requested.
     """
     if episode.spec.way is not None:
         return episode

@@ -96,9 +96,10 @@ class RobotModel:
 
     @property
     def roller_axes(self) -> F64 | None:
-        """Of mecanum wheels (W, 3): the axis in the robot's frame about which each drives, the
-        rollers' free direction along its contact being the other diagonal; a unit of its speed is
-        one of the wheel's. None: wheels without rollers.
+        """Return the axes (W, 3) that mecanum wheels drive about, in the robot's frame.
+
+        The rollers roll freely along the other diagonal of the contact. A unit of speed about an
+        axis is one of the wheel's. None for wheels without rollers.
         """
         if self.drive != "omnidirectional":
             return None
@@ -263,7 +264,7 @@ class Measures:
 
 
 def measures(robot: Robot, body: Body) -> Measures:
-    """A value for all that a profile's robot leaves out, by what is usual for its outline."""
+    """Return a robot's measures; what its profile omits is estimated from its outline."""
     size = math.sqrt(body.length_m * body.width_m)
     height = robot.height_m or max(0.5 * size, 2.2 * (robot.wheel_radius_m or 0.0))
     four = robot.drive != "differential"

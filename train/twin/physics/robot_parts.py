@@ -53,10 +53,10 @@ PLACE_M = 0.02  # how far parts may be from where the profile says
 
 
 def own_model(robot: Robot, body: Body, built: RobotModel) -> RobotModel:
-    """The robot of a profile's MJCF: measures are the file's, limits and the rest as `built`.
+    """Build the robot of a profile's MJCF: measures from the file, limits and the rest of `built`.
 
     Raises:
-        ConfigError: it lacks something, which is named: all that is wrong at once.
+        ConfigError: the model lacks something; the message names all problems at once.
     """
     if robot.drive not in ROLES:
         raise _refused(f"it cannot be of {robot.drive} drive: {', '.join(ROLES)} can")
@@ -367,7 +367,7 @@ def _add_steering_motors(spec: Any, robot: RobotModel) -> None:
 
 
 def _add_own(spec: Any, robot: RobotModel) -> None:
-    """A model of its own, with the outline, the sensors and the grip that every robot has."""
+    """Add a profile's own model, with the outline, sensors and grip that every robot has."""
     base = attach_own(spec, robot)
     base.add_geom(
         name="chassis",
@@ -399,8 +399,7 @@ def _add_sensors(spec: Any) -> None:
 
 
 def grip(model: mujoco.MjModel, robot: RobotModel) -> None:
-    """The floor's friction under the wheels of its own model, which is theirs to say, as of built
-    ones."""
+    """Give the wheels of a profile's own model the floor's friction, as built wheels have it."""
     if robot.mjcf is None:
         return
     for geom in _own_wheels(model, robot).geoms:

@@ -98,7 +98,7 @@ def _settled(robot: RobotModel) -> RobotModel:
 def driven_actions(
     robot: RobotModel, actions: Sequence[tuple[float, float]], friction: float
 ) -> list[dict[str, float]]:
-    """What a robot drives steadily of each action (m/s, rad/s), on a floor of this friction."""
+    """Return the steady speeds (m/s, rad/s) of each action on a floor of this friction."""
     rows = []
     for speed, turn in actions:
         ahead, turned = _driven(robot, speed, turn, friction)
@@ -159,7 +159,7 @@ def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str
 
 
 def outlined(body: Body) -> list[tuple[str, Any, str]]:
-    """The outline of a robot, and where its lidar is on it: name, value, and where it is from."""
+    """Return a robot's outline and lidar place as rows of name, value and source."""
     return [
         (f"body.{name}", round(getattr(body, name), 4), "task.body")
         for name in body.__struct_fields__

@@ -245,8 +245,11 @@ class Scenery(Stateful):
         lidar_z_m: float,
         moves: F64,
     ) -> None:
-        """`moves` (N, substeps, 3 * nmocap) are the mocap positions of the coming block, which
-        are written here and read by who runs it."""
+        """Build the scenery of N warehouses.
+
+        `moves` (N, substeps, 3 * nmocap) are the mocap positions of the coming block: written here,
+        read by the simulation.
+        """
         num_envs = len(moves)
         self.batch, self.handles, self.moves = batch, handles, moves
         self.traffic = Traffic(num_envs, robot_half_m)
@@ -317,7 +320,7 @@ class Scenery(Stateful):
 
 
 def quaternion(yaw_rad: F64) -> F64:
-    """Unit quaternions (..., 4), w first, of headings (...)."""
+    """Return unit quaternions (..., 4), w first, of headings (...)."""
     half = yaw_rad / 2
     zero = np.zeros_like(half)
     return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)

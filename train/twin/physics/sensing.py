@@ -92,7 +92,7 @@ class Sensing(Stateful):
         self._wander(env)
 
     def _wander(self, env: int) -> None:
-        """The localisation's drift: steps of an autoregressive walk of unit variance."""
+        """Turn an episode's localisation drift into an autoregressive walk of unit variance."""
         keep = float(np.exp(-self.task.control_period_s / DRIFT_TIME_S))
         drift = self._noise[env, :, 3:5]
         drift[1:] *= np.sqrt(1 - keep**2)
@@ -196,7 +196,7 @@ def _sees_everything(simulation: Simulation) -> bool:
 
 
 def add_route(task: Task, signals: Signals, plans_m: F64, goals_m: F64) -> F64:
-    """What robots see of plans (n, P, 2) and goals (n, 2); returns how far off plan they are."""
+    """Add what robots see of plans (n, P, 2) and goals (n, 2); return how far off plan they are."""
     x, y, yaw = signals["pose_x_m"], signals["pose_y_m"], signals["pose_yaw_rad"]
     view = view_route(plans_m, x, y, yaw, plan_distances_m(task))
     near, far = view.look_ahead_m[:, PLAN_PARTS], view.look_ahead_m[:, 2 * PLAN_PARTS]

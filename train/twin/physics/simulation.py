@@ -88,8 +88,10 @@ class BaseController(Stateful):
         return np.tile(speeds, len(self.robot.wheels_m) // 2)
 
     def _in_force(self, since_s: float) -> tuple[F64, F64, Ints]:
-        """Commands (N, 1, 2) in force as a block begins and as it ends, and the substep (N, 1, 1)
-        of the change: within a block there is at most one."""
+        """Return the commands (N, 1, 2) in force as a block begins and as it ends.
+
+        Also returns the substep (N, 1, 1) of the change: there is at most one within a block.
+        """
         step = np.arange(self._substeps)
         age_s = since_s + step * self._timestep_s - self.latency_s[:, None] + 1e-9
         age = np.clip(-np.floor(age_s / self._period_s), 0, self.commands.shape[1] - 1)
@@ -121,9 +123,11 @@ class BaseController(Stateful):
 
 
 class SteeringController(BaseController):
-    """Controllers of robots that steer: speed and steering angle ramp, and the angle is that of
-    the circle that is commanded, as tight as the steering allows. It stays where it is under a
-    command to stop."""
+    """Controllers of robots that steer, which ramp speed and steering angle.
+
+    The angle is that of the commanded circle, or of the tightest possible one. A stop command
+    leaves the steering as it is.
+    """
 
     STATE: ClassVar[tuple[str, ...]] = (*BaseController.STATE, "steering_rad")
 
@@ -406,8 +410,10 @@ class Simulation(Stateful):
         self.diverged = np.asarray((warnings > 0).any(axis=1), np.bool_)
 
     def _run(self, actuators: F64) -> Bools:
-        """One block of substeps under controls (N, S, actuators); returns whose bumper was
-        pressed."""
+        """Run one block of substeps under controls (N, S, actuators).
+
+        Returns whose bumper was pressed, (N,).
+        """
         control = self._control
         control[:, :, self.handles.actuators] = actuators
         touched = np.zeros(self.num_envs, np.bool_)
@@ -457,11 +463,11 @@ class Simulation(Stateful):
         )
 
     def pose(self) -> F64:
-        """True x, y and heading, (N, 3)."""
+        """Return the true x, y and heading, (N, 3)."""
         return np.column_stack([self.qpos[:, :2], yaw_of(self.qpos[:, 3:7])])
 
     def middle(self, pose: F64) -> F64:
-        """The middles and headings (..., 3) of outlines at poses (..., 3), which are axles'."""
+        """Return outlines' centres and headings (..., 3) for axles at poses (..., 3)."""
         if not self.robot.axle_x_m:
             return pose
         back = self.robot.axle_x_m
@@ -527,7 +533,7 @@ class Simulation(Stateful):
         return self.task.body.lidar_x_m - self.robot.axle_x_m
 
     def cast(self, ids: Ints) -> F64:
-        """True lidar ranges (n, beams) in metres now; inf where nothing is hit."""
+        """Return the true lidar ranges (n, beams) in metres; inf if nothing is hit."""
         heading = yaw_of(self.qpos[ids, 3:7])
         ahead = self.lidar_x_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         return self.lidar.ranges(ids, self.qpos[ids, :2] + ahead, heading)
@@ -546,11 +552,12 @@ class Simulation(Stateful):
 
 
 def blocks_of(task: Task, timestep_s: float) -> tuple[int, float]:
-    """The blocks of a control period and their length: `BLOCK_S` where periods are some of these,
-    else a part of a period.
+    """Return the number of blocks in a control period, and their length in seconds.
+
+    Blocks are `BLOCK_S` long if the period is a multiple of it, else an equal part of the period.
 
     Raises:
-        ConfigError: it is not some timesteps.
+        ConfigError: the length is not a multiple of the timestep.
     """
     period_s = task.control_period_s
     blocks = max(math.ceil(period_s / BLOCK_S - 1e-9), 1)

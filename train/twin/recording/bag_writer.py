@@ -71,7 +71,7 @@ class Sink(Protocol):
 def recording_sink(
     path: Path, file_format: Format, topics: Sequence[Topic], tags: Mapping[str, str] | None = None
 ) -> Iterator[Sink]:
-    """A sink that becomes `path` when the block ends well, and leaves nothing when it does not.
+    """Open a sink that becomes `path` if the block ends well, and leaves nothing if it fails.
 
     `tags` say whose drive it is, in an MCAP file's metadata or a rosbag2 folder's custom_data.
 

@@ -126,7 +126,7 @@ class Odometer:
         return np.floor(angle / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
 
     def carry_on(self, motion: Motion, reckoned: F64) -> None:
-        """The next mission begins where this motion ended."""
+        """Begin the next mission where this motion ended."""
         turned = motion.wheel_angle_rad[-1] - motion.wheel_angle_rad[0]
         self.wheel_angle_rad = self.wheel_angle_rad + turned
         self.pose = reckoned[-1]

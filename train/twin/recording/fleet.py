@@ -290,7 +290,7 @@ class Fleet:
             self._scan = self.env.simulation.cast(np.arange(self.env.num_envs))
 
     def _note_step(self, log: _Log, robot: int, info: Mapping[str, Any]) -> None:
-        """What came of the action."""
+        """Note what an action led to."""
         log.motion.extend(self._motion)
         if self._scan is not None and not log.hardware.lidar_period_s:
             log.scan_s.append(round((len(log.action) - 1) * self.period_s + BLOCK_S, 6))
@@ -298,7 +298,7 @@ class Fleet:
         self._note_tick(log, robot, info["signals"])
 
     def _note_tick(self, log: _Log, robot: int, signals: Signals) -> None:
-        """What the policy sees at a tick."""
+        """Note what the policy sees at a tick."""
         env, tick = self.env, len(log.action)
         log.signals.append({name: column[robot] for name, column in signals.items()})
         log.observation.append(env.observation[robot].copy())

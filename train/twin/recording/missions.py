@@ -112,7 +112,7 @@ class OrderedMissions:
         return owed
 
     def note(self, mission: Mission, *, observed: bool) -> None:
-        """What became of a mission."""
+        """Count a driven mission for its order, and whether its kind was observed."""
         if mission.order is not None:
             self.driven[mission.order] += 1
             self.observed[mission.order] += observed

@@ -133,7 +133,7 @@ class Robot:
         cell_m: float,
         origin_m: tuple[float, float] = (0.0, 0.0),
     ) -> list[Message]:
-        """What is sent when a recording or a floor begins: the sensors' places and the map."""
+        """Return what is sent when a recording or floor begins: sensor transforms and the map."""
         self._start_ns = start_ns
         at = np.zeros(1)
         return [
@@ -238,7 +238,7 @@ class Robot:
         return poses + self._send("/tf", tf_s, data)
 
     def _bumper(self, drive: Drive) -> list[Message]:
-        """Polled; sent when it changes, at its rate, and at every poll while it is pressed."""
+        """Return bumper messages: on change, at their rate, and at every poll while pressed."""
         end_s = float(drive.tick_s[-1])
         polls = np.arange(round(end_s / BUMPER_POLL_S) + 1) * BUMPER_POLL_S
         edges = np.searchsorted(drive.motion.time_s, polls + 1e-9, "right")
@@ -250,9 +250,9 @@ class Robot:
         return self._send("/bumper", polls[sent], topics.bumpers(pressed[sent]))
 
     def _ticks(self, drive: Drive) -> list[Message]:
-        """The simulator's truth, what navigation proposes and then the command of every tick.
+        """Return the true conditions, navigation's proposal and the command of every tick.
 
-        The command of the last is a stop.
+        The last command is a stop.
         """
         command = np.concatenate([drive.command, np.zeros((1, 2))])
         thinking = self.rng.uniform(*THINKING_S, len(command))
@@ -291,7 +291,7 @@ class Robot:
         return self._send("/diagnostics", times, data)
 
     def _scene(self, drive: Drive) -> list[Message]:
-        """The parameters in force, what stands and lies, and who walks: on change, at its rate."""
+        """Return the perturbation and markers as they are, and traffic on change, at its rate."""
         scene, at, start_ns = drive.scene, np.zeros(1), self._stamp(0.0)
         due = np.diff(np.floor(drive.tick_s * self.rates.traffic + 1e-6), prepend=-1) > 0
         due = due[: len(scene.traffic)]

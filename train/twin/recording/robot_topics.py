@@ -325,7 +325,7 @@ def perturbation_text(perturbation: Perturbation) -> str:
 
 
 def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) -> bytes:
-    """What stays where it is for a mission: goal, pallets, patches; and the robot's own body."""
+    """Return a mission's fixed markers: goal, pallets, patches, and the robot's own body."""
     length, width, height = scene.body_m
     radius = 2 * scene.goal_radius_m
     markers = [

@@ -234,13 +234,15 @@ def gather(
     profile: Profile | None,
     typestore: str | None,
 ) -> Evidence:
-    """What a recording has, or one of a store: `stored_recording`, or that with the most rows.
+    """Read what a floor can be made from, out of a recording or one recording of a store.
 
-    `with_map`: a map that is none is an error; without, it is left aside.
+    Of a store, it is `stored_recording`, or the one with the most rows.
+
+    With `with_map`, an invalid map is an error; without it, such a map is ignored.
 
     Raises:
-        RecordingError: it cannot be read, or its map is none.
-        ConfigError: `map_yaml` is none.
+        RecordingError: it cannot be read, or its map is invalid.
+        ConfigError: `map_yaml` is invalid.
         StoreError: the store is empty, or cannot be read.
     """
     notes: list[str] = []

@@ -194,9 +194,10 @@ _WALL_STEP_M = 0.6  # between their ends, on one wall
 def scan_map(
     scans: PlacedScans, driven_m: F64, room_m: float, frame: str, notes: list[str]
 ) -> tuple[OccupancyGrid, float]:
-    """The map that scans show, its axes along the walls, and how well they agree on it (a share).
+    """Build the map that scans show, its axes along the walls; also return how well they agree.
 
-    `driven_m` (N, 2) are the robot's places, which are free, `room_m` is how far around them.
+    Floor within `room_m` of the robot's places `driven_m` (N, 2) is free. The agreement is the
+    share of beams that end on a wall.
     """
     yaw = main_direction(*_walls(scans))
     turned = (0.0, 0.0, yaw)
@@ -237,7 +238,7 @@ def _walls(scans: PlacedScans) -> tuple[F64, F64]:
 
 
 def _cut(origin: F64, hit: F64) -> tuple[F64, F64, Bools]:
-    """The ends of beams (B, 2) within REACH_M, their lengths (B,), and which are hits (B,)."""
+    """Cut beams (B, 2) at REACH_M; return their ends, lengths (B,) and which are hits (B,)."""
     along = hit - origin
     length = np.hypot(*along.T)
     share = np.minimum(1.0, REACH_M / np.maximum(length, 1e-9))

@@ -1,5 +1,8 @@
-"""A surveyed floor from above: the map it was made from, the boxes that the twin has for it, aisles
-and crossings, where the robot drove and where missions go, with a scale."""
+"""A picture of a surveyed floor from above, with a scale.
+
+It shows the map that the floor was made from, the twin's boxes, aisles and crossings, where the
+robot drove and where missions go.
+"""
 
 from __future__ import annotations
 
@@ -203,8 +206,11 @@ class _Picture:
 
 
 def moved_apart(boxes: Sequence[tuple[float, float, float, float]]) -> list[float]:
-    """How far down each box (left, top, right, bottom) has to go to be below those that it covers:
-    the names of zones that overlap, such as the ends of two aisles, have nearly one centre."""
+    """Return how far down each label must move to be below those that it covers.
+
+    Boxes are (left, top, right, bottom). Zones that overlap, such as the ends of two aisles, have
+    nearly the same centre, and so have their names.
+    """
     placed: list[tuple[float, float, float, float]] = []
     found = []
     for left, top, right, bottom in boxes:

@@ -154,7 +154,7 @@ def candidate_poses(recording: Recording, profile: Profile | None = None) -> lis
 
 
 def choose_poses(candidates: Sequence[Poses], on_map: Callable[[F64], Bools]) -> Poses | None:
-    """The first that moves as far as others do and is on free floor, else the one most on it.
+    """Return the first poses that move far enough and are on free floor, else those most on it.
 
     `on_map` says which places (N, 2) are free. A localiser that never ran leaves poses that stand
     still, or lie in walls.
@@ -180,7 +180,7 @@ def _by_profile(recording: Recording, profile: Profile) -> Poses | None:
 
 
 def _of_topics(recording: Recording, topics: Mapping[str, Mapping[str, str]]) -> list[Poses]:
-    """The poses that these topics have in these fields; those without such fields are left out."""
+    """Read the poses in these fields of topics; topics without such fields are left out."""
     wanted: dict[str, list[str]] = {}
     for topic, fields in topics.items():
         leaves = set(recording.leaves(topic))
@@ -210,7 +210,7 @@ def _by_fixes(
     max_std_m: float | None = None,
     track_m: float | None = None,
 ) -> Poses | None:
-    """The poses by a satellite receiver's fixes; their yaw is the direction that was driven."""
+    """Read poses from a satellite receiver's fixes; their yaw is the direction of travel."""
     leaves = recording.leaves(topic)
     wanted = [*fields.values(), *(path for path in (STAMP, FRAME_ID) if path in leaves)]
     columns = recording.read({topic: wanted})[topic]
@@ -242,8 +242,10 @@ def _poses(times: Times, x: F64, y: F64, yaw: F64, frame: str, source: str) -> P
 
 
 def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
-    """The poses of `frames.base` in `frames.fixed`, at the times of the transform that moves most
-    often; None where no transforms join them."""
+    """Compute the poses of `frames.base` in `frames.fixed`; None if no transforms join them.
+
+    The poses are at the times of the moving transform that is sent most often.
+    """
     edges = _edges(recording, frames)
     chain = chain_between(edges, frames.base, frames.fixed)
     if not chain:
@@ -299,7 +301,7 @@ def _edges(recording: Recording, frames: Frames) -> Edges:
 
 
 def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
-    """The names of the transforms from a frame up to another, in `edges.topics`; [] for none."""
+    """Return the names in `edges.topics` of the transforms from a frame up to another, or []."""
     chain, here = list[str](), plain(base)
     while here != plain(fixed):
         names = [name for name in edges.topics if name.split(" ", 1)[1] == here]

@@ -49,9 +49,11 @@ class PlacedScans:
 def placed_scans(
     recording: Recording, poses: Poses, profile: Profile | None, footprint: Footprint | None
 ) -> list[PlacedScans]:
-    """The scans of a recording's lidar, put by each clock that they share with the poses: header
-    stamps first, and log time, as the clocks of two computers may be apart. Empty where it has no
-    scans, or none that can be placed."""
+    """Place a recording's lidar scans on the map, once per clock shared with the poses.
+
+    Header stamps come first, then log time, since the clocks of two computers may differ. Empty if
+    there are no scans, or none that can be placed.
+    """
     fit = _topic(recording, profile)
     if fit is None:
         return []
@@ -90,8 +92,10 @@ def _placed(
     *,
     by_stamp: bool,
 ) -> PlacedScans:
-    """The scans of a topic where the poses were by one clock; `bearings` (N,) of each first beam,
-    and from each beam to the next."""
+    """Place the scans of a topic at the poses of one clock.
+
+    `bearings` (N,) are those of each scan's first beam, and the steps from beam to beam.
+    """
     times, (turn, place), notes = Times.of(columns), mount, list(notes)
     pose, known = poses.at(times, by_stamp=by_stamp)
     chosen = _keyframes(pose, known, times.log_ns, topic, notes)

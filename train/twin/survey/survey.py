@@ -1,5 +1,4 @@
-"""A floor of the twin from what a recording or store shows: its map, else its scans, else the way
-that was driven.
+"""A floor of the twin from a recording or store: its map, else its scans, else its corridor.
 
     surveyed = survey(Path("logs/run.mcap"))
     surveyed.floor, surveyed.source, surveyed.notes
@@ -281,7 +280,7 @@ def _apart(grid: OccupancyGrid, poses: Poses) -> str:
 def _check_frames(
     grid: OccupancyGrid, poses: Poses | None, source: str, where: str, notes: list[str]
 ) -> None:
-    """That the poses lie on the map; says the share that does not.
+    """Check that the poses lie on the map; note the share that does not.
 
     Raises:
         ConfigError: most do not.
@@ -314,7 +313,7 @@ def _check_frames(
 def _check_walls(
     grid: OccupancyGrid, scans: list[PlacedScans], source: str, where: str, notes: list[str]
 ) -> None:
-    """That the map's walls are where the lidar saw them; says so where many are not.
+    """Check that the map's walls are where the lidar saw them; note it if many are not.
 
     Raises:
         ConfigError: most are not.
@@ -339,7 +338,7 @@ _QUARTERS = (("south", "west"), ("south", "east"), ("north", "west"), ("north", 
 
 
 def with_zones(floor: Warehouse) -> Warehouse:
-    """The floor with its crossings as zones beside its aisles, or its quarters without aisles."""
+    """Add a floor's crossings as zones beside its aisles, or its quarters if it has no aisles."""
     if floor.segments:
         named = ((f"crossing_{k + 1}", area) for k, area in enumerate(floor.crossings))
         return replace(floor, cross_zones=tuple(named))
@@ -354,7 +353,7 @@ def with_zones(floor: Warehouse) -> Warehouse:
 
 
 def profile_zones(floor: Warehouse) -> str:
-    """The floor's zones as TOML for a profile: boxes in the map's frame, turned by `yaw_rad`."""
+    """Return a floor's zones as TOML for a profile: boxes in the map's frame, with their yaw."""
     yaw = float((floor.map_origin[2] + np.pi) % (2 * np.pi) - np.pi)
     lines: list[str] = []
     for name, area in floor.zones.items():
