@@ -1,4 +1,4 @@
-"""A floor that is known only as free cells: its aisles, crossings and goals, and its racks.
+"""Floors known only as free cells: finds aisles, crossings, goals and racks in them.
 
 An aisle segment is a straight, narrow, free corridor between racks or walls on two sides: pallets
 can close it, and the lidar can tell that they do. Both directions are looked at. Racks are blocked
@@ -29,7 +29,7 @@ GOALS = 200
 
 @dataclass(frozen=True)
 class _Corridor:
-    """Columns first to last (exclusive) of a corridor, and its sides, in cells."""
+    """A corridor: its columns, first to last (exclusive), and its sides, in cells."""
 
     first: int
     last: int
@@ -38,7 +38,7 @@ class _Corridor:
 
 
 def cells_of(floor: Warehouse, cell_m: float) -> Cells:
-    """Return the free cells (X, Y) of a floor: those whose middle no rack holds."""
+    """Return the free cells (X, Y) of a floor: those whose centre is in no rack."""
     x = (np.arange(round(floor.width_m / cell_m)) + 0.5) * cell_m
     y = (np.arange(round(floor.depth_m / cell_m)) + 0.5) * cell_m
     free = np.ones((len(x), len(y)), np.bool_)
@@ -73,7 +73,7 @@ def find_segments(free: Cells, cell_m: float) -> tuple[AisleSegment, ...]:
 
 
 def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
-    """Corridors along the first axis: runs of free cells across it, joined while sides agree."""
+    """Find corridors along the first axis: runs of free cells across it, joined if sides agree."""
     low, high = WIDTH_M[0] / cell_m - 1e-6, WIDTH_M[1] / cell_m + 1e-6
     wander = EDGE_M / cell_m + 1e-6
     open_: list[tuple[_Corridor, int, int]] = []  # with the widest sides seen
@@ -119,7 +119,7 @@ def _corridors(free: Cells, cell_m: float) -> list[_Corridor]:
 def find_crossings(
     segments: tuple[AisleSegment, ...], free: Cells, cell_m: float
 ) -> tuple[Rect, ...]:
-    """Free places off the ends of the aisle segments, where others come from the side."""
+    """Find free places beyond the ends of aisle segments, where others come from the side."""
     crossings: dict[Rect, None] = {}
     for segment in segments:
         turned = segment.along == "y"
@@ -145,7 +145,7 @@ def find_crossings(
 def find_goals(
     free: Cells, cell_m: float, spacing_m: float = 1.0, room_m: float = GOAL_ROOM_M
 ) -> tuple[tuple[float, float], ...]:
-    """Places with room around them, evenly over the free cells; at most GOALS."""
+    """Choose at most GOALS places with room around them, evenly over the free cells."""
     room = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     stride = max(round(spacing_m / cell_m), 1)
     places = []
@@ -163,7 +163,7 @@ def find_goals(
 
 
 def cover(blocked: Cells, limit: int) -> list[Box] | None:
-    """Rectangles of blocked cells (X, Y) over all that border free ones; None: over `limit`.
+    """Cover all blocked cells (X, Y) beside free ones with rectangles; None if above `limit`.
 
     Each grows from a cell not yet covered, along one axis first and then along the other, in
     whichever order covers more.
@@ -186,7 +186,7 @@ def cover(blocked: Cells, limit: int) -> list[Box] | None:
 
 
 def _grow(total: Ints, i: int, j: int, order: tuple[int, int]) -> Box:
-    """Return the rectangle of blocked cells around one, grown along the axes in this order."""
+    """Grow a rectangle of blocked cells along the axes in this order."""
     box = [i, i + 1, j, j + 1]
     for axis in order:
         for side, step in ((2 * axis, -1), (2 * axis + 1, 1)):
@@ -205,7 +205,7 @@ def _grow(total: Ints, i: int, j: int, order: tuple[int, int]) -> Box:
 
 
 def _full(total: Ints, box: list[int]) -> bool:
-    """Whether every cell of a rectangle is blocked."""
+    """Return whether every cell of a rectangle is blocked."""
     a, b, c, d = box
     count = total[b, d] - total[a, d] - total[b, c] + total[a, c]
     return bool(count == (b - a) * (d - c))

@@ -1,4 +1,4 @@
-"""A floor as TOML, in metres: what a person writes, and what is written back.
+"""A floor as a TOML file in metres: reading, writing and its keys.
 
     name = "hall 3"
     width_m = 12.0
@@ -164,7 +164,7 @@ def _box(area: Rect) -> list[float]:
 
 
 def write_floor(floor: Warehouse, path: Path, remarks: Sequence[str] = ()) -> None:
-    """Write a floor as TOML. Raises ConfigError where it cannot be written."""
+    """Write a floor as TOML. Raises ConfigError if it cannot be written."""
     try:
         path.write_text(floor_toml(floor, remarks), encoding="utf-8")
     except OSError as error:

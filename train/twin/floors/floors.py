@@ -1,4 +1,4 @@
-"""Which floors the twin has: generated from seeds, split into training, validation and test.
+"""The twin's floors: generated from seeds, split into training, validation and test.
 
 `open_floors` takes what a user writes:
 
@@ -49,7 +49,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a generator may draw; ranges are in metres, rounded to .1 m."""
+    """The ranges that a generator draws from, in metres, rounded to .1 m."""
 
     aisle_m: Range = (1.5, 2.3)  # width
     cross_m: Range = (2.0, 2.6)
@@ -80,7 +80,7 @@ def split_of(seed: int) -> Split:
 
 
 def seeds_of(split: Split) -> Iterator[int]:
-    """Yield the seeds of a split, rising, without end."""
+    """Yield the seeds of a split in rising order, endlessly."""
     return (seed for seed in count() if split_of(seed) == split)
 
 
@@ -133,7 +133,7 @@ def generate(seed: int, recipe: Recipe | None = None, *, name: str | None = None
 def _strips(
     widths: list[float], recipe: Recipe, rng: np.random.Generator, way: Literal["deep", "long"]
 ) -> tuple[tuple[Range, ...], float]:
-    """Free strips with racks between them, and where the last one ends."""
+    """Draw free strips with racks between them; return them and where the last one ends."""
     span = recipe.rack_deep_m if way == "deep" else recipe.rack_m
     strips, at = [], 0.0
     for width in widths:
@@ -151,7 +151,7 @@ _TRANSPOSED: dict[Heading, Heading] = {
 
 
 def transposed(floor: Warehouse) -> Warehouse:
-    """With x and y exchanged: aisles that ran east run north."""
+    """Exchange x and y of a floor: aisles that ran east run north."""
     return replace(
         floor,
         width_m=floor.depth_m,
@@ -184,7 +184,7 @@ def open_floors(text: str) -> tuple[Warehouse, ...]:
 
 
 def floors_of(layouts: str | Sequence[Warehouse | str]) -> tuple[Warehouse, ...]:
-    """Floors as they are, or as `open_floors` reads them. Raises ConfigError where names repeat."""
+    """Return floors, read by `open_floors` if given as text. Raises ConfigError if names repeat."""
     parts = [layouts] if isinstance(layouts, str) else layouts
     opened = [open_floors(part) if isinstance(part, str) else (part,) for part in parts]
     floors = tuple(floor for some in opened for floor in some)
@@ -209,7 +209,7 @@ def layouts_of_split(text: str, split: Split) -> str:
 
 
 def open_floor(text: str) -> Warehouse:
-    """One floor. Raises ConfigError where `text` names several, or one that does not exist."""
+    """Open one floor. Raises ConfigError if `text` names several, or an unknown one."""
     floors = open_floors(text)
     if len(floors) > 1:
         raise ConfigError(

@@ -36,7 +36,7 @@ NO_PATCH = (1e6, 1e6, 0.0, 0.0, 1.0)  # x, y, half x, half y, friction
 
 @dataclass(frozen=True)
 class Walk:
-    """One agent's way, (WAY_POINTS, 2) evenly spaced, and how it behaves on it."""
+    """The path of a person or forklift, (WAY_POINTS, 2) evenly spaced, and its behaviour on it."""
 
     way_m: F64
     speed_mps: float
@@ -45,12 +45,12 @@ class Walk:
 
 
 def no_pallets() -> F64:
-    """Every pallet parked off the floor."""
+    """Return every pallet parked off the floor."""
     return np.tile([PARKED_M[0], PARKED_M[1], 0.0], (PALLETS, 1))
 
 
 def pallet_half_m(yaw_rad: F64) -> F64:
-    """Half sizes (..., 2) along x and y of pallets by heading (...): across, they are exchanged."""
+    """Return pallets' half sizes (..., 2) along x and y, exchanged if they stand across."""
     across = np.abs(np.sin(yaw_rad))[..., None] > 0.7
     return np.where(across, PALLET_HALF_M[1::-1], PALLET_HALF_M[:2])
 
@@ -85,7 +85,7 @@ class Rect:
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
-        """x_min, y_min, x_max, y_max."""
+        """Return x_min, y_min, x_max, y_max."""
         return self.x_min, self.y_min, self.x_max, self.y_max
 
     @property
@@ -97,7 +97,7 @@ class Rect:
         return (self.x_max - self.x_min) / 2, (self.y_max - self.y_min) / 2
 
     def contains(self, x_m: float, y_m: float, margin_m: float = 0.0) -> bool:
-        """Whether the point lies inside, at least `margin_m` from every side."""
+        """Return whether a point is inside, at least `margin_m` from every side."""
         return (
             self.x_min + margin_m <= x_m <= self.x_max - margin_m
             and self.y_min + margin_m <= y_m <= self.y_max - margin_m
@@ -105,13 +105,13 @@ class Rect:
 
     @property
     def transposed(self) -> Rect:
-        """With x and y exchanged."""
+        """Return it with x and y exchanged."""
         return Rect(self.y_min, self.x_min, self.y_max, self.x_max)
 
 
 @dataclass(frozen=True)
 class AisleSegment:
-    """The part of an aisle between two cross-aisles: what a block closes.
+    """A part of an aisle between two cross-aisles, which one block closes.
 
     It runs along `along` and is shut in by racks or walls on its two other sides.
     """
@@ -123,12 +123,12 @@ class AisleSegment:
 
     @property
     def lengthwise(self) -> Rect:
-        """Its area with x along the aisle: x and y exchanged where it runs north and south."""
+        """Return its area with x along the aisle: x and y are exchanged if it runs north."""
         return self.area if self.along == "x" else self.area.transposed
 
     @property
     def width_m(self) -> float:
-        """From rack to rack."""
+        """Return the width from rack to rack, in metres."""
         return self.lengthwise.y_max - self.lengthwise.y_min
 
 
@@ -150,7 +150,7 @@ class OneWay:
 
 @dataclass(frozen=True)
 class Warehouse:
-    """A floor. Walls stand around it; within, everything is free but the racks."""
+    """A floor within walls, on which everything but the racks is free."""
 
     width_m: float
     depth_m: float
@@ -169,7 +169,7 @@ class Warehouse:
     starts_m: tuple[tuple[float, float], ...] = ()  # where missions begin, where that is known
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where the numbers do not make a floor."""
+        """Raise ConfigError if the numbers do not make a floor."""
         where = f"layout {self.name}"
         for side in (self.width_m, self.depth_m):
             if not MIN_SIDE_M <= side <= MAX_SIDE_M:
@@ -226,7 +226,7 @@ class Warehouse:
 
     @cached_property
     def goals(self) -> F64:
-        """Where a robot may be sent, (G, 2): bays, crossings and docks."""
+        """Return where a robot may be sent, (G, 2): bays, crossings and docks."""
         docks = tuple(dock.area.center for dock in self.docks)
         return np.array(self.goals_m + docks, np.float64).reshape(-1, 2)
 
@@ -241,7 +241,7 @@ class Warehouse:
 
     @cached_property
     def zones(self) -> dict[str, Rect]:
-        """Named parts of the floor, for coverage; where they overlap the first one counts."""
+        """Return named parts of the floor, for coverage; the first one counts if they overlap."""
         named = {dock.name: dock.area for dock in self.docks}
         named |= dict(self.cross_zones)
         return named | {segment.name: segment.area for segment in self.segments}
@@ -263,17 +263,17 @@ class Warehouse:
 
     @cached_property
     def segment_edges(self) -> F64:
-        """(S, 4): x_min, y_min, x_max, y_max of each aisle segment."""
+        """Return x_min, y_min, x_max, y_max of each aisle segment, (S, 4)."""
         return np.array([segment.area.edges for segment in self.segments]).reshape(-1, 4)
 
     @cached_property
     def segment_along_y(self) -> Bools:
-        """(S,) which aisle segments run north and south."""
+        """Return which aisle segments run north and south, (S,)."""
         return np.array([segment.along == "y" for segment in self.segments], np.bool_)
 
     @cached_property
     def hash(self) -> str:
-        """Names everything but the name, 12 hex digits."""
+        """Return 12 hex digits that identify the floor, its name excepted."""
         content = asdict(self) | {"name": ""}
         for later, usual in (("room_m", ROOM_M), ("way_m", WAY_M), ("starts_m", ())):
             if content[later] == usual:  # floors from before these were known keep their hash
@@ -282,7 +282,7 @@ class Warehouse:
 
 
 def _inside(edges: F64, x_m: F64, y_m: F64) -> Bools:
-    """Which boxes (B, 4) hold each point, (N, B)."""
+    """Return which boxes (B, 4) hold each point, (N, B)."""
     x, y = np.asarray(x_m)[:, None], np.asarray(y_m)[:, None]
     inside: Bools = (
         (edges[:, 0] <= x) & (x <= edges[:, 2]) & (edges[:, 1] <= y) & (y <= edges[:, 3])
@@ -304,7 +304,7 @@ def strip_warehouse(
     one_way: tuple[OneWay, ...] = (),
     open_racks: frozenset[int] = frozenset(),
 ) -> Warehouse:
-    """Racks in a grid: aisles (south, north) and cross-aisles (west, east) are the free strips.
+    """Build a grid of racks between free strips: aisles (south, north), cross-aisles (west, east).
 
     `open_racks` are left out: floor to walk on. There is no aisle segment beside such a place.
     """
@@ -357,7 +357,7 @@ def strip_warehouse(
 
 
 def bays(segments: tuple[AisleSegment, ...]) -> tuple[tuple[float, float], ...]:
-    """Return the goals along aisle segments, in their middle."""
+    """Return goals along the middle of aisle segments."""
     places_m: list[tuple[float, float]] = []
     for segment in segments:
         area = segment.lengthwise
@@ -368,7 +368,7 @@ def bays(segments: tuple[AisleSegment, ...]) -> tuple[tuple[float, float], ...]:
 
 
 def default_warehouse() -> Warehouse:
-    """12 x 10 m: four aisles 1.8 m wide, three cross-aisles 2.2 m wide, six racks."""
+    """Build a 12 x 10 m floor: four 1.8 m aisles, three 2.2 m cross-aisles and six racks."""
     rack, aisle = 2.8 / 3, 1.8
     starts = [index * (aisle + rack) for index in range(4)]
     return strip_warehouse(

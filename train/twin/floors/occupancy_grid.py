@@ -1,4 +1,4 @@
-"""An occupancy grid, whatever it came from, and the twin's floor that it gives.
+"""Occupancy grids from any source, and the twin's floors made from them.
 
 Occupancy is in percent, -1 unknown, as `nav_msgs/OccupancyGrid` has it. The floor is one connected
 part of the free cells: the one that a robot drove in where its poses are known, else the largest.
@@ -51,7 +51,7 @@ NEAREST_M = 0.5  # a way shorter than this is no mission
 
 @dataclass(frozen=True)
 class Places:
-    """Places (x, y) in the floor's frame, and what is to be said of them."""
+    """Places (x, y) in the floor's frame, with notes for the user."""
 
     places_m: tuple[tuple[float, float], ...] = ()
     notes: list[str] = field(default_factory=list)
@@ -60,7 +60,7 @@ class Places:
 def find_places(
     free: Bools, reachable: Bools, cell_m: float, visited_m: F64, room_m: float, turn_m: float
 ) -> Places:
-    """Return the places among those visited (N, 2), in the floor's frame.
+    """Choose start and goal places among those visited (N, 2), in the floor's frame.
 
     `free` and `reachable` (X, Y) are the floor's cells, `room_m` is what driving needs around a
     robot's middle, `turn_m` what turning does. Without two places there are none.
@@ -128,7 +128,7 @@ def missions_way(floor: Warehouse) -> Warehouse:
 
 
 def _ways(floor: Warehouse) -> tuple[F64, F64]:
-    """Lengths and costs (N,) in metres of ways between its places, of those that are missions."""
+    """Return lengths and costs (N,) in metres of the ways between places that make missions."""
     planner = Planner(floor, trees_kept=1)
     starts = [segment.area.center for segment in floor.starts]
     starts = starts[:: max(len(starts) // SAMPLE, 1)]
@@ -144,7 +144,7 @@ def _ways(floor: Warehouse) -> tuple[F64, F64]:
 
 
 def _long_as(floor: Warehouse, length: F64, cost: F64) -> Warehouse:
-    """Return the floor with missions of these lengths, where the usual ones are not among them."""
+    """Return the floor with missions of these lengths, unless the usual ones are common enough."""
     if not len(length):
         return floor
     low, high = WAY_M
@@ -185,15 +185,15 @@ class OccupancyGrid:
 
     @property
     def free(self) -> Cells:
-        """(X, Y) which cells are free."""
+        """Return which cells are free, (X, Y)."""
         return np.asarray(self.occupancy == FREE, np.bool_)
 
     def within(self, places_m: F64) -> F64:
-        """Places (N, 2) of the map's frame along the grid's own axes, from its corner."""
+        """Convert places (N, 2) of the map's frame to the grid's own axes, from its corner."""
         return into_frame(places_m, self.origin)
 
     def at(self, places_m: F64) -> NDArray[np.int8]:
-        """Occupancy (N,) at places (N, 2) of the map's frame; unknown off the map."""
+        """Return the occupancy (N,) at places (N, 2) of the map's frame; unknown off the map."""
         cells, inside = self.cells_at(places_m)
         found = np.full(len(places_m), UNKNOWN, np.int8)
         found[inside] = self.occupancy[cells[inside, 0], cells[inside, 1]]
@@ -206,13 +206,13 @@ class OccupancyGrid:
         return cells, np.asarray(inside, np.bool_)
 
     def cut(self, i0: int, i1: int, j0: int, j1: int) -> OccupancyGrid:
-        """Its columns i0 to i1 and rows j0 to j1 (exclusive)."""
+        """Return its columns i0 to i1 and rows j0 to j1 (exclusive)."""
         corner = out_of_frame(np.array([[i0, j0]]) * self.cell_m, self.origin)[0]
         origin = (float(corner[0]), float(corner[1]), self.origin[2])
         return OccupancyGrid(self.occupancy[i0:i1, j0:j1], self.cell_m, origin, self.frame)
 
     def coarser(self) -> OccupancyGrid:
-        """Four cells as one: free where all are, else occupied where any is, else unknown."""
+        """Merge four cells into one: free if all are, else occupied if any is, else unknown."""
         shape = self.occupancy.shape
         padded = np.pad(self.occupancy, [(0, size % 2) for size in shape], constant_values=UNKNOWN)
         four = padded.reshape(padded.shape[0] // 2, 2, padded.shape[1] // 2, 2)
@@ -224,7 +224,7 @@ class OccupancyGrid:
 
 @dataclass(frozen=True)
 class GridFloor:
-    """A floor that a grid gave, the grid as it was used, and what was changed on the way."""
+    """A floor made from a grid, with the grid as it was used and notes on what was changed."""
 
     floor: Warehouse
     grid: OccupancyGrid
@@ -232,7 +232,7 @@ class GridFloor:
 
 
 def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Places (N, 2) of the map along the axes of a frame whose corner is at `origin`."""
+    """Convert places (N, 2) of the map to a frame whose corner and yaw are `origin`."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = (np.asarray(places_m, np.float64) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
@@ -240,7 +240,7 @@ def into_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
 
 
 def out_of_frame(places_m: F64, origin: tuple[float, float, float]) -> F64:
-    """Places (N, 2) of such a frame in the map's frame."""
+    """Convert places (N, 2) of such a frame to the map's frame."""
     x, y, yaw = origin
     cos, sin = np.cos(yaw), np.sin(yaw)
     moved: F64 = np.asarray(places_m, np.float64) @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
@@ -256,7 +256,7 @@ def floor_of_grid(
     turn_m: float = GOAL_ROOM_M,
     visited_m: F64 | None = None,
 ) -> GridFloor:
-    """Return the floor of a grid: the part that a robot was in, or the largest that it fits in.
+    """Build the floor of a grid: the part the robot was in, or the largest that it fits in.
 
     Args:
         name: of the floor.
@@ -362,7 +362,7 @@ def _no_room(grid: OccupancyGrid, room_m: float) -> str:
 def _bounded(
     grid: OccupancyGrid, where: str, visited_m: F64 | None, notes: list[str]
 ) -> OccupancyGrid:
-    """Cut to where the robot drove, or made coarser, where it is too large for a floor."""
+    """Cut a grid too large for a floor to where the robot drove, or make it coarser."""
     size = grid.occupancy.shape
     if visited_m is not None and len(visited_m) and max(size) * grid.cell_m > MAX_SIDE_M:
         cells, inside = grid.cells_at(visited_m)
@@ -399,7 +399,7 @@ def _metres(grid: OccupancyGrid) -> str:
 def _cells_in(
     grid: OccupancyGrid, visited_m: F64 | None, cell_m: float | None = None
 ) -> NDArray[np.int64] | None:
-    """Return the cells (N, 2) of this size in which the robot was, which may be off the grid."""
+    """Return the cells (N, 2) of this size that the robot was in; they may be off the grid."""
     if visited_m is None:
         return None
     return np.floor(grid.within(visited_m) / (cell_m or grid.cell_m)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""ROS occupancy maps, `map.yaml` and its image, as floors of the twin; and floors as such maps.
+"""ROS occupancy maps, `map.yaml` and its image: reads them as floors, and writes floors so.
 
 As `nav2_map_server` reads them (https://docs.nav2.org, map_io.cpp): with `p` a pixel's darkness in
 [0, 1], turned around by `negate`,
@@ -44,7 +44,7 @@ _FORMATS = ("PPM", "PNG", "BMP")  # PPM: Pillow's name for PGM and its kin
 
 
 class MapDescription(Checked, frozen=True, forbid_unknown_fields=False):
-    """What a `map.yaml` says. Keys that are not here are of other tools, and left alone."""
+    """The keys of a `map.yaml`. Other tools' keys are ignored."""
 
     image: str
     resolution: Annotated[float, Meta(ge=0.001, le=1)]  # metres a cell
@@ -121,7 +121,7 @@ def _read_yaml(path: Path) -> MapDescription:
 
 
 def occupancy_of(pixels: F64, description: MapDescription) -> NDArray[np.int8]:
-    """Occupancy (X, Y) in percent, -1 unknown, of pixels (H, W) in [0, 1], north first."""
+    """Convert pixels (H, W) in [0, 1], north first, to occupancy (X, Y) in percent, -1 unknown."""
     if description.mode == "raw":
         percent = np.round(pixels * 255)
         occupancy = np.where(percent <= 100, percent, UNKNOWN)
@@ -163,7 +163,7 @@ def write_map(floor: Warehouse, path: Path, cell_m: float = 0.05) -> None:
 
 
 def read_image(path: Path) -> tuple[F64, NDArray[np.bool_]]:
-    """Shades (H, W) in [0, 1], the first row on top, and which pixels are opaque (H, W).
+    """Read shades (H, W) in [0, 1], top row first, and which pixels are opaque (H, W).
 
     Raises:
         ConfigError: no such file, one that is not a PGM, PNG or BMP, or is cut short or too large.

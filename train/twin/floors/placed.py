@@ -1,4 +1,4 @@
-"""Whether a drive is in a floor's frame: its poses lie on free ground, what its lidar saw on walls.
+"""Checks that a drive is in a floor's frame: poses on free ground, lidar returns on walls.
 
 Odometry begins anew with each start of a robot, and so may a map that is made on the way:
 recordings may each have a frame of their own. On open ground poses of another frame lie as well as
@@ -31,14 +31,14 @@ MIN_RETURNS = 50  # fewer say nothing
 
 @dataclass(frozen=True)
 class Drive:
-    """Where a robot was, and where its lidar's nearest returns were, in the frame of its log."""
+    """The places of a robot and of its lidar's nearest returns, in the frame of its log."""
 
     places_m: F64  # (N, 2)
     returns_m: F64  # (M, 2); none without a lidar
 
 
 def on_free_ground(floor: Warehouse, places_m: F64) -> Bools:
-    """Which places (N, 2), in a floor's own frame, lie on it and in none of its racks, (N,)."""
+    """Return which places (N, 2), in the floor's own frame, are on it and in no rack, (N,)."""
     x, y = places_m.T
     free: Bools = (x >= 0) & (x <= floor.width_m) & (y >= 0) & (y <= floor.depth_m)
     for rack in floor.racks:
@@ -47,7 +47,7 @@ def on_free_ground(floor: Warehouse, places_m: F64) -> Bools:
 
 
 def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
-    """How far places (N, 2), in a floor's own frame, are from its nearest rack or edge, (N,)."""
+    """Return the distance (N,) of places (N, 2), in the floor's frame, to a rack or edge."""
     x, y = places_m.T
     away = np.abs(np.stack([x, floor.width_m - x, y, floor.depth_m - y])).min(axis=0)
     for rack in floor.racks:
@@ -58,7 +58,7 @@ def from_walls_m(floor: Warehouse, places_m: F64) -> F64:
 
 
 def placed_on(floor: Warehouse, drive: Drive) -> bool:
-    """Whether a drive in the frame of its log is one on this floor."""
+    """Return whether a drive, in the frame of its log, was on this floor."""
     if not len(drive.places_m):
         return False
     places, returns = (
@@ -89,7 +89,7 @@ _ROWS = (
 def logged_drives(
     connection: duckdb.DuckDBPyConnection, task: Task | None, recordings: Sequence[str]
 ) -> dict[str, Drive]:
-    """Of each of these recordings, by its id, from rows of this task; None: poses alone."""
+    """Read the drives of these recordings, by id; only their poses if `task` is None."""
     counts = connection.execute(_COUNTS, [list(recordings)]).fetchall()
     lidar = task is not None and task.lidar
     query = _ROWS.format(", observation" if lidar else "")  # large: only where it is looked at

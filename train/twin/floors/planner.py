@@ -35,7 +35,7 @@ CLOSURE_STEP_M = 0.3
 
 @dataclass
 class Planner:
-    """Plans for one warehouse. Shared by all environments; holds only a cache."""
+    """A planner for one warehouse. Shared by all environments; its only state is a cache."""
 
     warehouse: Warehouse
     trees_kept: int = _TREES_KEPT
@@ -131,7 +131,7 @@ class Planner:
         return graph if np.isfinite(distance[cell]) else self._unruled._build_graph(clearance)
 
     def _read_off(self, start: int, before: NDArray[np.int32], goal: tuple[float, float]) -> F64:
-        """From a cell along the tree to the goal, smoothed and resampled."""
+        """Follow the tree from a cell to the goal; return the way smoothed and resampled."""
         cells = [start]
         while before[cells[-1]] >= 0:
             cells.append(int(before[cells[-1]]))
@@ -140,11 +140,11 @@ class Planner:
         return smooth_plan(way)
 
     def distance_m(self, x_m: float, y_m: float, goal: tuple[float, float]) -> float:
-        """Cost-weighted length of the way to the goal on the known map; inf where there is none."""
+        """Return the cost-weighted length of the way to the goal on the known map; inf if none."""
         return float(self._tree(self.cell(*goal), ())[0][self.cell(x_m, y_m)])
 
     def parts(self) -> Ints:
-        """Which connected part each cell (size,) is in: by the rules, there and back."""
+        """Return the connected part (size,) of each cell: by the rules, there and back."""
         return np.asarray(csgraph.connected_components(self._graph, connection="strong")[1])
 
     def cell(self, x_m: float, y_m: float) -> int:
@@ -154,7 +154,7 @@ class Planner:
         return i * self.shape[1] + j
 
     def _nearest(self, cell: int, distance: F64) -> int:
-        """Return the reachable cell nearest to one that is not, such as one too near to a rack."""
+        """Return the reachable cell nearest to an unreachable one, such as one close to a rack."""
         i, j = divmod(cell, self.shape[1])
         low_i, low_j = max(i - 8, 0), max(j - 8, 0)
         window = distance.reshape(self.shape)[low_i : i + 9, low_j : j + 9]
@@ -194,7 +194,7 @@ class Planner:
         return (across, along) if turned else (along, across)
 
     def _build_graph(self, clearance_m: F64) -> sparse.csr_matrix:
-        """Cells joined to their eight neighbours, at length times the cost of both ends.
+        """Connect cells to their eight neighbours, at length times the cost of both ends.
 
         Edges run against the robot's way: trees grow from the goal.
         """
@@ -223,7 +223,7 @@ class Planner:
         return sparse.csr_matrix((value, (row, column)), shape=(free.size, free.size))
 
     def _against_rules(self) -> list[tuple[tuple[int, int], Bools]]:
-        """Each one-way rule: its heading, and the cells (size,) that it holds in."""
+        """Return each one-way rule's heading, and the cells (size,) that it holds in."""
         x, y = _cell_middles(self.shape)
         rules = []
         for rule in self.warehouse.one_way:
@@ -239,7 +239,7 @@ def _allowed(
     one: Ints,
     other: Ints,
 ) -> Bools:
-    """Which edges between cells a robot may take by `step`: none against a rule."""
+    """Return which edges between cells a robot may take by `step`: not against a one-way rule."""
     allowed = np.ones(len(one), np.bool_)
     for heading, inside in rules:
         if heading[0] * step[0] + heading[1] * step[1] < 0:
@@ -248,14 +248,14 @@ def _allowed(
 
 
 def planners(floors: Sequence[Warehouse]) -> list[Planner]:
-    """Return a planner a floor; together their caches stay within some 500 MB."""
+    """Return a planner per floor; together their caches stay within some 500 MB."""
     cells = max(round(f.width_m / CELL_M) * round(f.depth_m / CELL_M) for f in floors)
     kept = _TREES_KEPT_BYTES // (12 * max(cells, 1) * len(floors))
     return [Planner(floor, min(max(kept, 16), _TREES_KEPT)) for floor in floors]
 
 
 def _rack_clearance(warehouse: Warehouse, shape: tuple[int, int]) -> F64:
-    """From every cell's middle to the nearest rack or wall, in metres."""
+    """Return the distance in metres from every cell's centre to the nearest rack or wall."""
     x, y = _cell_middles(shape)
     clearance = np.minimum(
         np.minimum(x, warehouse.width_m - x), np.minimum(y, warehouse.depth_m - y)
@@ -275,7 +275,7 @@ def _cell_middles(shape: tuple[int, int]) -> tuple[F64, F64]:
 def box_distance(
     x_m: F64, y_m: F64, center: tuple[float, float], half: tuple[float, float], yaw_rad: float
 ) -> F64:
-    """From points to a box, in metres; 0 inside."""
+    """Return the distance in metres from points to a box; 0 inside."""
     dx, dy = x_m - center[0], y_m - center[1]
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     outside_x = np.maximum(np.abs(cos * dx + sin * dy) - half[0], 0.0)
@@ -285,12 +285,12 @@ def box_distance(
 
 
 def smooth_plan(way: NDArray[Any]) -> F64:
-    """Return a plan (PLAN_POINTS, 2) along the cells' middles (C, 2) of a way."""
+    """Return a plan (PLAN_POINTS, 2) along the centres (C, 2) of the cells of a way."""
     return _resample(_smooth(way))
 
 
 def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
-    """Return a moving average over the cells of a way, which takes off the grid's corners."""
+    """Average a way's cells over a moving window, which rounds the grid's corners."""
     if len(way) < 3:
         return way
     padded = np.concatenate(
@@ -304,7 +304,7 @@ def _smooth(way: NDArray[Any], half_window: int = 4) -> F64:
 
 
 def _resample(way: F64) -> F64:
-    """PLAN_POINTS points at equal distances along a polyline."""
+    """Return PLAN_POINTS points at equal distances along a polyline."""
     length = np.hypot(*np.diff(way, axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(length)])
     at = np.linspace(0.0, arc[-1], PLAN_POINTS)

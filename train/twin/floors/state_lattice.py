@@ -1,4 +1,4 @@
-"""The time to a goal from every pose near obstacles, and the plan that takes it: a state lattice.
+"""A state lattice: the time to a goal from every pose near obstacles, and the fastest plan.
 
 A plan on the map is a way for a point. Whether the robot's outline comes through a gap, and how it
 must stand before it, a search over places and headings says (state lattices: Pivtoraiko and Kelly,
@@ -36,7 +36,7 @@ ENTER_RAD = 0.6  # the turn that coming in costs: outside, where a cell has no h
 
 @dataclass(frozen=True)
 class Motion:
-    """What a lattice must know of a robot that turns on the spot: its outline and speeds."""
+    """The outline and speeds of a robot that turns on the spot, as a lattice needs them."""
 
     outline_m: F64  # (K, 2) points on its outline, x ahead of the pose
     ahead_mps: float
@@ -45,7 +45,7 @@ class Motion:
 
 
 def rectangle(length_m: float, width_m: float, axle_x_m: float = 0.0, points: int = 5) -> F64:
-    """Points on a rectangle's outline, (4 * points - 4, 2), about an axle ahead of its middle."""
+    """Return points on a rectangle's outline, (4 * points - 4, 2), about an axle off its centre."""
     side = np.linspace(-1.0, 1.0, points)[:-1]
     one = np.ones_like(side)
     corners = np.concatenate(
@@ -67,7 +67,7 @@ class Window:
 
     @classmethod
     def around(cls, places_m: F64, reach_m: float, floor: tuple[int, int]) -> Window:
-        """All within `reach_m` of places (K, 2), along both axes, that is on the floor."""
+        """Return the window of the floor within `reach_m` of places (K, 2), along both axes."""
         low = np.floor((places_m.min(axis=0) - reach_m) / CELL_M).astype(np.int64)
         high = np.ceil((places_m.max(axis=0) + reach_m) / CELL_M).astype(np.int64)
         return cls(np.maximum(low, 0), np.minimum(high, floor), floor)
@@ -79,13 +79,13 @@ class Window:
 
     @property
     def cells(self) -> Ints:
-        """The floor's indices (nx, ny) of its cells."""
+        """Return the floor's indices (nx, ny) of the window's cells."""
         x, y = (np.arange(self.low[axis], self.high[axis]) for axis in range(2))
         return np.asarray(x[:, None] * self.floor[1] + y)
 
     @property
     def border(self) -> Bools:
-        """Its cells (nx, ny) along those sides that are not the floor's."""
+        """Return the cells (nx, ny) along those sides that are not the floor's."""
         border = np.ones(self.shape, np.bool_)
         first = np.where(self.low > 0, BORDER_CELLS, 0)
         last = self.shape - np.where(self.high < self.floor, BORDER_CELLS, 0)
@@ -93,7 +93,7 @@ class Window:
         return border
 
     def covers(self, x_m: float, y_m: float) -> bool:
-        """Whether a place lies within it, off its border."""
+        """Return whether a place is in the window and off its border."""
         margin = (BORDER_CELLS + 1) * CELL_M
         place = np.array([x_m, y_m])
         inside = (self.low == 0) | (place > self.low * CELL_M + margin)
@@ -103,7 +103,7 @@ class Window:
 
 @dataclass(frozen=True)
 class StateLattice:
-    """Time to the goal from every pose of a window, and plans there from anywhere."""
+    """The time to the goal from every pose of a window, and plans there from anywhere."""
 
     window: Window
     times_s: F64  # (nx, ny, 17) at the middles of cells; the last heading is the first again
@@ -111,7 +111,7 @@ class StateLattice:
     _before: Ints  # (cells + states + 1,) the next node on the way; below 0: none
 
     def time_s(self, poses: F64) -> F64:
-        """Time (...) from poses (..., 3): x, y, heading; between states it is interpolated."""
+        """Return times (...) from poses (..., 3): x, y, heading, interpolated between states."""
         corner, share = [], []
         for value, count in zip(self._place(poses), self.times_s.shape, strict=True):
             value = np.clip(value, 0.0, count - 1.001)
@@ -127,7 +127,7 @@ class StateLattice:
         return total
 
     def plan(self, x_m: float, y_m: float, yaw_rad: float) -> F64 | None:
-        """Return the plan (PLAN_POINTS, 2) from a pose; None where no way leads to the goal."""
+        """Return the plan (PLAN_POINTS, 2) from a pose; None if no way leads to the goal."""
         node = self._nearest(x_m, y_m, yaw_rad)
         if node < 0:
             return None
@@ -140,7 +140,7 @@ class StateLattice:
         return smooth_plan(places[np.append(moved, True)])
 
     def _nearest(self, x_m: float, y_m: float, yaw_rad: float) -> int:
-        """Return the node nearest to a pose from which there is a way, within .6 m; -1: none."""
+        """Return the nearest node within .6 m of a pose from which there is a way, or -1."""
         inside = self.window.covers(x_m, y_m)
         pose = np.array([x_m, y_m, yaw_rad])
         x, y, turned = (float(value) for value in self._place(pose))
@@ -161,7 +161,7 @@ class StateLattice:
         return int(nodes[gap.argmin()]) if np.isfinite(gap).any() else -1
 
     def _place(self, poses: F64) -> list[F64]:
-        """Poses (..., 3) in cells and headings of the window."""
+        """Convert poses (..., 3) to cells and headings of the window."""
         turned = np.interp(poses[..., 2] % (2 * np.pi), _ROUND_RAD, np.arange(len(_ROUND_RAD)))
         return [*(poses[..., a] / CELL_M - 0.5 - self.window.low[a] for a in range(2)), turned]
 
@@ -186,7 +186,7 @@ def lattice_around(
     motion: Motion,
     window: Window,
 ) -> StateLattice:
-    """Return a lattice over a window of a floor with boxes (K, 2) of half sizes (K, 2) on it.
+    """Build a lattice over a window of a floor with boxes (K, 2), half sizes (K, 2), on it.
 
     `graph` joins the floor's cells past the boxes, in metres, against the robot's way
     (`Planner.graph_around`): outside the window it goes on with that.
@@ -215,7 +215,7 @@ Edges = tuple[Ints, Ints, F64]  # from and to in the robot's way, and the second
 
 
 def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
-    """Between cells of the floor, but within the window."""
+    """Return the edges between the floor's cells, except those within the window."""
     within = np.zeros(graph.shape[0], np.bool_)
     within[window.cells[~window.border]] = True
     way = graph.tocoo()
@@ -224,7 +224,7 @@ def _outside(graph: sparse.csr_matrix, window: Window, motion: Motion) -> Edges:
 
 
 def _across(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
-    """Between states and cells along the window's border."""
+    """Return the edges between states and cells along the window's border."""
     enter_s = ENTER_RAD / motion.turn_radps
     at = np.flatnonzero(window.border[..., None] & free)
     cell = window.cells.ravel()[at // free.shape[2]]
@@ -235,7 +235,7 @@ def _across(free: Bools, window: Window, motion: Motion, cells: int) -> Edges:
 def _arrivals(
     free: Bools, window: Window, goal: tuple[float, float], goal_radius_m: float
 ) -> Edges:
-    """From states and cells at the goal to the root, the last node."""
+    """Return the edges from states and cells at the goal to the root, which is the last node."""
     nx, ny = window.floor
     x, y = (CELL_M * (np.arange(window.low[a], window.high[a]) + 0.5) for a in range(2))
     near = np.hypot(x[:, None] - goal[0], y - goal[1]) < max(goal_radius_m - CELL_M, CELL_M)
@@ -246,7 +246,7 @@ def _arrivals(
 
 
 def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
-    """Between the states of the window, whose nodes follow those of the cells."""
+    """Return the edges between the window's states, whose nodes follow those of the cells."""
     nx, ny, headings = free.shape
     index = np.arange(free.size).reshape(free.shape)
     edges: list[Edges] = []
@@ -277,7 +277,7 @@ def _inside(free: Bools, cost: F64, motion: Motion, cells: int) -> Edges:
 
 
 def _room(floor: Warehouse, boxes: F64, half_m: F64, window: Window, outline_m: F64) -> F64:
-    """Clearance (nx, ny, 16) of the outline at every state of the window."""
+    """Return the clearance (nx, ny, 16) of the outline at every state of the window."""
     pad = float(np.hypot(*outline_m.T).max()) + _FIELD_M
     x, y = (
         np.arange((window.low[a] + 0.5) * CELL_M - pad, window.high[a] * CELL_M + pad, _FIELD_M)
@@ -311,7 +311,7 @@ def _filled(times: F64) -> F64:
 
 
 def floor_gap(floor: Warehouse, x: F64, y: F64) -> F64:
-    """From points to the nearest rack or wall; negative inside."""
+    """Return the distance from points to the nearest rack or wall; negative inside."""
     room = _wall_gap(floor, x, y)
     for rack in floor.racks:
         room = np.minimum(room, box_gap(x, y, rack.center, rack.half_size))
@@ -323,7 +323,7 @@ def _wall_gap(floor: Warehouse, x: F64, y: F64) -> F64:
 
 
 def near_floor_gap(floor: Warehouse, x: F64, y: F64, within_m: float) -> F64:
-    """`floor_gap` of the points (n, …) of n robots, exact where it is below `within_m`.
+    """Return `floor_gap` of points (n, …) of n robots, exact if it is below `within_m`.
 
     Racks farther from all points of a robot are left out: a floor made of scans has hundreds.
     """
@@ -347,7 +347,7 @@ def box_gap(
     center: tuple[float | F64, float | F64],
     half: tuple[float | F64, float | F64],
 ) -> F64:
-    """From points to an axis-aligned box; negative inside."""
+    """Return the distance from points to an axis-aligned box; negative inside."""
     dx, dy = np.abs(x - center[0]) - half[0], np.abs(y - center[1]) - half[1]
     outside = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0))
     gap: F64 = outside + np.minimum(np.maximum(dx, dy), 0)

@@ -1,1 +1,1 @@
-"""The kinds of missions that the twin stages and scores: a file each."""
+"""The kinds of missions that the twin stages and scores, a file each."""

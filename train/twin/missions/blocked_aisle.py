@@ -1,4 +1,4 @@
-"""Pallets across an aisle on the way, partly (a gap of .8 to 1 m) or wholly."""
+"""Pallets across an aisle on the route, partly (a gap of .8 to 1 m) or wholly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged |
 def _draw_block(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, *, full: bool
 ) -> F64 | None:
-    """Pallets across an aisle that the plan runs through; None where placed is no room for it."""
+    """Place pallets across an aisle on the route; None if there is no room."""
     if not warehouse.segments:
         return None
     spacing = length_m(plan) / (len(plan) - 1)

@@ -1,4 +1,4 @@
-"""What a kind of mission says of itself. Each kind is a module here with a `MISSION`.
+"""The interface of a kind of mission. Each kind is a module here with a `MISSION`.
 
 The registry finds the modules; nothing else lists them.
 """
@@ -16,7 +16,7 @@ from restock.train.twin.floors.layout import AGENTS, NO_PATCH, PATCHES, Walk, Wa
 
 @dataclass(frozen=True)
 class Staged:
-    """What stands, lies and walks in the way of an episode."""
+    """The obstacles, patches and traffic staged for an episode."""
 
     block: str = "none"
     pallets: F64 = field(default_factory=no_pallets)  # (PALLETS, 3): x, y, yaw
@@ -26,7 +26,7 @@ class Staged:
 
 @dataclass(frozen=True)
 class Situation:
-    """What physically was so over a step of N environments, each (N,)."""
+    """The physical truth over a step of N environments, each (N,)."""
 
     plan_blocked: Bools  # at t: pallets lay on the plan just ahead
     near: Bools  # at t + 1: nearer than the task's `tight_clearance_m`, or the bumper was pressed

@@ -1,4 +1,4 @@
-"""People and forklifts who cross the way or come toward the robot."""
+"""People and forklifts who cross the route or come toward the robot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged |
 def draw_walks(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64
 ) -> tuple[Walk | None, ...] | None:
-    """One or two people and perhaps a forklift on the robot's way; None where none fits."""
+    """Draw one or two people and perhaps a forklift on the robot's route; None if none fits."""
     walks: list[Walk | None] = [None] * AGENTS
     crossings = _crossings_on(plan, warehouse)
     for slot in range(1 + int(rng.random() < 0.35)):
@@ -37,7 +37,7 @@ def draw_walks(
 
 
 def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
-    """Points of the plan inside a crossing, at least 1.5 m from its ends."""
+    """Return points of the plan inside a crossing, at least 1.5 m from its ends."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     margin = int(1.5 / max(spacing, 1e-6)) + 1
     return [
@@ -50,7 +50,7 @@ def _crossings_on(plan: F64, warehouse: Warehouse) -> list[int]:
 def _crossing(
     rng: np.random.Generator, warehouse: Warehouse, plan: F64, index: int, half_width_m: float
 ) -> Walk | None:
-    """Straight across the plan at one of its points, as far as the racks allow."""
+    """Draw a walk straight across the plan at one of its points, as far as the racks allow."""
     place = plan[index]
     along = plan[min(index + 2, len(plan) - 1)] - plan[max(index - 2, 0)]
     across = np.array([0.0, 1.0]) if abs(along[0]) > abs(along[1]) else np.array([1.0, 0.0])
@@ -74,7 +74,7 @@ def _crossing(
 
 
 def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
-    """Along the robot's plan, the other way, some way to one side of it."""
+    """Draw a walk along the robot's plan, the other way, some distance to one side of it."""
     spacing = float(np.hypot(*(plan[1] - plan[0])))
     length = spacing * (len(plan) - 1)
     meet_m = rng.uniform(0.4, 0.7) * length
@@ -96,7 +96,7 @@ def _oncoming(rng: np.random.Generator, plan: F64) -> Walk:
 
 
 def _free_m(warehouse: Warehouse, place: F64, direction: F64, half_width_m: float) -> float:
-    """How far one can go from a place in a direction before a rack or wall is too near."""
+    """Return how far one can go from a place in a direction before a rack or wall is too near."""
     for step in range(1, 60):
         x, y = place + direction * (0.1 * step)
         on_floor = (

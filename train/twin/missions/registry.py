@@ -1,4 +1,4 @@
-"""All kinds of missions, found as the modules beside this one."""
+"""The registry of mission kinds, found as the modules beside this one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slippery patches on the way, where the robot starts, turns or stops."""
+"""Slippery patches on the route, where the robot starts, turns or stops."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def stage(rng: np.random.Generator, warehouse: Warehouse, plan: F64) -> Staged:
 
 
 def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
-    """Oily floor before and in the sharpest turn, and mostly where the robot starts or stops.
+    """Draw oily floor before and in the sharpest turn, and mostly also at the start or stop.
 
     Some patches lie under the wheels of one side only, which turns a robot that pulls or brakes.
     """
@@ -42,7 +42,7 @@ def _draw_patches(rng: np.random.Generator, plan: F64) -> F64:
 
 
 def _sharpest_turn(plan: F64) -> float:
-    """How far along the plan it bends most over .6 m."""
+    """Return how far along the plan it bends most over .6 m."""
     step = np.diff(plan, axis=0)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     spacing = length_m(plan) / (len(plan) - 1)
