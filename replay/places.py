@@ -36,8 +36,9 @@ def open_place(
     version: Version | None = None,
     opened: Callable[[Store], None] = lambda store: None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """A connection with the views of a store, a run or a panel: for `query` or `install_named`,
-    which make those views of a store that a text names.
+    """Yield a connection with the views of a store, a run or a panel.
+
+    Query it with `query` or `install_named`, which make the store's views that a text names.
 
     Args:
         path: the place: a folder, or `s3://bucket/prefix` for a store.
@@ -128,7 +129,7 @@ def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> Non
 
 
 def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str | None:
-    """Views of a run or a panel in a schema; returns which it is, None where it is neither."""
+    """Create the views of a run or a panel; return which it is, or None if it is neither."""
     from restock.replay.panel.panel import EVALUATION_SPLIT, HEADER, META, Panel
 
     if (path / HEADER).is_file():
@@ -162,14 +163,14 @@ def _add(connection: duckdb.DuckDBPyConnection, path: Path, schema: str) -> str 
 
 
 def _add_table(connection: duckdb.DuckDBPyConnection, schema: str, view: str, file: Path) -> None:
-    """A view of a panel's table; one from before there were tags knows no robot and no site."""
+    """Create a view of a panel's table; robot and site are null in panels older than tags."""
     has = pq.read_schema(file).names
     absent = [name for name in ("robot", "site") if name not in has]
     read_parquet(connection, view, [file], schema=schema, absent=absent)
 
 
 def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: str) -> None:
-    """The view `replay_audit` of a run, with the names of its actions."""
+    """Create the view `replay_audit` of a run, with the names of its actions."""
     names = read_json(run / RUN_CONFIG, error=RunError).get("actions", [])
     table = {
         "action": pa.array(range(len(names)), pa.int16()),
@@ -181,7 +182,7 @@ def _add_replay_audit(connection: duckdb.DuckDBPyConnection, run: Path, schema: 
 
 
 def _add_returns(connection: duckdb.DuckDBPyConnection, file: Path, schema: str) -> None:
-    """The views `driven_episodes` and `returns`, where evaluations have discounted returns."""
+    """Create the views `driven_episodes` and `returns` if evaluations have discounted returns."""
     if "discounted_return" not in pq.read_schema(file).names:
         return
     connection.execute(definitions(names=("return_order.sql",)))
@@ -196,7 +197,7 @@ def _keep(connection: duckdb.DuckDBPyConnection, schema: str, name: str, table: 
 
 
 def _list_columns(connection: duckdb.DuckDBPyConnection) -> None:
-    """The view `columns` of a run or panel: names, types, and meanings where a run has them."""
+    """Create the view `columns` of a run or panel: names, types, and meanings if a run has them."""
     connection.execute(
         'CREATE VIEW columns AS SELECT table_name AS "view", column_name,'
         ' data_type AS "type", comment AS meaning FROM duckdb_columns() WHERE NOT internal'

@@ -115,8 +115,10 @@ def chosen_cameras(store: Store, named: Sequence[str] | None) -> list[str]:
 def pictures(
     store: Store | None, trajectory: Trajectory, features: Sequence[ImageFeature]
 ) -> Iterator[tuple[ImageFeature, list[dict[str, Any]], NDArray[np.uint8]]]:
-    """Of each camera the pictures (T) of a trajectory, as LeRobot's columns have them, and some of
-    them for statistics, thinned: (N, h, w, 3).
+    """Yield each camera's pictures of a trajectory, one per step (T).
+
+    For each camera: the feature, the encoded pictures as rows of a LeRobot column, and a few
+    thinned ones for statistics, (N, h, w, 3).
 
     Raises:
         StoreError: as `ImageFeature.picture`, or a damaged frame.

@@ -247,7 +247,7 @@ def _json(stats: Stats) -> dict[str, Any]:
 
 
 def _write_tasks(path: Path) -> None:
-    """A pandas frame whose index is the task's text, as LeRobot reads it."""
+    """Write the task table as a pandas frame indexed by the task's text, as LeRobot reads it."""
     index = {"name": "task", "field_name": "task", "pandas_type": "unicode"}
     about = {
         "index_columns": ["task"],

@@ -232,7 +232,7 @@ def _with_frames(
     camera: str,
     where: str,
 ) -> tuple[str, int]:
-    """The query for those of its rows at which a camera has a frame, and how many have none."""
+    """Return the query for rows with a frame of this camera, and the number of rows without."""
     if "transition_id" not in columns:
         raise QueryError(
             "the query gives no transition_id, by which frames are found",

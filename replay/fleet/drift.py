@@ -46,7 +46,7 @@ class Drift:
         return sum(row["p"] is not None for row in self.own)
 
     def without_findings(self) -> str:
-        """What it means that no change was found: how much was tested, or what a test needs."""
+        """Explain why no change was found: how much was tested, or what a test would need."""
         short = len(self.own) - self.tested
         if self.tested:
             undecided = sum(row["verdict"] == "undecided" for row in self.own)

@@ -19,7 +19,7 @@ SHARES = ("natural_share", "wanted_share", "share", "effective_share")
 
 
 def diff_panels(first: Panel, second: Panel) -> dict[str, Any]:
-    """What is different in `second`, as plain values: what `restock coverage diff --json` prints.
+    """Return how `second` differs, as plain values: the JSON of `restock coverage diff`.
 
     Raises:
         PanelError: their rows are of different tasks.

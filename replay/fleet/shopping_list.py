@@ -173,7 +173,9 @@ def _least(
     share: float,
     unit: Unit,
 ) -> dict[Supply, float]:
-    """The least amounts that fill every gap that can be, where each alone is enough with `share`.
+    """Compute the smallest amounts that fill all gaps that can be filled.
+
+    An amount is enough for a gap if it fills that gap in a share `share` of the replicates.
 
     A mission counts for a gap by what it takes of it alone: missing / the amount that is enough.
     """

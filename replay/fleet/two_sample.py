@@ -1,4 +1,4 @@
-"""Two samples of episodes: how far apart are they, and could that be chance?
+"""Test whether two samples of episodes differ, by how much, and if that could be chance.
 
 The unit is the episode: rows of one are alike, and as rows they would make every trifle certain.
 """

@@ -89,7 +89,7 @@ class Yields:
 
 
 def read_yields(connection: duckdb.DuckDBPyConnection, kinds: Sequence[str]) -> Yields:
-    """The episodes of the connection's `transitions`; `kinds` of missions that could be driven."""
+    """Read the yield of each episode in `transitions`; `kinds` are the missions one could drive."""
     script = files("restock.replay.fleet").joinpath("episode_yields.sql")
     for statement in duckdb.extract_statements(script.read_text(encoding="utf-8")):
         given = {"kinds": list(kinds), "min_steps": MIN_STEPS}

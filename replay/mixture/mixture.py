@@ -365,7 +365,7 @@ def nanoseconds(moment: datetime) -> int:
 
 
 def mixture_schema() -> str:
-    """The schema as the structs say it, with the comments beside their fields as descriptions.
+    """Return the JSON schema of the mixture structs; comments beside fields are descriptions.
 
     `python -m restock.replay.mixture.mixture` writes the file that is shipped.
     """

@@ -55,7 +55,9 @@ class Resolved(Protocol):
 def represented_shares(
     mixture: Mixture, strata: Sequence[Resolved], sources: Sequence[Source]
 ) -> list[F64 | None]:
-    """The natural share of each stratum (S,) that each source stands for; None: of its own rows.
+    """Return the natural share of each stratum (S,) that each source represents.
+
+    It is None if a source represents just its own rows.
 
     Raises:
         MixtureError: rates that are of no stratum or leave no room for the others.
@@ -130,14 +132,14 @@ def look_for_archives(
     observed: Mapping[str, Sequence[tuple[int, int]]],
     strata: Collection[str],
 ) -> tuple[str, ...]:
-    """What to warn of: a source in which a condition is far more frequent than in the others.
+    """Return warnings for a source where a condition is far more frequent than in the others.
 
     Of several such conditions, the clearest. Only a source that does not say what it represents is
     looked at, and compared with those that do not stand for other rates than their own.
 
     Args:
         said: what each source says of itself.
-        met: condition or exposure -> of each source, the episodes that met it, and of how many.
+        observed: condition or exposure -> per source, episodes that met it, and all episodes.
         strata: names of strata: the rates of others change nothing.
 
     Raises:

@@ -170,7 +170,7 @@ class ShareController(Stateful):
         return offline, planned.online * mean[name]
 
     def parts_at(self, env_steps: float) -> dict[str, float]:
-        """The share of an online batch each source is to have, before its rows are looked at."""
+        """Return the share of an online batch that each source should get, whatever rows it has."""
         sources = self.mixture.sources
         return self._scaled({n: value_at(part, env_steps) for n, part in sources.parts.items()})
 
@@ -219,12 +219,12 @@ class ShareController(Stateful):
             source.offline, source.online = self._draws_of(source.name)
 
     def count(self, stratum: NDArray[Any]) -> None:
-        """A batch was drawn, its logged rows from these strata (n,)."""
+        """Count a drawn batch, given the strata (n,) of its logged rows."""
         self.batches += 1
         self.drawn += np.bincount(stratum, minlength=len(self.drawn))
 
     def give_up(self) -> bool:
-        """A stratum's rows were drawn as often as they may be. True where the shares changed."""
+        """Redistribute shares once a stratum's draws are used up; return if they changed."""
         return self._work_out("redistribute")
 
     def _work_out(self, shortfall: Shortfall) -> bool:
@@ -271,7 +271,7 @@ class ShareController(Stateful):
         return True
 
     def _split(self, stock: F64, limit: F64) -> tuple[F64, F64, F64]:
-        """What of a batch comes from the logs (K * S,) and the ring (S,), and is wanted (S,).
+        """Split a batch: shares from the logs (K * S,), from the ring (S,), and wanted (S,).
 
         `stock` (S,) bounds what the ring gives, `limit` (K * S,) what logged rows bear.
         """
@@ -318,7 +318,7 @@ class ShareController(Stateful):
         return wanted_shares(source.rules, have, self.env_steps)
 
     def _limits(self, *, from_start: bool = False) -> F64:
-        """The share of an online batch that the logged rows of each stratum bear, (K * S,)."""
+        """Return the largest share of an online batch that each stratum allows, (K * S,)."""
         rows = np.array([stratum.rows for stratum in self.strata], np.float64)
         if self.max_replays is None:
             return np.where(rows > 0, 1.0, 0.0)
@@ -409,7 +409,7 @@ class ShareController(Stateful):
             )
 
     def _plan(self, source: _SourceDraws, shortfall: Shortfall) -> tuple[F64, float, float]:
-        """A source's shares, and how much it can fill of its draws to come, and of online ones."""
+        """Plan a source: its shares, and how much of its remaining and online draws it can fill."""
         wanted = self._wanted(source)
         drawn = self.drawn[source.strata]
         ahead = max(self._ahead(source, float(drawn.sum())), 1.0)
@@ -444,7 +444,10 @@ class ShareController(Stateful):
         return plan.got, plan.scale, filled
 
     def _ahead(self, source: _SourceDraws, drawn: float) -> float:
-        """The draws that batches to come ask of a source: not what those before did not get."""
+        """Return how many draws of a source remain.
+
+        Only the planned draws of later batches count, not those that earlier ones missed.
+        """
         if self.fresh is not None:  # online, the ring gives what these rows do not bear
             return source.offline - drawn
         by_draws = source.offline + source.online - drawn

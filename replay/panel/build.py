@@ -157,7 +157,7 @@ def _kind(kind: str) -> str:
 
 
 def _named_conditions(connection: duckdb.DuckDBPyConnection) -> list[Condition]:
-    """The conditions and exposures that labels name: the shipped ones, or of the name alone."""
+    """Return the conditions and exposures that labels name, shipped ones with their definition."""
     found = []
     columns: dict[str, Kind] = {"conditions": "outcome", "exposures": "exposure"}
     for column in columns.keys() & set(connection.sql("FROM transitions LIMIT 0").columns):
@@ -301,8 +301,7 @@ def _address(store: str) -> str:
 
 
 def check_free(out: Path, force: bool) -> None:
-    """Raises PanelError when something is at `out` that may not be replaced, or when no panel can
-    be made there."""
+    """Raise PanelError if `out` is taken and may not be replaced, or no panel can be made there."""
     expect_place(out, PanelError)
     is_panel = (out / HEADER).is_file()
     if out.exists() and not (force and is_panel):
@@ -357,7 +356,10 @@ def _random_probability(task_json: str) -> float:
 
 
 def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
-    """What names a panel: store versions, mixture, task, rows (by `digest`), packing version."""
+    """Return a panel's id: a hash of store versions, mixture, task, rows and packing version.
+
+    `digest` stands for the rows.
+    """
     versions = [source.version, *(store.version for store in source.others)]
     named = [PACKING_VERSION, versions, plan.mixture, plan.task_hash, digest]
     return hashlib.blake2b(msgspec.json.encode(named), digest_size=8).hexdigest()

@@ -109,7 +109,10 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
             sampler.close()
 
     def _rank(self) -> tuple[int, int]:
-        """This process's rank, and how many there are; a worker that was spawned is told."""
+        """Return this process's rank and the number of ranks.
+
+        A spawned worker has them from the process that spawned it.
+        """
         if distributed.is_available() and distributed.is_initialized():
             return distributed.get_rank(), distributed.get_world_size()
         return self._sent_by

@@ -128,13 +128,16 @@ class LoggedSampler(Stateful):
         return BatchDraw(rows, strata, weight, quota)
 
     def weights_of(self, rows: Ints) -> F32 | None:
-        """The correction's weights (n,) of rows (n,) under the shares in force; None for ones."""
+        """Return the importance weights (n,) of rows (n,) under the current shares.
+
+        None means that all weights are 1.
+        """
         if isinstance(self._weights, WeightsInForce):
             return self._weights.of(rows)
         return None if self._weights is None else self._weights[rows]
 
     def gather(self, rows: Ints, out: F32) -> None:
-        """The packed rows last drawn (L,) into `out` (L, W)."""
+        """Copy the packed rows last drawn (L,) into `out` (L, W)."""
         if (
             not isinstance(self.sampler, ChunkedSampler)
             or len(rows) < self.sampler.batch_size
@@ -149,7 +152,7 @@ class LoggedSampler(Stateful):
         self.sampler.update(rows, td_abs)
 
     def _follow(self) -> None:
-        """The sampler and the weights take over the controller's shares."""
+        """Pass the controller's shares to the sampler and the weights."""
         self.sampler.set_shares(self.controller.shares)
         if isinstance(self._weights, WeightsInForce):
             self._weights.set_shares(self.controller.shares)
@@ -189,7 +192,10 @@ class LoggedSampler(Stateful):
         return rows[kept], strata[kept], None if weight is None else weight[kept]
 
     def _replacement(self, stratum: int, limit: int) -> tuple[int, int] | None:
-        """A row that may still be drawn, and its stratum: of this one, else by the shares."""
+        """Return a row that may still be drawn and its stratum; None if there is none.
+
+        The given stratum is tried first, then the others at random by their shares (offline only).
+        """
         replays, shares = self.replays, self.controller.shares
         if replays is None:
             return None
@@ -294,7 +300,10 @@ def sampler_by_shares(
     logs_share: float,
     weights: F32 | None = None,
 ) -> LoggedSampler:
-    """The same for rows (n, W) that are no panel's: fixed shares (S,), each stratum in turns."""
+    """Build a sampler over rows (n, W) that belong to no panel, with fixed shares (S,).
+
+    Each stratum is drawn without replacement.
+    """
     controller = ShareController.fixed(
         names, [len(members) for members in stratum_rows], shares, logs_share
     )

@@ -93,7 +93,7 @@ def install_function(
     table_of: Callable[[T], pa.Table],
     planned: Callable[[str, int], T],
 ) -> None:
-    """A function of the connection: names of mixtures to lists of structs, one a row.
+    """Install a SQL function that maps mixture names to lists of structs, one per row.
 
     `planned` gets a name and when its file was last written, in ns (0 of a shipped mixture).
     """

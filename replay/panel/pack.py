@@ -171,8 +171,10 @@ class Packer:
             )
 
     def write_meta(self, meta: Path, evaluation_split: Path, stop: Event) -> None:
-        """Write what stands beside the rows, and the evaluation split, in the same order; where
-        `stop` is set meanwhile, no more of it."""
+        """Write the metadata of the rows, and the evaluation split, in the same order.
+
+        Writing ends early if `stop` is set.
+        """
         held = np.flatnonzero(self.plan.evaluation_split)
         with _writer(evaluation_split) as write:
             for begin in _groups(len(held), stop):

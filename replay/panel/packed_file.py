@@ -138,15 +138,17 @@ class PackedFile:
 
 
 class _Stretches:
-    """Stretches of row numbers (m,): as a slice, which copies faster, where each is one above the
-    last."""
+    """Parts of a list of row numbers (m,), as slices if the numbers are consecutive.
+
+    Slices copy faster.
+    """
 
     def __init__(self, rows: Ints) -> None:
         self._rows = rows
         self._breaks = np.append(0, np.cumsum(np.diff(rows) != 1))  # up to each
 
     def __call__(self, begin: int, end: int, base: int = 0) -> Ints | slice:
-        """Those of [begin, end), counted from `base`."""
+        """Return the row numbers [begin, end) less `base`."""
         if self._breaks[begin] != self._breaks[end - 1]:
             return self._rows[begin:end] - base
         first = int(self._rows[begin]) - base

@@ -176,18 +176,24 @@ class Panel:
 
     @property
     def warnings(self) -> list[str]:
-        """What `restock mix` warns of: a source that may be an archive, or a split that holds out
-        far more than was asked for."""
+        """Return the warnings of `restock mix`.
+
+        It warns of a source that may be an archive, or a split that holds out far more than
+        requested.
+        """
         return self.header.warnings
 
     @property
     def meta(self) -> pa.Table:
-        """Beside each packed row (n,): transition_id, recording_id, episode_id, step_index,
-        stamp_ns, logged_ns, condition, zone, behaviour_policy, behaviour_version,
-        action_probability, action, reward (of one step), terminated, truncated, perturbation,
-        stratum, stratum_code (its place in `strata`), horizon, weight; where the mixture says so,
-        return_to_go and return_to_go_whole (it ran to a termination); and what weights under
-        shares that move need (state_code, probability_of_…)."""
+        """Return the metadata of each packed row, a table of n rows.
+
+        Columns: transition_id, recording_id, episode_id, step_index, stamp_ns, logged_ns,
+        condition, zone, behaviour_policy, behaviour_version, action_probability, action, reward (of
+        one step), terminated, truncated, perturbation, stratum, stratum_code (its index in
+        `strata`), horizon, weight. If the mixture asks for it: return_to_go and return_to_go_whole
+        (whether it ran to a termination). If shares move: what their weights need (state_code,
+        probability_of_…).
+        """
         if self._meta is None:
             self._meta = self._read(META).unify_dictionaries()
         return self._meta

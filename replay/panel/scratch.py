@@ -62,7 +62,7 @@ class SourceSteps:
         return (self.flags[begin:end] & self._bit) > 0
 
     def horizon(self, begin: int, end: int, n_step: int) -> Ints:
-        """Steps of the returns of the rows [begin, end)."""
+        """Return the number of steps in the return of each row of [begin, end)."""
         return n_step_horizon(self._continues(begin, end + n_step - 1), n_step)[: end - begin]
 
     def returns(self, begin: int, end: int, horizon: Ints, discount: float) -> F64:
@@ -73,8 +73,10 @@ class SourceSteps:
         return n_step_return(reward, padded, discount)[: end - begin]
 
     def returns_to_go(self, discount: float) -> tuple[F32, Bools]:
-        """Discounted rewards to where a row's return must end, (N,), on disk; and whether that is
-        where its episode terminated, so that nothing is missing of it, (N,)."""
+        """Compute each row's discounted return (N,), on disk, and whether it is complete (N,).
+
+        A return is complete if it runs to the termination of its episode.
+        """
         total: F32 = _on_disk(self._folder / "return_to_go", np.float32, self.rows)
         whole: Bools = _on_disk(self._folder / "whole", np.bool_, self.rows)
         after, ends_whole = 0.0, False

@@ -37,7 +37,7 @@ class FileRecord(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, path: Path) -> FileRecord:
-        """That of a file as it is."""
+        """Return the record of a file as it is now."""
         size = path.stat().st_size
         return cls(size, checksum(path, LEAF_BYTES), sample_checksum(path), LEAF_BYTES)
 

@@ -119,8 +119,7 @@ def read_candidates(
 
 
 def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
-    """What has the rows of the connection's `transitions` as they lie, or more: reading them costs
-    less without what the view makes of them."""
+    """Return the cheapest table that has the rows of `transitions`, maybe among others."""
     views = connection.sql(_VIEWS).fetchall()
     return "stored_transitions" if ("stored_transitions",) in views else "transitions"
 
@@ -154,7 +153,9 @@ def _blame(
 def without_measured_actions(
     connection: duckdb.DuckDBPyConnection, table: pa.Table
 ) -> tuple[pa.Table, int]:
-    """The rows whose actions were commanded, and how many are of odometry in place of a command.
+    """Drop rows whose action is odometry instead of a command; return the rest and their number.
+
+    The number is that of the rows dropped.
 
     Raises:
         MixtureError: none was commanded.
@@ -283,7 +284,7 @@ def one_task(table: pa.Table) -> str:
 
 
 def codes(table: pa.Table, name: str) -> Codes:
-    """Dictionary codes of a text column, (N,); -1 for null."""
+    """Return the dictionary codes of a text column, (N,); -1 for null."""
     column = table[name].combine_chunks()
     return np.asarray(column.indices.fill_null(-1).to_numpy(), np.int32)
 

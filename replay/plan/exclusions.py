@@ -257,11 +257,13 @@ class EvaluationRows:
 
 
 def split_for_evaluation(table: pa.Table, mixture: Mixture) -> EvaluationRows:
-    """The evaluation split: whole episodes, recordings, robots or sites, the latest episodes, or
-    the end of each episode, which is also what there is of a single one. Of few episodes, a whole
-    one may be all there is of a condition: where it is more than twice the share that is asked
-    for, the end of the longest is held out, and the others stay whole, with how they ended.
-    Episodes of which the mixture's `where` admits no row are in no part of it.
+    """Choose the rows held out for evaluation.
+
+    These are whole episodes, recordings, robots or sites, the latest episodes, or the end of each
+    episode. The end is also held out if there is a single episode. With few episodes, a whole one
+    may be all there is of a condition. If it is more than twice the requested share, the end of the
+    longest is held out instead, and the others stay whole, with how they ended. Episodes of which
+    the mixture's `where` admits no row are left out.
 
     Raises:
         MixtureError: the rule would take everything, there is only one group to split, a robot that
@@ -308,7 +310,9 @@ def _split(table: pa.Table, mixture: Mixture) -> EvaluationRows:
 def _ends_of_episodes(
     table: pa.Table, rule: EvaluationSplit, n_step: int, only: int | None = None
 ) -> EvaluationRows:
-    """The last `share` of each episode's time, and a gap before it that no n-step return spans.
+    """Hold out the last `share` of each episode, with a gap before it that no n-step return spans.
+
+    With `only`, hold out the end of that episode alone, about `share` of all rows.
 
     Of `only` one episode, about as much as `share` of all.
     """

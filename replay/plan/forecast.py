@@ -36,7 +36,7 @@ class Forecast:
         return self.seen > 0
 
     def quantile(self, share: float) -> float:
-        """The amount that is enough in this share of the replicates; infinite if none ever came."""
+        """Return the amount that is enough in this share of the replicates; inf without draws."""
         return float(np.quantile(self.draws, share)) if len(self.draws) else math.inf
 
 
@@ -112,7 +112,10 @@ def probability_to_close(
     rng: np.random.Generator,
     replicates: int = REPLICATES,
 ) -> float:
-    """That planned missions yield what is missing: `parts` are (yields (E,), missions) each."""
+    """Return the probability that planned missions yield what is missing.
+
+    `parts` are pairs of yields (E,) and a number of missions.
+    """
     total = np.zeros(replicates)
     for sample, missions in parts:
         found = sample[~np.isnan(sample)]
