@@ -25,7 +25,7 @@ from twin_runs import trained
 
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
-from restock.train.comparison.diagnose import Diagnosis, diagnose
+from restock.train.judge.diagnose import Diagnosis, diagnose
 from restock.train.run.run import Run
 
 STRATUM = "blocked_aisle"

@@ -40,10 +40,9 @@ from restock.ingest.steps import steps as steps_module
 from restock.ingest.steps.filling import Filling
 from restock.ingest.store.writer import StoreWriter
 from restock.ingest.task.signals import Signals
-from restock.train.diagnosis.before_training import diagnose_rows, open_rows
-from restock.train.diagnosis.causes import Finding
-from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.twin_rows import drive_twin
+from restock.train.judge.before_training import diagnose_rows, drive_twin, open_rows
+from restock.train.judge.causes import Finding
+from restock.train.judge.fed_rows import FedRows
 
 PROFILE = load_profile("warehouse_amr")
 STRATUM = "blocked_aisle"

@@ -7,11 +7,6 @@ from typing import TYPE_CHECKING
 from restock.public import lazy
 
 if TYPE_CHECKING:
-    from restock.train.comparison.compare import compare as compare
-    from restock.train.comparison.diagnose import diagnose as diagnose
-    from restock.train.diagnosis.before_training import (
-        diagnose_before_training as diagnose_before_training,
-    )
     from restock.train.dqn.algorithm import Algorithm as Algorithm
     from restock.train.dqn.algorithm import Loss as Loss
     from restock.train.dqn.algorithm import TrainingBatch as TrainingBatch
@@ -19,6 +14,11 @@ if TYPE_CHECKING:
     from restock.train.dqn.network import QNetwork as QNetwork
     from restock.train.evaluation.eval_run import evaluate as evaluate
     from restock.train.feed.teacher import Teacher as Teacher
+    from restock.train.judge.before_training import (
+        diagnose_before_training as diagnose_before_training,
+    )
+    from restock.train.judge.compare import compare as compare
+    from restock.train.judge.diagnose import diagnose as diagnose
     from restock.train.libraries.sb3_buffer import MixtureReplayBuffer as MixtureReplayBuffer
     from restock.train.libraries.sb3_buffer import dqn_critic as dqn_critic
     from restock.train.libraries.tianshou_buffer import (

@@ -24,7 +24,7 @@ from restock.errors import RunError, StoreError
 from restock.files import read_json, read_table, write_table
 from restock.ingest.profile.profile import load_profile
 from restock.ingest.store.writer import StoreWriter
-from restock.train.comparison.diagnose import diagnose
+from restock.train.judge.diagnose import diagnose
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES
 

@@ -70,18 +70,16 @@ MAY_IMPORT = {
         " twin/physics replay/panel replay/ring replay/store ingest/live"
         " ingest/profile ingest/task"
     ),
-    "train/comparison": (
-        "train diagnosis dqn evaluation run twin/physics replay/fleet replay/panel"
-    ),
-    "train/diagnosis": (
-        "evaluation/off_policy feed run twin/calibration twin/drivers twin/missions twin/env"
-        " twin/physics replay/panel replay/store ingest/profile ingest/store ingest/task"
+    "train/judge": (
+        "train dqn evaluation evaluation/off_policy feed run twin/calibration twin/drivers"
+        " twin/missions twin/env twin/physics replay/fleet replay/panel replay/store"
+        " ingest/profile ingest/store ingest/task"
     ),
     "train/libraries": (
         "train dqn evaluation feed run twin/floors twin/physics replay/mixture replay/panel"
         " replay/ring replay/sampling replay/store ingest/profile ingest/task"
     ),
-    "train/study": "comparison dqn evaluation libraries run replay/panel twin/missions",
+    "train/study": "judge dqn evaluation libraries run replay/panel twin/missions",
     "train/view": "dqn evaluation run twin/env twin/recording replay/trace ingest/decoding",
     "train/twin": "",
     "train/twin/floors": "ingest/task",
@@ -118,17 +116,17 @@ MAY_IMPORT = {
     ),
     "cli/fleet": (
         "cli report ingest/store replay replay/fleet replay/mixture replay/panel replay/store"
-        " train/comparison train/twin/missions"
+        " train/judge train/twin/missions"
     ),
     "cli/learning": (
         "cli report ingest/profile ingest/store replay/fleet replay/mixture replay/trace"
-        " train train/comparison train/diagnosis train/dqn train/evaluation train/run"
+        " train train/judge train/dqn train/evaluation train/run"
         " train/study train/twin/floors train/twin/physics train/view ingest/task"
         " replay/panel train/feed train/twin/env replay/store train/twin/calibration"
     ),
     "cli/start": (
         "cli ingest/containers ingest/decoding ingest/profile ingest/propose/evidence ingest/task"
-        " replay/mixture replay/panel replay/store replay/trace train/diagnosis train/dqn"
+        " replay/mixture replay/panel replay/store replay/trace train/judge train/dqn"
         " train/evaluation train/evaluation/off_policy train/run train/twin/calibration"
         " train/twin/floors train/twin/missions"
     ),

@@ -27,20 +27,22 @@ from restock.ingest.store.writer import StoreWriter
 from restock.replay.panel.panel import HEADER, META, Panel
 from restock.replay.panel.seal import FileRecord, seal
 from restock.stats import ConfidenceInterval
-from restock.train.comparison.diagnose import Diagnosis
-from restock.train.comparison.rows_verdict import with_rows
-from restock.train.comparison.windows import Cause
-from restock.train.diagnosis import twin_rows
-from restock.train.diagnosis.answers import GAIN, Answer
-from restock.train.diagnosis.before_training import RowDiagnosis, diagnose_rows, open_rows
-from restock.train.diagnosis.by_recording import unlike_recordings
-from restock.train.diagnosis.causes import findings
-from restock.train.diagnosis.evidence import judged
-from restock.train.diagnosis.fed_rows import FedRows
-from restock.train.diagnosis.gap_evidence import gap_evidence, untrusted
-from restock.train.diagnosis.relations import ACTION_TURN, RELATIONS
-from restock.train.diagnosis.twin_rows import drive_twin
-from restock.train.diagnosis.values import values
+from restock.train.judge import before_training
+from restock.train.judge.answers import ACTION_TURN, GAIN, RELATIONS, Answer
+from restock.train.judge.before_training import (
+    RowDiagnosis,
+    diagnose_rows,
+    drive_twin,
+    gap_evidence,
+    open_rows,
+    unlike_recordings,
+    untrusted,
+)
+from restock.train.judge.causes import findings
+from restock.train.judge.diagnose import Diagnosis, with_rows
+from restock.train.judge.fed_rows import FedRows, judged
+from restock.train.judge.row_checks import values
+from restock.train.judge.windows import Cause
 from restock.train.twin.calibration.twin_gap import (
     TrustLimits,
     TwinGap,
@@ -268,9 +270,9 @@ def test_ice_and_aimless_driving_are_no_faults(
     """On ice the robot turns later than its wheels; who drives elsewhere does not shorten the way
     to go by his speed. Both were named as faults of a sensor."""
     if logged == "ice":
-        monkeypatch.setattr(twin_rows, "KINDS", ("nominal", "wheel_slip"))
+        monkeypatch.setattr(before_training, "KINDS", ("nominal", "wheel_slip"))
     else:
-        monkeypatch.setattr(twin_rows, "Handover", lambda *_: RandomPolicy(seed=9))
+        monkeypatch.setattr(before_training, "Handover", lambda *_: RandomPolicy(seed=9))
     found = diagnose_rows(_drive(seed=9), twin)
     assert found.findings == []
     assert not any(row.off for row in found.comparisons)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from restock.train.comparison.comparability import (
+from restock.train.judge.comparability import (
     Check,
     ComparabilityLimits,
     Feed,

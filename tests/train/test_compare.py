@@ -18,10 +18,9 @@ from support.toy_run import logs as toy_logs
 
 from restock.cli import main
 from restock.errors import RunError
-from restock.train.comparison.compare import compare
-from restock.train.comparison.diagnose import diagnose
-from restock.train.comparison.run_difference import diff_runs
 from restock.train.feed.logs import Coded, Logs
+from restock.train.judge.compare import compare, diff_runs
+from restock.train.judge.diagnose import diagnose
 from restock.train.run.run import FORMAT, Run
 
 EXTRA = ("update_path",)

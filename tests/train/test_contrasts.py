@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.finished_runs import document, make_run
 
 from restock.report import write_study_page
-from restock.train.comparison.compare import compare
+from restock.train.judge.compare import compare
 from restock.train.run.kept_evaluations import add_evaluation
 from restock.train.run.run import Run
 from restock.train.run.run_tables import EVAL_EPISODES

@@ -14,13 +14,13 @@ import pytest
 
 from restock.cli import main
 from restock.errors import RunError
-from restock.train.comparison.action_coverage import action_symptoms
-from restock.train.comparison.confirm import confirm, swapped
-from restock.train.comparison.diagnose import diagnose
-from restock.train.diagnosis.before_training import RowDiagnosis
-from restock.train.diagnosis.causes import Finding
 from restock.train.dqn.config import TeacherConfig, TrainConfig, apply_overrides, parse_config
 from restock.train.dqn.target import Hard, Polyak, TargetRule
+from restock.train.judge.before_training import RowDiagnosis
+from restock.train.judge.causes import Finding
+from restock.train.judge.confirm import confirm, swapped
+from restock.train.judge.diagnose import diagnose
+from restock.train.judge.windows import action_symptoms
 from restock.train.prepare import Prepared
 from restock.train.run.run import Run
 
@@ -468,7 +468,7 @@ def test_no_run_confirms_rows_that_alone_are_at_fault(
 ) -> None:
     mirrored = Finding("ACTIONS_MIRRORED", "the logs' left is the twin's right", "swap them", ())
     rows = RowDiagnosis("BUFFER", [mirrored], [], {})
-    monkeypatch.setattr("restock.train.comparison.rows_verdict.rows_of", lambda _: (rows, ""))
+    monkeypatch.setattr("restock.train.judge.diagnose.rows_of", lambda _: (rows, ""))
     make_run(tmp_path / "r")  # its own figures are healthy, and another run's would be
     assert main(["diagnose", str(tmp_path / "r"), "--confirm", str(tmp_path / "c")]) == 2
     printed = capsys.readouterr()
@@ -537,7 +537,7 @@ def test_of_two_faults_the_experiment_answers_for_the_target(
 
         def close(self) -> None: ...
 
-    monkeypatch.setattr("restock.train.comparison.confirm.prepare_new", Trained)
-    monkeypatch.setattr("restock.train.comparison.confirm.train", lambda session: None)
+    monkeypatch.setattr("restock.train.judge.confirm.prepare_new", Trained)
+    monkeypatch.setattr("restock.train.judge.confirm.train", lambda session: None)
     answer = confirm(run, found, tmp_path / "c")
     assert (answer["cause"], answer["confirmed"]) == (cause, confirmed)

@@ -8,8 +8,8 @@ import pytest
 from support.stores import TASK
 
 from restock.replay.store.store import Store
-from restock.train.diagnosis.evidence_needed import Evidence, policy_evidence
 from restock.train.evaluation.off_policy.estimators import EssGate
+from restock.train.judge.evidence_needed import Evidence, policy_evidence
 
 PERIOD_S = TASK.control_period_s
 

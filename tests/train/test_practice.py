@@ -20,7 +20,6 @@ from restock.cli import main
 from restock.cli.learning.describe_run import unmoved
 from restock.errors import ConfigError, RunError
 from restock.replay.fleet.missions_file import MissionOrder
-from restock.train.comparison.arms import differences
 from restock.train.dqn.config import PracticeConfig, load_config, parse_config
 from restock.train.feed import practice as practice_module
 from restock.train.feed.collector import EndedEpisode
@@ -32,6 +31,7 @@ from restock.train.feed.practice import (
     unordered,
     with_floor,
 )
+from restock.train.judge.comparability import differences
 from restock.train.loop import train
 from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.run.run import Run

@@ -12,7 +12,7 @@ from support.finished_runs import document, make_run
 from restock.cli import main
 from restock.errors import RunError
 from restock.files import write_table
-from restock.train.comparison.run_difference import diff_runs
+from restock.train.judge.compare import diff_runs
 from restock.train.run.run import Run
 
 

@@ -13,9 +13,8 @@ from support.stores import recording_transitions, write_store
 
 from restock.cli import main
 from restock.errors import ConfigError, RunError
-from restock.train.comparison.arms import Difference, Treatment
-from restock.train.comparison.comparability import Check
-from restock.train.comparison.compare import Comparison
+from restock.train.judge.comparability import Check, Difference, Treatment
+from restock.train.judge.compare import Comparison
 from restock.train.study import study_run
 from restock.train.study.findings import findings
 from restock.train.study.study import StudyPlan, load_study

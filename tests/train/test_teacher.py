@@ -28,7 +28,6 @@ from restock.replay.ring.ring import FreshRing
 from restock.report.run.card import as_markdown, replay_card
 from restock.report.run.facts import Facts
 from restock.state import restored, saved
-from restock.train.comparison.arms import differences
 from restock.train.dqn.algorithm import td_target
 from restock.train.dqn.behaviour import (
     UNKNOWN,
@@ -43,6 +42,7 @@ from restock.train.dqn.fitted_q import soft_greedy
 from restock.train.dqn.learner import Learner, greedy_actions
 from restock.train.feed.imitation import Imitation, refuse_nothing_to_learn
 from restock.train.feed.teacher import TeacherFailed, open_teacher
+from restock.train.judge.comparability import differences
 from restock.train.loop import TrainingInterrupted, train
 from restock.train.prepare import prepare_new, prepare_resumed
 from restock.train.prepare import train as train_new

@@ -24,7 +24,7 @@ from restock.stats import (
     NOT_KNOWN,
     ConfidenceInterval,
 )
-from restock.train.diagnosis.evidence_needed import twin_evidence
+from restock.train.judge.evidence_needed import twin_evidence
 from restock.train.twin.calibration.gap import (
     AFTER,
     AGREES,

@@ -12,9 +12,9 @@ import pytest
 from restock.cli import main
 from restock.errors import ConfigError
 from restock.replay.fleet.missions_file import MissionOrder, MissionsFile
-from restock.train.comparison.arms import kind_of
 from restock.train.dqn.config import parse_config
 from restock.train.feed.training_twin import make_twin
+from restock.train.judge.comparability import kind_of
 from restock.train.prepare import prepare_new
 from restock.train.twin.env.episode_queue import EpisodeQueue, MissionOrders
 from restock.train.twin.env.vector_env import WarehouseVectorEnv

@@ -11,7 +11,7 @@ import numpy as np
 
 from restock.errors import RunError
 from restock.stats import paired_t
-from restock.train.comparison.compare import Comparison
+from restock.train.judge.compare import Comparison
 from restock.train.run.kept_evaluations import mission_of, planner_times, read_evaluations
 from restock.train.run.measures import cell_name
 from restock.train.study.contrasts import (

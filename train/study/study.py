@@ -14,7 +14,6 @@ from restock.errors import ConfigError, RunError
 from restock.files import read_json
 from restock.renamed import STUDY_KEYS
 from restock.toml import Checked, read_toml, typed
-from restock.train.comparison.arms import Treatment
 from restock.train.dqn.config import (
     EvaluationConfig,
     ScheduleConfig,
@@ -24,6 +23,7 @@ from restock.train.dqn.config import (
     refuse_untaught,
 )
 from restock.train.evaluation.references import wrong_seed
+from restock.train.judge.comparability import Treatment
 from restock.train.libraries.library_arm import Library
 from restock.train.study.contrasts import CELLS, RARE, unknown_measure
 from restock.train.twin.missions.registry import KINDS

@@ -22,7 +22,7 @@ from restock.errors import RestockError, RunError
 from restock.files import write_text
 from restock.interrupts import ended_with_us, interrupt_running, kill_as_interrupt
 from restock.replay.panel.build import plan_only
-from restock.train.comparison.compare import Comparison, compare
+from restock.train.judge.compare import Comparison, compare
 from restock.train.libraries.library_arm import DONE, Library, LibraryArm, check_installed, resolve
 from restock.train.study.study import (
     ArmConfig,

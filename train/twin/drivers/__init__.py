@@ -1,1 +1,1 @@
-"""The twin's drivers: planner, operator, random actions, and handover between them."""
+"""Who drives in the twin: planner, operator, random actions, and who takes over from whom."""

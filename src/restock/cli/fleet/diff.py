@@ -67,7 +67,7 @@ def _difference(first: str, second: str) -> dict[str, Any]:
 
         return diff_panels(Panel.open(first), Panel.open(second))
     if kind == "run":
-        from restock.train.comparison.run_difference import diff_runs
+        from restock.train.judge.compare import diff_runs
 
         return diff_runs(Path(first), Path(second))
     from restock.cli import output

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.comparison.comparability import Check
-    from restock.train.comparison.compare import Comparison
+    from restock.train.judge.comparability import Check
+    from restock.train.judge.compare import Comparison
 
 
 @dataclass
@@ -49,7 +49,7 @@ class CompareCommand:
     def run(self) -> int:
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.comparison.compare import compare
+        from restock.train.judge.compare import compare
 
         first, second = self.runs, self.against
         if second and not first:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from restock.train.comparison.diagnose import Diagnosis
-    from restock.train.diagnosis.before_training import RowDiagnosis
+    from restock.train.judge.before_training import RowDiagnosis
+    from restock.train.judge.diagnose import Diagnosis
 
 
 @dataclass
@@ -60,9 +60,8 @@ class DiagnoseCommand:
         from restock.cli.command_line import refuse
         from restock.cli.output import print_json, say
         from restock.errors import ConfigError, ExitCode
-        from restock.train.comparison.confirm import check_place, confirm
-        from restock.train.comparison.diagnose import diagnose
-        from restock.train.comparison.rows_verdict import rows_of, with_rows
+        from restock.train.judge.confirm import check_place, confirm
+        from restock.train.judge.diagnose import diagnose, rows_of, with_rows
         from restock.train.run.run import Run
 
         if self.before_training is not None:
@@ -112,8 +111,8 @@ class DiagnoseCommand:
         from restock.cli.output import print_json
         from restock.errors import ConfigError, ExitCode
         from restock.ingest.profile.profile import load_profile
-        from restock.train.diagnosis.before_training import diagnose_before_training
         from restock.train.evaluation.references import wrong_seed
+        from restock.train.judge.before_training import diagnose_before_training
         from restock.train.twin.physics.perturbation import load_perturbation
 
         if self.runs or self.confirm is not None:
@@ -177,14 +176,14 @@ def _show(diagnosis: Diagnosis, paths: tuple[Path, ...]) -> None:
 
 def _show_rows(diagnosis: RowDiagnosis) -> None:
     from restock.cli.output import print_parted, stdout
-    from restock.train.diagnosis.gap_evidence import CHECK
+    from restock.train.judge.before_training import GAP_CHECK
 
     named = {check for one in diagnosis.findings for check in one.evidence}
     chosen = [
         row
         for row in diagnosis.comparisons
         if row.check in named
-        or (row.status in ("off", "undecided") and not row.check.startswith(CHECK))
+        or (row.status in ("off", "undecided") and not row.check.startswith(GAP_CHECK))
     ]
     if chosen:
         print_parted(

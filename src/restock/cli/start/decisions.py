@@ -240,8 +240,8 @@ def evidence_lines(to: Settings) -> list[str]:
     """Say what must be logged before the twin and a policy can be judged by the logs."""
     from restock.replay.mixture.mixture import load_mixture
     from restock.replay.store.store import Store
-    from restock.train.diagnosis.evidence_needed import policy_evidence, twin_evidence
     from restock.train.evaluation.off_policy.estimators import EssGate
+    from restock.train.judge.evidence_needed import policy_evidence, twin_evidence
     from restock.train.twin.calibration.twin_gap import GapConfig, TrustLimits
 
     found, horizon_s = [], horizon(to.profile)

@@ -29,8 +29,59 @@ from typing import Any, Literal
 import numpy as np
 
 from restock.errors import RunError
-from restock.train.comparison.action_coverage import ActionSymptom
+from restock.stats import wilson
 from restock.train.run.run import Run
+
+
+@dataclass(frozen=True)
+class ActionSymptom:
+    """One action in one condition, over the last windows."""
+
+    condition: str
+    action: str  # its name
+    wanted_share: float  # of the condition's fresh rows looked at, where the policy would take it
+    wanted_low: float  # lower end of its 95 % interval
+    audited_rows: int  # that were looked at
+    logs_share: float  # of the condition's logged rows drawn
+    logged_rows: int  # different ones with the action
+    condition_rows: int  # different ones of the condition
+    fresh_share: float | None  # of the condition's fresh rows drawn
+
+    @property
+    def reason(self) -> str:
+        """For people."""
+        supplied = "" if self.fresh_share is None else f", fresh rows in {self.fresh_share:.0%}"
+        return (
+            f"the policy takes {self.action!r} in {self.wanted_share:.0%} of the rows looked at (at"
+            f" least {self.wanted_low:.0%}), logged batches have it in {self.logs_share:.1%}:"
+            f" {self.logged_rows} of {self.condition_rows} different rows{supplied}"
+        )
+
+
+def action_symptoms(run: Run, since: int) -> list[ActionSymptom]:
+    """Every action in every condition of the logs, in batches after gradient step `since`.
+
+    Empty for a run without logs, of another library, or of a Restock that kept no such table.
+    """
+    import duckdb
+
+    query = files("restock.train.judge").joinpath("action_coverage.sql").read_text("utf-8")
+    with duckdb.connect() as connection:
+        connection.register("run_actions", run.table("actions"))
+        rows = connection.sql(query, params={"since": since}).to_arrow_table().to_pylist()
+    symptoms = []
+    for row in rows:
+        wanted, audited = row.pop("wanted"), row.pop("audited")
+        if not audited:
+            continue
+        low, _ = wilson(wanted, audited)
+        symptoms.append(
+            ActionSymptom(
+                wanted_share=wanted / audited, wanted_low=low, audited_rows=audited, **row
+            )
+        )
+    return symptoms
+
 
 Cause = Literal[
     "HEALTHY", "BUFFER", "ACTION_COVERAGE", "TARGET", "BOTH", "DIVERGENCE", "UNDETERMINED"
@@ -241,7 +292,7 @@ def windows_of(run: Run) -> list[Window]:
     """The windows of a run, one an evaluation that had updates before it."""
     import duckdb
 
-    query = files("restock.train.comparison").joinpath("diagnose.sql").read_text(encoding="utf-8")
+    query = files("restock.train.judge").joinpath("diagnose.sql").read_text(encoding="utf-8")
     with duckdb.connect() as connection:
         names = ("evaluation_buffer", "conditions", "strata", "progress")
         for name in names:  # one that an older run has not is empty
@@ -305,6 +356,3 @@ def _value_bound(run: Run) -> float:
     largest = float(np.abs(rewards).max(initial=0.0)) if len(rewards) else 0.0
     discount = run.document["config"]["loss"]["discount"]
     return largest / (1 - discount) if largest > 0 else float("inf")
-
-
-__all__ = ["Cause", "DiagnosisLimits", "Symptom", "Window", "median_window", "windows_of"]

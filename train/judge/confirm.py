@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from restock.errors import RunError
-from restock.train.comparison.diagnose import Diagnosis, diagnose, other_target, target_rule
-from restock.train.comparison.windows import Cause
 from restock.train.dqn.config import apply_overrides, as_overrides, parse_config
+from restock.train.judge.diagnose import Diagnosis, diagnose, other_target, target_rule
+from restock.train.judge.windows import Cause
 from restock.train.loop import train
 from restock.train.prepare import prepare_new
 from restock.train.run.run import Run, check_free

@@ -12,19 +12,21 @@ from dataclasses import dataclass
 from statistics import median
 
 from restock.ingest.task.task import Task
-from restock.train.diagnosis.answers import DELAY_STEPS, GAIN, Answer
-from restock.train.diagnosis.evidence import Comparison
-from restock.train.diagnosis.relations import (
+from restock.train.judge.answers import (
     ACCELEROMETER,
     ACTION_SPEED,
     ACTION_TURN,
+    DELAY_STEPS,
+    GAIN,
     GYROSCOPE,
     LIDAR,
     PLAN,
     POSE,
     WHEEL_SPEED,
     WHEEL_TURN,
+    Answer,
 )
+from restock.train.judge.fed_rows import Comparison
 
 GROUPS = {"actions": (ACTION_SPEED, ACTION_TURN), "wheels": (WHEEL_SPEED, WHEEL_TURN)}
 _KEYS = {  # where a profile says what fills it
@@ -413,6 +415,3 @@ KINDS = (
         " remove STORE RECORDING`",
     ),
 )
-
-
-__all__ = ["Finding", "findings", "odd_ends"]

@@ -88,6 +88,3 @@ def _more_h(driven_h: float, *counts: tuple[int, int]) -> float | None:
     if not all(there for there, _ in counts):
         return None
     return driven_h * max(0.0, *(least / there - 1 for there, least in counts))
-
-
-__all__ = ["Evidence", "policy_evidence", "twin_evidence"]

@@ -13,21 +13,25 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isinf
+from pathlib import Path
 
 import msgspec
 
-from restock.errors import expect
-from restock.train.comparison.action_coverage import action_symptoms
-from restock.train.comparison.arms import refuse_dependent
-from restock.train.comparison.windows import (
+from restock.errors import RestockError, expect
+from restock.train.dqn.target import Polyak, TargetRule
+from restock.train.judge.before_training import RowDiagnosis, diagnose_before_training
+from restock.train.judge.comparability import refuse_dependent
+from restock.train.judge.windows import (
     Cause,
     DiagnosisLimits,
     Window,
+    action_symptoms,
     median_window,
     windows_of,
 )
-from restock.train.dqn.target import Polyak, TargetRule
 from restock.train.run.run import Run
+from restock.train.run.run_profile import profile_of_run, run_panel
+from restock.train.twin.physics.perturbation import Schedule, find_perturbation
 from restock.words import counted
 
 WINDOWS = 3  # the last, that figures are the median of
@@ -209,4 +213,49 @@ def _experiment(
     }[cause]
 
 
-__all__ = ["Diagnosis", "diagnose", "other_target", "target_rule"]
+_TOGETHER: dict[Cause, Cause] = {  # of a run, where its rows are at fault too
+    "HEALTHY": "BUFFER",
+    "ACTION_COVERAGE": "BUFFER",
+    "UNDETERMINED": "BUFFER",
+    "TARGET": "BOTH",
+}
+
+
+def rows_of(runs: Sequence[Run]) -> tuple[RowDiagnosis | None, str]:
+    """The diagnosis of the panel that the runs were fed, or None and why there is none."""
+    fed = {run.document["panel"]["path"]: run for run in runs if run.document.get("panel")}
+    if len(fed) != 1:
+        return None, "the runs were fed several panels" if fed else "there is no panel"
+    ((path, run),) = fed.items()
+    env = run.document["config"].get("env", {})
+    try:
+        run_panel(run.document)
+        given = find_perturbation(env.get("perturbation", "nominal"), where="env.perturbation")
+        twin = given.base if isinstance(given, Schedule) else given
+        profile = profile_of_run(run)
+        found = diagnose_before_training(
+            Path(path), profile=profile, perturbation=twin, run=run.path
+        )
+        return found, ""
+    except RestockError as error:  # a run may be read where its panel is not
+        return None, f"{path}: {error.what}"
+
+
+def with_rows(diagnosis: Diagnosis, rows: RowDiagnosis) -> Diagnosis:
+    """The verdict on a run and on its rows together; rows that are not at fault change nothing."""
+    if not rows.findings:
+        return diagnosis
+    cause = _TOGETHER.get(diagnosis.cause, diagnosis.cause)
+    experiment = diagnosis.experiment
+    if cause in ("BUFFER", "BOTH"):
+        experiment = f"first correct the rows ({rows.findings[0].remedy}), mix and train again"
+    said = []
+    if cause != diagnosis.cause:
+        whose = "the run's own figures" if len(diagnosis.runs) == 1 else "the runs' own figures"
+        said = [f"{diagnosis.cause} by {whose}, {cause} with the rows that were fed:"]
+    said += [f"rows: {one.cause}: {one.text}" for one in rows.findings]
+    if rows.untrusted:
+        said.append(f"rows: the twin is far from these logs in {', '.join(rows.untrusted)}")
+    return replace(
+        diagnosis, cause=cause, evidence=[*diagnosis.evidence, *said], experiment=experiment
+    )

@@ -1,1 +1,0 @@
-"""May two runs be compared, and what went wrong in one."""

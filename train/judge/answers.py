@@ -1,0 +1,449 @@
+"""Do the logs' sensors and actions answer to each other as the twin's do?
+
+Of each relation the gain, the delay and what is left unexplained, in logs against in the twin; or
+against what holds by definition where no twin can be driven. And of each action the motion that it
+comes to when held: which of the twin's actions is that?
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from restock.arrays import F64, Bools, Ints
+from restock.stats import ConfidenceInterval, cluster_counts, for_few_clusters, percentiles
+from restock.train.judge.fed_rows import Comparison, FedRows, judged, not_run
+
+RESAMPLES = 200
+MIN_CLUSTERS = 5
+_RIDGE = 1e-4  # of the mean diagonal: lags that the rows do not tell apart
+
+
+@dataclass(frozen=True)
+class Response:
+    """A fitted response, with its R bootstrap draws."""
+
+    rows: int
+    clusters: int
+    gain: float
+    delay: float  # steps
+    unexplained: float  # of y's mean square
+    gains: F64  # (R,)
+    delays: F64  # (R,)
+    unexplained_draws: F64  # (R,)
+
+
+def fit_response(
+    x: F64, y: F64, cluster: Ints, lags: Ints, rng: np.random.Generator
+) -> Response | None:
+    """The response of y (n,) to x (n, L) at `lags` (L,); None where too little is known.
+
+    Rows with a value that is not finite are left out.
+    """
+    known = np.isfinite(y) & np.isfinite(x).all(axis=1)
+    x, y = x[known], y[known]
+    place = np.unique(cluster[known], return_inverse=True)[1].reshape(-1)
+    clusters = int(place.max(initial=-1)) + 1
+    if clusters < MIN_CLUSTERS or not (y**2).sum() or not (x**2).sum():
+        return None
+    joint = np.concatenate([x, y[:, None]], axis=1)
+    width = joint.shape[1]
+    moments = np.stack(
+        [
+            np.bincount(place, joint[:, i] * joint[:, j], clusters)
+            for i in range(width)
+            for j in range(width)
+        ],
+        axis=1,
+    )  # (C, W * W)
+    counts = np.concatenate([np.ones((1, clusters)), cluster_counts(clusters, RESAMPLES, rng)])
+    drawn = (counts @ moments).reshape(-1, width, width)
+    xx, xy, yy = drawn[:, :-1, :-1], drawn[:, :-1, -1], drawn[:, -1, -1]
+    ridge = _RIDGE * np.trace(xx, axis1=1, axis2=2) / (width - 1)
+    ridge = np.where(ridge > 0.0, ridge, ridge[0])  # a draw may have only clusters without a change
+    h = np.linalg.solve(xx + ridge[:, None, None] * np.eye(width - 1), xy[..., None])[..., 0]
+    gain = h.sum(axis=1)
+    safe = np.where(np.abs(gain) > 1e-9, gain, 1e-9)
+    delay = (h * lags).sum(axis=1) / safe
+    left = yy - 2 * (h * xy).sum(axis=1) + np.einsum("ri,rij,rj->r", h, xx, h)
+    unexplained = np.clip(left / np.maximum(yy, 1e-12), 0.0, None)
+    return Response(
+        len(y), clusters, float(gain[0]), float(delay[0]), float(unexplained[0]),
+        gain[1:], delay[1:], unexplained[1:],
+    )  # fmt: skip
+
+
+def ratio_of(above: F64, below: F64, at: tuple[float, float], clusters: int) -> ConfidenceInterval:
+    """A ratio of two statistics with independent draws (R,) each, and the values `at`.
+
+    `clusters` are those of the one that has fewer.
+    """
+    bottom = np.where(np.abs(below) > 1e-9, below, np.nan)
+    return interval_of(at[0] / at[1] if at[1] else float("nan"), above / bottom, clusters)
+
+
+def difference_of(
+    first: F64, second: F64, at: tuple[float, float], clusters: int
+) -> ConfidenceInterval:
+    """A difference of two statistics with independent draws (R,) each, and the values `at`.
+
+    `clusters` are those of the one that has fewer.
+    """
+    return interval_of(at[0] - at[1], first - second, clusters)
+
+
+def interval_of(value: float, draws: NDArray[np.float64], clusters: int) -> ConfidenceInterval:
+    """That of a statistic with draws (R,) over so many clusters; NaN where it is not known."""
+    finite = draws[np.isfinite(draws)]
+    if not len(finite) or not np.isfinite(value):
+        return ConfidenceInterval(value, float("nan"), float("nan"))
+    return for_few_clusters(ConfidenceInterval(value, *percentiles(finite)), clusters)
+
+
+def lagged(x: F64, before: list[tuple[Ints, Bools]]) -> F64:
+    """x (N,) at each of L lags, (N, L); NaN where the row of that lag is not known."""
+    return np.stack([np.where(known, x[row], np.nan) for row, known in before], axis=1)
+
+
+ACTION_SPEED, ACTION_TURN = "action (speed)", "action (turn)"
+WHEEL_SPEED, WHEEL_TURN = "wheels (speed)", "wheels (turn)"
+POSE, GYROSCOPE, ACCELEROMETER, PLAN, LIDAR = "pose", "gyroscope", "accelerometer", "plan", "lidar"
+COMMANDS = np.arange(-4, 8)  # lags of commands: robots answer late, logs may be wrong either way
+SENSORS = np.arange(-3, 4)
+NOW = np.zeros(1, np.int64)
+_JUMP_RAD = 0.8  # a plan was replaced, not turned
+_SLOW_MPS = 0.3  # slower than this a waypoint's bearing changes by turning, not by driving past it
+_JUMP_M = 0.6
+_AHEAD = 0.5  # sine of the waypoint's bearing, at most, for the way to be what is driven
+_MOST = 0.5  # of what moves
+_CLEAN = 0.1  # of what moves in a recording, in episodes without slip, for slip to be the floor's
+_MIN_EPISODES = 5  # of a recording that is judged by itself
+_NEAR_STEPS = 5
+_FAR = 0.97  # of the lidar's range: nothing was seen
+SlipLeftOut = Literal["episodes", "rows", "none"]
+
+
+@dataclass(frozen=True)
+class Relation:
+    """`y` answers to `x`; each end has a name that says whose it is."""
+
+    name: str
+    x: str
+    y: str
+    lags: Ints
+    of: Callable[[FedRows], tuple[F64, F64]]  # x and y of the rows, (N,) each; or (N, S)
+    gain: float | None = 1.0  # by definition, where there is no twin to ask
+
+    def fit(
+        self, rows: FedRows, rng: np.random.Generator, leave_out: SlipLeftOut = "none"
+    ) -> Response | None:
+        """None where the rows say too little."""
+        x, y = self.of(rows)
+        y = y.copy()
+        y[_left_out(rows, _motion(x, y), leave_out)] = np.nan
+        if x.ndim == 2:
+            cluster = np.repeat(rows.cluster, x.shape[1])
+            return fit_response(x.reshape(-1, 1), y.reshape(-1), cluster, NOW, rng)
+        before = [rows.before(int(lag)) for lag in self.lags]
+        return fit_response(lagged(x, before), y, rows.cluster, self.lags, rng)
+
+    def slip_to_leave_out(self, rows: FedRows) -> SlipLeftOut:
+        """What of logs to leave out so that a floor does not count as a fault of the robot.
+
+        Where wheels slip, how a robot moves is the floor's, also in the rows around those that are
+        labelled: so whole episodes, as long as others remain. But a sensor that is wrong looks
+        like slip too, all the time: then nearly every episode of its recording is so labelled.
+        """
+        moves = _motion(*self.of(rows))
+        if _on_ice(rows, moves).any():
+            return "episodes"
+        return "rows" if moves[~_near_slip(rows)].sum() >= _MOST * moves.sum() else "none"
+
+
+def _motion(x: F64, y: F64) -> F64:
+    """How much each row says of a relation, (N,)."""
+    moves = np.where(np.isfinite(y), x, 0.0) ** 2
+    return moves if moves.ndim == 1 else np.asarray(moves.sum(axis=1))
+
+
+def _left_out(rows: FedRows, moves: F64, what: SlipLeftOut) -> Bools:
+    if what == "episodes":
+        return _on_ice(rows, moves)
+    return _near_slip(rows) if what == "rows" else np.zeros(len(rows), np.bool_)
+
+
+def _slips(rows: FedRows) -> Bools:
+    return np.asarray(rows.condition == "wheel_slip", np.bool_)
+
+
+def _near_slip(rows: FedRows) -> Bools:
+    """Rows (N,) labelled as slipping, and those a few steps from them."""
+    slips = _slips(rows)
+    near = slips.copy()
+    for lag in (*range(-_NEAR_STEPS, 0), *range(1, _NEAR_STEPS + 1)):
+        place, known = rows.before(lag)
+        near |= slips[place] & known
+    return near
+
+
+def _on_ice(rows: FedRows, moves: F64) -> Bools:
+    """The rows (N,) of episodes with slip, in recordings that move without slip as well; those of
+    few episodes are judged together."""
+    if not len(rows):
+        return np.zeros(0, np.bool_)
+    _, first, episode = np.unique(rows.episode, return_index=True, return_inverse=True)
+    slipped = np.bincount(episode, _slips(rows)) > 0  # (E,)
+    recording = np.unique(rows.recording[first], return_inverse=True)[1] + 1  # (E,)
+    recording[np.bincount(recording)[recording] < _MIN_EPISODES] = 0
+    moved = np.bincount(episode, moves)
+    clean = np.bincount(recording, moved * ~slipped)  # (R,)
+    ice = clean >= np.maximum(_CLEAN * np.bincount(recording, moved), 1e-12)
+    return np.asarray((slipped & ice[recording])[episode], np.bool_)
+
+
+def _speed(rows: FedRows) -> F64:
+    return rows.after("wheel_speed")
+
+
+def _gyro(rows: FedRows) -> F64:
+    return rows.after("gyro_yaw_rate")
+
+
+def _wheel_turn(rows: FedRows) -> F64:
+    return rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
+
+
+def _pose_speed(rows: FedRows) -> F64:
+    return rows.after("localised_speed")
+
+
+def _gained(rows: FedRows) -> F64:
+    """How much wheels speeded up over the step, m/s2."""
+    change = rows.after("wheel_speed") - rows.now("wheel_speed")
+    return np.asarray(change / rows.task.control_period_s)
+
+
+def _turned_waypoint(rows: FedRows) -> F64:
+    """The yaw rate that the near waypoint's bearing shows, rad/s; NaN where driving or the plan
+    moved it."""
+    now = np.arctan2(rows.now("near_sin"), rows.now("near_cos"))
+    after = np.arctan2(rows.after("near_sin"), rows.after("near_cos"))
+    change = (after - now + np.pi) % (2 * np.pi) - np.pi
+    driving = np.abs(rows.after("localised_speed")) > _SLOW_MPS
+    change[(np.abs(change) > _JUMP_RAD) | driving] = np.nan
+    return np.asarray(-change / rows.task.control_period_s)
+
+
+def _route_speed(rows: FedRows) -> F64:
+    """How fast the way to go became shorter, m/s; NaN where the plan jumped or reads its most, and
+    where the robot is not headed along it: whoever drives elsewhere does not shorten it."""
+    now, after = rows.now("goal_distance"), rows.after("goal_distance")
+    shorter = 10.0 * (now - after)
+    aside = (np.abs(rows.now("near_sin")) > _AHEAD) | (rows.now("near_cos") < 0.0)
+    shorter[(np.abs(shorter) > _JUMP_M) | (now >= 1.0) | (after >= 1.0) | aside] = np.nan
+    return np.asarray(shorter / rows.task.control_period_s)
+
+
+def _scan_flow(rows: FedRows, turn: F64) -> tuple[F64, F64]:
+    """How sectors changed (N, S), and how they would by a turn (rad/s, (N,)) on the spot."""
+    now, after = rows.sectors(), rows.sectors(after=True)
+    width = 2 * np.pi / max(rows.task.sectors, 1)
+    slope = (np.roll(now, -1, axis=1) - np.roll(now, 1, axis=1)) / (2 * width)
+    expected = slope * (turn * rows.task.control_period_s)[:, None]
+    changed = after - now
+    unseen = (now > _FAR) | (after > _FAR)
+    unseen |= np.roll(unseen, 1, axis=1) | np.roll(unseen, -1, axis=1)
+    unseen |= np.abs(slope) > 1.0  # an edge: what lies behind it comes into view
+    unseen |= (np.abs(turn) < 0.2)[:, None]
+    return expected, np.where(unseen, np.nan, changed)
+
+
+RELATIONS = (
+    Relation("speed of the wheels to the action", ACTION_SPEED, WHEEL_SPEED, COMMANDS,
+             lambda rows: (rows.command()[:, 0], _speed(rows))),
+    Relation("speed of the pose to the action", ACTION_SPEED, POSE, COMMANDS,
+             lambda rows: (rows.command()[:, 0], _pose_speed(rows))),
+    Relation("yaw rate of the gyroscope to the action", ACTION_TURN, GYROSCOPE, COMMANDS,
+             lambda rows: (rows.command()[:, 1], _gyro(rows))),
+    Relation("yaw rate of the wheels to the action", ACTION_TURN, WHEEL_TURN, COMMANDS,
+             lambda rows: (rows.command()[:, 1], _wheel_turn(rows))),
+    Relation("speed of the pose to the wheels", WHEEL_SPEED, POSE, SENSORS,
+             lambda rows: (_speed(rows), _pose_speed(rows))),
+    Relation("yaw rate of the wheels to the gyroscope", GYROSCOPE, WHEEL_TURN, SENSORS,
+             lambda rows: (_gyro(rows), _wheel_turn(rows))),
+    Relation("acceleration to the wheels", WHEEL_SPEED, ACCELEROMETER, SENSORS,
+             lambda rows: (_gained(rows), 5.0 * rows.after("accel_x")), None),
+    Relation("bearing of the waypoint to the gyroscope", GYROSCOPE, PLAN, NOW,
+             lambda rows: (_gyro(rows), _turned_waypoint(rows)), None),
+    Relation("way to go to the speed of the pose", POSE, PLAN, SENSORS,
+             lambda rows: (_pose_speed(rows), _route_speed(rows)), None),
+    Relation("what the lidar sees to the gyroscope", GYROSCOPE, LIDAR, NOW,
+             lambda rows: _scan_flow(rows, _gyro(rows)), None),
+    Relation("what the lidar sees to the turn of the wheels", WHEEL_TURN, LIDAR, NOW,
+             lambda rows: _scan_flow(rows, _wheel_turn(rows)), None),
+)  # fmt: skip
+
+
+GAIN = 1.2  # of logs over the twin's, or its inverse
+NOISY_GAIN = 2.0  # of relations that are no measurement of the same thing
+DELAY_STEPS = 0.6
+LATEST_STEPS = 2.0  # without a twin: how late a robot may answer to its commands
+UNEXPLAINED = 0.2
+NOISY_UNEXPLAINED = 0.4  # where it depends on who drives, and where
+_KNOWN_GAIN = 0.3  # of logs over the twin's, for a delay to mean something
+HELD = 3  # steps of one action in a row, for its motion to be that action's
+_MIN_HELD = 15
+_AWAY = 0.25  # of the fastest action on each axis
+_MAX_ROWS = 0.8  # of an action's, those with the motion of one other
+TwinFits = dict[tuple[str, SlipLeftOut], Response | None]  # by relation and what it leaves out
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A relation in logs and twin."""
+
+    relation: Relation
+    comparisons: tuple[Comparison, ...]
+    gain: float  # logs over twin; NaN: not known
+    delay: float  # logs less twin, steps
+
+    @property
+    def off(self) -> bool:
+        return any(one.off for one in self.comparisons)
+
+    @property
+    def fine(self) -> bool:
+        """Neither off nor undecided."""
+        return all(one.status in ("ok", "not run") for one in self.comparisons)
+
+    def is_off(self, figure: str) -> bool:
+        """Whether its `gain`, `delay` or `unexplained` is."""
+        return any(one.off and one.check.startswith(figure) for one in self.comparisons)
+
+
+def answers(
+    logs: FedRows, twin: FedRows | None, seed: int = 0, of_twin: TwinFits | None = None
+) -> list[Answer]:
+    """Every relation, compared. `of_twin` keeps the twin's fits for the next logs."""
+    rng = np.random.default_rng([seed, 1])
+    of_twin = {} if of_twin is None else of_twin
+    return [_answer(relation, logs, twin, rng, of_twin) for relation in RELATIONS]
+
+
+def _answer(
+    relation: Relation,
+    logs: FedRows,
+    twin: FedRows | None,
+    rng: np.random.Generator,
+    of_twin: TwinFits,
+) -> Answer:
+    leave_out = relation.slip_to_leave_out(logs)
+    found = relation.fit(logs, rng, leave_out)
+    kept = relation.name, leave_out
+    if twin is not None and kept not in of_twin:
+        of_twin[kept] = relation.fit(twin, rng, leave_out)
+    expected = of_twin.get(kept)
+    name, what = relation.name, f"answer of the {relation.name}"
+    if found is None or (twin is not None and expected is None):
+        reason = "too few rows, or nothing moves, in the " + ("logs" if found is None else "twin")
+        return Answer(relation, (not_run(f"gain: {name}", what, reason),), float("nan"), 0.0)
+    if expected is None:
+        return _by_definition(relation, found, what)
+    most, most_left = (
+        (GAIN, UNEXPLAINED) if relation.gain is not None else (NOISY_GAIN, NOISY_UNEXPLAINED)
+    )
+    fewer = min(found.clusters, expected.clusters)
+    gain = ratio_of(found.gains, expected.gains, (found.gain, expected.gain), fewer)
+    delay = difference_of(found.delays, expected.delays, (found.delay, expected.delay), fewer)
+    left = difference_of(
+        found.unexplained_draws,
+        expected.unexplained_draws,
+        (found.unexplained, expected.unexplained),
+        fewer,
+    )
+    timed = len(relation.lags) > 1 and abs(gain.value) > _KNOWN_GAIN
+    compared = [
+        ("gain", "ratio", gain, found.gain, expected.gain, 1 / most, most),
+        *[("delay", "steps later", delay, found.delay, expected.delay, -DELAY_STEPS, DELAY_STEPS)]
+        * timed,
+        ("unexplained", "difference", left, found.unexplained, expected.unexplained, -1.0,
+         most_left),
+    ]  # fmt: skip
+    made = [
+        judged(
+            f"{figure}: {name}", what, measure, interval, logs=of_logs, twin=of_twin,
+            least=low, most=high, logs_rows=found.rows, twin_rows=expected.rows,
+        )
+        for figure, measure, interval, of_logs, of_twin, low, high in compared
+    ]  # fmt: skip
+    return Answer(relation, tuple(made), gain.value, delay.value if timed else 0.0)
+
+
+def _by_definition(relation: Relation, found: Response, what: str) -> Answer:
+    """Without a twin: a speed is a speed, and commands come before what they cause."""
+    name = relation.name
+    if relation.gain is None:
+        row = not_run(f"gain: {name}", what, "no twin to compare with")
+        return Answer(relation, (row,), float("nan"), 0.0)
+    of_unit = found.gain / relation.gain, found.gains / relation.gain
+    gain = interval_of(*of_unit, found.clusters)
+    delay = interval_of(found.delay, found.delays, found.clusters)
+    made = [
+        judged(f"gain: {name}", what, "ratio", gain, logs=found.gain, twin=None,
+               least=1 / GAIN, most=GAIN, logs_rows=found.rows),
+    ]  # fmt: skip
+    if abs(gain.value) > _KNOWN_GAIN:
+        made.append(
+            judged(f"delay: {name}", what, "steps later", delay, logs=found.delay, twin=None,
+                   least=-DELAY_STEPS, most=LATEST_STEPS, logs_rows=found.rows)
+        )  # fmt: skip
+    over = min(max(found.delay, 0.0), LATEST_STEPS)
+    return Answer(relation, tuple(made), gain.value, found.delay - over)
+
+
+def held_motion(rows: FedRows) -> list[F64]:
+    """Of each action the motion (n, 2) of the rows that hold it: m/s and rad/s by the wheels."""
+    held = np.ones(len(rows), np.bool_)
+    for lag in range(1, HELD):
+        place, known = rows.before(lag)
+        held &= known & (rows.action[place] == rows.action)
+    turn = rows.after("slip_yaw_rate") + rows.after("gyro_yaw_rate")
+    motion = np.stack([rows.after("wheel_speed"), turn], axis=1)
+    return [motion[held & (rows.action == action)] for action in range(len(rows.task.actions))]
+
+
+def permuted_actions(logs: FedRows, twin: FedRows | None) -> Iterator[tuple[Comparison, int]]:
+    """Of each action of the logs how far its motion is from that action's in the twin (or from the
+    task's table), and the action (or itself) whose motion most of its rows have."""
+    expected = np.array(logs.task.actions, np.float64)
+    scale = np.maximum(np.abs(expected).max(axis=0), 1e-9)
+    for action, motion in enumerate(held_motion(twin) if twin is not None else []):
+        if len(motion) >= _MIN_HELD:
+            expected[action] = np.median(motion, axis=0)
+    names = logs.task.action_names
+    for action, motion in enumerate(held_motion(logs)):
+        name = names[action]
+        what = f"motion under the action {name!r}, held"
+        if len(motion) < _MIN_HELD:
+            yield not_run(f"action: {name}", what, "hardly held in the logs"), action
+            continue
+        away = np.linalg.norm((motion[:, None] - expected) / scale, axis=2)  # (n, A)
+        middle = np.median(away, axis=0)
+        nearest = int(np.bincount(away.argmin(axis=1)).argmax())
+        share = float((away.argmin(axis=1) == nearest).mean())
+        is_other = nearest != action and middle[action] > _AWAY and share >= _MAX_ROWS
+        speed, turn = np.median(motion, axis=0)
+        distance = float(middle[action])
+        row = judged(
+            f"action: {name}", what, "distance", ConfidenceInterval(distance, distance, distance),
+            logs=distance, twin=float(middle[nearest]),
+            most=_AWAY if is_other else math.inf, logs_rows=len(motion),
+            note=f"{speed:+.2f} m/s, {turn:+.2f} rad/s: {share:.0%} nearest to {names[nearest]!r}",
+        )  # fmt: skip
+        # A median decided by a share: there is no interval to show.
+        yield replace(row, low=None, high=None), nearest if is_other else action

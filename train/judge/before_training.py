@@ -1,0 +1,474 @@
+"""What can be known before anything is trained: from a panel or a store, and the twin alone.
+
+A critic that is fed consistent mistakes learns them, and no figure of its training shows it: logs
+that swap left and right explain themselves. So the rows are held against fresh rows of the twin,
+and against what must hold by definition. Where the twin cannot be driven, the checks
+that need none still run, and the others say why they did not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from restock.arrays import Ints
+from restock.errors import ConfigError, RestockError, RunError, StoreError
+from restock.ingest.profile.profile import Profile
+from restock.ingest.task.conditions import Condition, label, primary
+from restock.ingest.task.robot import Robot
+from restock.ingest.task.signals import STORED_SIGNALS
+from restock.ingest.task.task import Task
+from restock.replay.panel.panel import HEADER, Panel
+from restock.replay.store.store import Store, is_store, profiles_of
+from restock.train.feed.collector import conditions_in_twin
+from restock.train.judge.answers import Answer, TwinFits, answers, permuted_actions
+from restock.train.judge.causes import Finding, findings
+from restock.train.judge.fed_rows import Comparison, FedRows, Status, not_run, of_panel, of_store
+from restock.train.judge.row_checks import fed_labels, outcomes, row_order, stored, values
+from restock.train.run.run_profile import carried_profile, profile_of_panel
+from restock.train.twin.calibration.twin_gap import (
+    DOCUMENT,
+    FOLDER,
+    TRUSTED,
+    UNDECIDED,
+    UNTRUSTED,
+    read_gap,
+)
+from restock.train.twin.drivers.operator_policy import Operator
+from restock.train.twin.drivers.policies import Handover, PlannerFollower
+from restock.train.twin.env.vector_env import WarehouseVectorEnv
+from restock.train.twin.missions.registry import KINDS
+from restock.train.twin.physics.perturbation import Perturbation
+
+GAP_CHECK = "twin gap"
+_STATUS: dict[str, Status] = {TRUSTED: "ok", UNDECIDED: "undecided", UNTRUSTED: "off"}
+
+
+def gap_evidence(places: Sequence[Path]) -> Iterator[Comparison]:
+    """A row for each condition, of the first of `places` (a run, a store) that has a gap in it."""
+    what = "where the twin ends when it drives what was logged"
+    folder = next((p / FOLDER for p in places if (p / FOLDER / DOCUMENT).is_file()), None)
+    if folder is None:
+        shown = places[0] / FOLDER if places else f"STORE/{FOLDER}"
+        yield not_run(GAP_CHECK, what, f"`restock twin gap STORE --out {shown}` measures it")
+        return
+    try:
+        gap = read_gap(folder)
+    except RunError as error:
+        yield not_run(GAP_CHECK, what, f"{error.where}: {error.what}")
+        return
+    for verdict in gap.verdicts:
+        name, reasons = f"{GAP_CHECK}: {verdict.condition}", "; ".join(verdict.reasons)
+        if verdict.verdict not in _STATUS:
+            yield not_run(name, what, reasons)
+            continue
+        ends = verdict.position_p90
+        yield Comparison(
+            name, what, "m", _STATUS[verdict.verdict],
+            effect=ends.value, low=ends.low, high=ends.high,
+            logs_rows=verdict.segments, note=reasons,
+        )  # fmt: skip
+
+
+def untrusted(rows: Sequence[Comparison]) -> list[str]:
+    """The conditions in which the twin strays from the logs beyond its limits."""
+    start = f"{GAP_CHECK}: "
+    return [
+        row.check.removeprefix(start) for row in rows if row.off and row.check.startswith(start)
+    ]
+
+
+MIN_ROWS = 500  # of the logs, for silence to mean health; and of each part that is compared
+MOST = 40  # parts, of the most rows
+RECORDINGS_CHECK = "recordings"
+_SOME = 0.8  # of the parts, at most: what is wrong in nearly all of them is wrong in all rows
+_NAMED = 3
+
+
+def unlike_recordings(
+    logs: FedRows, twin: FedRows | None, seed: int = 0
+) -> tuple[list[Finding], list[Comparison]]:
+    """What is wrong in some of the recordings alone, and the comparisons that say so."""
+    recordings = len(np.unique(logs.recording))
+    if recordings < 2:
+        return [], []
+    part, kind = _parts(logs)
+    names, rows = np.unique(part, return_counts=True)
+    chosen = names[np.argsort(-rows, kind="stable")][: min((rows >= MIN_ROWS).sum(), MOST)]
+    what = f"each of the {kind} by itself"
+    if len(chosen) < 2:
+        return [], [
+            not_run(RECORDINGS_CHECK, what, f"there are no two {kind} with {MIN_ROWS} rows")
+        ]
+    found: dict[str, list[tuple[str, Finding]]] = {}  # by cause
+    off: list[Comparison] = []
+    of_twin: TwinFits = {}  # the same for every recording
+    for name in chosen.tolist():
+        rows_of = logs.take(part == name)
+        own = [_named(one, name) for one in answers(rows_of, twin, seed, of_twin)]
+        for one in findings(own, [], [], logs.task):
+            found.setdefault(one.cause, []).append((name, one))
+        off += [row for one in own for row in one.comparisons if row.off]
+    some = list(found.values())
+    if any(len(each) > _SOME * len(chosen) for each in some):
+        some = []
+    inside = np.isin(part, chosen)
+    compared = Comparison(
+        RECORDINGS_CHECK, what, "recordings", "off" if some else "ok",
+        logs_rows=int(inside.sum()),
+        note=f"{len(chosen)} {kind} with {MIN_ROWS} rows were compared:"
+        f" {len(np.unique(logs.recording[inside]))} of {recordings} recordings",
+    )  # fmt: skip
+    return [_joined(each, len(chosen), kind) for each in some], [compared, *(off if some else [])]
+
+
+def _parts(logs: FedRows) -> tuple[NDArray[np.str_], str]:
+    """Which part each row (N,) is compared with, and what the parts are called."""
+    place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)[1:]
+    is_short = (rows < MIN_ROWS)[place.reshape(-1)]
+    tagged = is_short & (logs.robot != "")
+    part = np.where(tagged, np.char.add("robot ", logs.robot), logs.recording).astype(object)
+    untagged = is_short & ~tagged
+    if untagged.any():
+        part[untagged] = _by_start(logs.take(untagged))
+        return part.astype(np.str_), "groups of recordings"
+    kind = "recordings" if not tagged.any() else "robots" if is_short.all() else ""
+    return part.astype(np.str_), kind or "recordings and robots"
+
+
+def _by_start(logs: FedRows) -> NDArray[np.str_]:
+    """The group of each row (N,): recordings that started one after the other, in groups of
+    `MIN_ROWS` rows at least, as many as let `MOST` groups hold all."""
+    names, place, rows = np.unique(logs.recording, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    start = np.full(len(names), np.iinfo(np.int64).max)
+    np.minimum.at(start, place, logs.logged_ns)
+    order = np.argsort(start, kind="stable")
+    middle = np.cumsum(rows[order]) - rows[order] / 2
+    groups = np.clip(len(logs) // (MIN_ROWS + rows.max()), 1, MOST)  # each loses half of two
+    begins = np.searchsorted(middle * groups / len(logs), np.arange(groups + 1))
+    named = np.empty(len(names), object)
+    for first, end in pairwise(begins.tolist()):
+        named[order[first:end]] = f"{names[order[first]]} and the next {end - first - 1}"
+    return np.asarray(named[place], np.str_)
+
+
+def _named(answer: Answer, recording: str) -> Answer:
+    """With the recording in the names of its comparisons."""
+    rows = (replace(row, check=f"{row.check}, {recording}") for row in answer.comparisons)
+    return replace(answer, comparisons=tuple(rows))
+
+
+def _joined(each: Sequence[tuple[str, Finding]], compared: int, kind: str) -> Finding:
+    """One finding of those of several parts, in the words of the first."""
+    names = ", ".join(name for name, _ in each[:_NAMED])
+    more = f" and {len(each) - _NAMED} more" if len(each) > _NAMED else ""
+    first = each[0][1]
+    return replace(
+        first,
+        text=f"in {len(each)} of {compared} {kind} ({names}{more}): {first.text}",
+        remedy="for their recordings alone (the store's `recordings` view has the files and tags):"
+        f" {first.remedy}",
+        evidence=tuple(check for _, one in each for check in one.evidence),
+    )
+
+
+ROBOTS = 24
+STEPS = 400  # of each robot
+EXPLORATION = 0.1
+_STORED = tuple(signal.name for signal in STORED_SIGNALS)
+
+
+def drive_twin(
+    task: Task,
+    conditions: Sequence[Condition],
+    *,
+    robot: Robot | None = None,
+    perturbation: Perturbation | None = None,
+    seed: int = 0,
+    robots: int = ROBOTS,
+    steps: int = STEPS,
+) -> FedRows:
+    """Rows of whole episodes that ended within `steps` steps of each robot.
+
+    `conditions` are those that the twin's signals can say.
+
+    Raises:
+        ConfigError: the twin cannot keep the task's control period, or has no such body.
+    """
+    env = WarehouseVectorEnv(
+        robots, conditions=dict.fromkeys(KINDS, 1.0), perturbation=perturbation, seed=seed,
+        nthread=0, task=task, robot=robot,
+    )  # fmt: skip
+    table = np.asarray(task.actions, np.float64)
+    driver = Handover(
+        PlannerFollower(epsilon=EXPLORATION, seed=seed), Operator(epsilon=EXPLORATION, seed=seed)
+    )
+    taken: list[dict[str, NDArray[Any]]] = []
+    observation, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        action, _ = driver.act(env, observation)
+        now = {name: column.copy() for name, column in env.signals.items()}
+        after, reward, terminated, truncated, info = env.step(action)
+        ended = terminated | truncated
+        now["command_speed_mps"], now["command_yaw_rate_radps"] = table[action].T
+        step = {"now " + name: now[name] for name in _STORED}
+        step |= {"after " + name: info["signals"][name] for name in _STORED}
+        following = after.copy()
+        for place in np.flatnonzero(ended):
+            following[place] = info["final_obs"][place]
+        taken.append(
+            step
+            | {"observation": observation, "next_observation": following, "action": action}
+            | {"reward": reward, "terminated": terminated, "truncated": truncated}
+            | {"ended": ended, "invalid": info["invalid"]}
+        )
+        observation = after
+    env.close()
+    return _rows(task, conditions, taken)
+
+
+def _rows(
+    task: Task, conditions: Sequence[Condition], taken: Sequence[dict[str, NDArray[Any]]]
+) -> FedRows:
+    """Of T steps of N robots those whose episode ended, robot by robot."""
+    steps = {name: np.stack([step[name] for step in taken], axis=1) for name in taken[0]}
+    flat = {name: values.reshape(-1, *values.shape[2:]) for name, values in steps.items()}
+    ended = steps["ended"]
+    later = np.cumsum(ended[:, ::-1], axis=1)[:, ::-1].reshape(-1)  # ends from here on
+    robot = np.repeat(np.arange(len(ended)), ended.shape[1])
+    episode = np.unique(robot * (ended.shape[1] + 1) - later, return_inverse=True)[1].reshape(-1)
+    broken = np.isin(episode, episode[flat["invalid"]])
+    kept = (later > 0) & ~broken
+    chosen = {name: values[kept] for name, values in flat.items()}
+    episode = np.unique(episode[kept], return_inverse=True)[1].reshape(-1).astype(np.int64)
+    first = np.flatnonzero(np.append(True, np.diff(episode) != 0)[: len(episode)])
+    step = np.arange(len(episode)) - np.repeat(first, np.diff(np.append(first, len(episode))))
+    return FedRows(
+        task=task,
+        observation=chosen["observation"],
+        next_observation=chosen["next_observation"],
+        action=chosen["action"].astype(np.int64),
+        reward=chosen["reward"].astype(np.float64),
+        terminated=chosen["terminated"],
+        truncated=chosen["truncated"],
+        episode=episode,
+        step=step.astype(np.int64),
+        recording=np.full(len(episode), "twin"),
+        robot=np.full(len(episode), ""),
+        logged_ns=np.zeros(len(episode), np.int64),
+        condition=_labels(conditions, chosen, episode, step),
+        transition_id=np.arange(len(episode), dtype=np.int64),
+    )
+
+
+def _labels(
+    conditions: Sequence[Condition], rows: dict[str, NDArray[Any]], episode: Ints, step: Ints
+) -> NDArray[np.str_]:
+    """The one condition of each row, by the very rules that label logs."""
+    ends = np.flatnonzero(rows["ended"])
+    order = np.argsort(np.concatenate([np.arange(len(episode)), ends + 0.5]), kind="stable")
+    columns: dict[str, Any] = {
+        "episode_index": np.concatenate([episode, episode[ends]])[order],
+        "step_index": np.concatenate([step, step[ends] + 1])[order],
+    }
+    for name in _STORED:
+        both = np.concatenate([rows["now " + name], rows["after " + name][ends]])
+        columns[name] = both[order]
+    labels = label(pa.table(columns), list(conditions))
+    names = np.array(primary(labels, list(conditions)) or ["nominal"] * len(order))
+    return np.asarray(names[order < len(episode)], np.str_)
+
+
+Verdict = Literal["HEALTHY", "BUFFER", "UNDETERMINED"]
+
+
+@dataclass(frozen=True)
+class RowDiagnosis:
+    """What is wrong with rows before they are trained on, and the evidence."""
+
+    verdict: Verdict
+    findings: list[Finding]
+    comparisons: list[Comparison]
+    about: dict[str, Any]  # what was looked at
+
+    @property
+    def not_run(self) -> list[Comparison]:
+        """Checks that could not be made, each with the reason in `note`."""
+        return [row for row in self.comparisons if row.status == "not run"]
+
+    @property
+    def untrusted(self) -> list[str]:
+        """The conditions in which `restock twin gap` found the twin far from these logs."""
+        return untrusted(self.comparisons)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {
+            "verdict": self.verdict,
+            "untrusted": self.untrusted,
+            "findings": [asdict(one) for one in self.findings],
+            "comparisons": [asdict(row) for row in self.comparisons],
+            "about": self.about,
+        }
+
+
+class OpenedRows(NamedTuple):
+    """Rows at hand, and what needs more than them."""
+
+    rows: FedRows
+    profile: Profile
+    comparisons: list[Comparison]  # with the signals of their store
+    folders: list[Path]  # of the store and the panel: where a measured gap may be
+
+
+def diagnose_before_training(
+    path: Path | str,
+    *,
+    profile: Profile | None = None,
+    twin: bool = True,
+    perturbation: Perturbation | None = None,
+    task_hash: str | None = None,
+    run: Path | str | None = None,
+    seed: int = 0,
+) -> RowDiagnosis:
+    """Hold the rows of a panel or a store against the twin, and against the task's definitions.
+
+    Args:
+        profile: whose task and conditions the twin is driven with; None: that of the rows.
+        twin: False: only the checks that need none.
+        perturbation: of the twin, as `restock twin fit` finds it; None: the nominal one.
+        task_hash: whose rows, where a store has several tasks.
+        run: the run that was fed these rows, whose measured gap counts first.
+
+    Raises:
+        RunError: there is not a panel or a store.
+        PanelError, StoreError: it is damaged, has no rows, or its profile is not at hand.
+        ConfigError: the profile's task is not that of the rows.
+    """
+    begun = time.perf_counter()
+    opened = open_rows(Path(path), profile, task_hash)
+    own = opened.profile
+    fresh, reason = _drive(own, perturbation, seed) if twin else (None, "it was not requested")
+    diagnosis = diagnose_rows(opened.rows, fresh, reason, seed=seed, more=opened.comparisons)
+    places = [*([Path(run)] if run is not None else []), *opened.folders]
+    diagnosis = replace(diagnosis, comparisons=[*diagnosis.comparisons, *gap_evidence(places)])
+    diagnosis.about.update(
+        path=str(path), profile=own.name, task_hash=own.task.hash,
+        seconds=round(time.perf_counter() - begun, 1),
+    )  # fmt: skip
+    return diagnosis
+
+
+def diagnose_rows(
+    rows: FedRows, twin: FedRows | None, reason: str = "", *, seed: int = 0,
+    more: Sequence[Comparison] = (),
+) -> RowDiagnosis:  # fmt: skip
+    """The same of rows at hand; `reason` says why there are none of a twin. `more` comparisons,
+    made elsewhere, count like these."""
+    compared = answers(rows, twin, seed)
+    permuted = list(permuted_actions(rows, twin))
+    others = [*outcomes(rows, twin, seed), *row_order(rows), *values(rows, twin, seed), *more]
+    found = findings(compared, permuted, others, rows.task)
+    comparisons = [row for one in compared for row in one.comparisons]
+    of_relations = {row.check for row in comparisons}
+    comparisons += [row for row, _ in permuted] + others
+    of_robots = [one for one in found if not of_relations.isdisjoint(one.evidence)]
+    if of_robots or not found:  # else the rows are at fault, whichever robot's they are
+        own, unlike = unlike_recordings(rows, twin, seed)
+        comparisons += unlike
+        found = [one for one in found if not own or one not in of_robots] + own
+    if twin is None:
+        comparisons.append(not_run("twin", "rows of the twin", reason))
+    verdict: Verdict = "BUFFER" if found else "HEALTHY"
+    if not found and (len(rows) < MIN_ROWS or any(row.suspicious for row in comparisons)):
+        verdict = "UNDETERMINED"
+    about = {
+        "rows": len(rows),
+        "episodes": int(rows.last.sum()),
+        "left_out": rows.left_out,
+        "twin_rows": len(twin) if twin is not None else 0,
+    }
+    return RowDiagnosis(verdict, found, comparisons, about)
+
+
+def open_rows(
+    path: Path, profile: Profile | None = None, task_hash: str | None = None
+) -> OpenedRows:
+    """The rows of a panel or a store.
+
+    Raises:
+        as `diagnose_before_training`.
+    """
+    opened = _open(path, profile, task_hash)
+    own, of_rows = opened.profile, opened.rows.task.hash
+    if own.task.hash != of_rows:
+        raise ConfigError(
+            f"profile {own.name!r} defines task {own.task.hash}, the rows are of {of_rows}",
+            where=str(path),
+            remedy="give the profile with which they were ingested",
+        )
+    return opened
+
+
+def _open(path: Path, profile: Profile | None, task_hash: str | None) -> OpenedRows:
+    if (path / HEADER).is_file():
+        panel = Panel.open(path)
+        rows, own = of_panel(panel), profile or profile_of_panel(panel)
+        store_path, version = Path(panel.header.store), panel.store_version
+        if version < 0 or not is_store(store_path):
+            reason = f"the panel's store is no longer at {store_path}"
+            missing = [
+                not_run("fed labels", "labels against the store's", reason),
+                not_run("labels", "labels by stored signals", reason),
+            ]
+            return OpenedRows(rows, own, missing, [path])
+        with Store(store_path, version=version) as store:
+            compared = [*fed_labels(store, rows), *_of_store(store, rows, own)]
+            return OpenedRows(rows, own, compared, [store_path, path])
+    if is_store(path):
+        with Store(path) as store:
+            chosen = task_hash or store.task().hash
+            rows, own = of_store(store, chosen), profile or _profile_of_store(store, chosen)
+            return OpenedRows(rows, own, _of_store(store, rows, own), [path])
+    raise RunError(
+        "is not a panel or a store" if path.exists() else "there is no such panel or store",
+        where=str(path),
+        remedy="`restock mix STORE --mixture coverage --out PANEL` makes a panel",
+    )
+
+
+def _of_store(store: Store, rows: FedRows, profile: Profile) -> list[Comparison]:
+    conditions = conditions_in_twin(profile.conditions, profile.signals, lidar=profile.task.lidar)[
+        0
+    ]
+    return list(stored(store, rows, profile, conditions))
+
+
+def _profile_of_store(store: Store, task_hash: str) -> Profile:
+    newest = profiles_of(store.connection, task_hash)[0]
+    where, option = str(store.path), f"--profile {newest.name}.toml"
+    return carried_profile(newest.name, newest.toml, task_hash, where, option, StoreError)
+
+
+def _drive(
+    profile: Profile, perturbation: Perturbation | None, seed: int
+) -> tuple[FedRows | None, str]:
+    conditions: list[Condition] = conditions_in_twin(
+        profile.conditions, profile.signals, lidar=profile.task.lidar
+    )[0]
+    try:
+        driven = drive_twin(
+            profile.task, conditions, robot=profile.robot, perturbation=perturbation, seed=seed
+        )
+        return driven, ""
+    except RestockError as error:  # no such robot in the twin: the other checks still say much
+        return None, f"the twin cannot be driven with this profile: {error.what}"

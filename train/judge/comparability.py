@@ -1,0 +1,501 @@
+"""Decide whether two arms were the same but for the treatment: their settings, and what was fed.
+
+A difference test asks the wrong question of a feed: at a million draws it rejects trifles, and it
+takes rows of one episode for independent ones. So two feeds are comparable only if the data show
+that they differ by *at most* a stated limit. Shares are of conditions, which mean the same in both
+runs; a stratum is whatever its own run's mixture says. What a mixture fixes (the logged rows, by
+quotas and in turns) is compared as it is; what is random (which fresh episodes there were) is
+resampled by whole episodes. Total variation distance alone does not see a rare condition, hence the
+ratios.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from restock.arrays import F64, Ints
+from restock.errors import ArgumentError, RunError
+from restock.toml import by_path
+from restock.train.run.run import Run
+
+Verdict = Literal["comparable", "inconclusive", "incomparable"]
+_CHECKS = 30  # about as many are made of random figures
+_ORDER: list[Verdict] = ["comparable", "inconclusive", "incomparable"]
+
+
+@dataclass(frozen=True)
+class ComparabilityLimits:
+    """What still counts as the same feed."""
+
+    distance: float = 0.02  # total variation between the mixes of the whole run
+    tenth_distance: float = 0.05  # … of one tenth of it, which has a tenth of the episodes
+    share_ratio: float = 1.25  # of a condition's shares
+    share_floor: float = 0.0005  # conditions below this share in both are not asked for a ratio
+    unlabelled: float = 0.5  # share of the fresh rows drawn before their episode had labels
+    episode_ratio: float = 1.5  # of the numbers of episodes that a condition was drawn from
+    confidence: float = 0.95
+    resamples: int = 1000
+
+
+@dataclass(frozen=True)
+class Feed:
+    """What one arm's critics were fed: draws by cell (source/condition), tenth and episode.
+
+    Rows are sums over the draws of one episode in one cell and tenth.
+    """
+
+    cells: list[str]  # "logs/wheel_slip", …
+    cell: Ints  # (n,)
+    tenth: Ints  # (n,) 0 to 9
+    episode: Ints  # (n,) fresh ones are distinct over the arm's runs
+    run: Ints  # (n,)
+    drawn: F64  # (n,)
+    weight: F64  # (n,) the sum of importance weights
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of comparability, with its verdict."""
+
+    name: str  # "mix", "mix after weights", "share of logs/wheel_slip", …
+    part: str  # "whole run", or "tenth 3"
+    first: float | None  # the arms' own figures, where there are such
+    second: float | None
+    value: float  # distance, or ratio of the larger to the smaller
+    low: float  # of its confidence interval
+    high: float
+    limit: float
+
+    @classmethod
+    def exact(cls, name: str, first: float, second: float, value: float, limit: float) -> Check:
+        """Of counts of the whole run, with nothing random in them."""
+        return cls(name, "whole run", first, second, value, value, value, limit)
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.high <= self.limit:
+            return "comparable"
+        return "incomparable" if self.low > self.limit else "inconclusive"
+
+
+def worst(verdicts: Sequence[Verdict]) -> Verdict:
+    """The verdict of many: one that is incomparable decides."""
+    return max(verdicts, key=_ORDER.index, default="comparable")
+
+
+def check_feeds(
+    first: Feed, second: Feed, limits: ComparabilityLimits, rng: np.random.Generator
+) -> list[Check]:
+    """All checks. Both feeds must name the same cells in the same order."""
+    checks = []
+    totals = [_resampled(feed, limits, rng) for feed in (first, second)]
+    # Without importance weights the mix after weights is the mix.
+    weighted = any(not np.array_equal(feed.drawn, feed.weight) for feed in (first, second))
+    for kind, name in enumerate(("mix", "mix after weights")[: 1 + weighted]):
+        for tenth in (None, *range(10)):
+            limit = limits.distance if tenth is None else limits.tenth_distance
+            part = "whole run" if tenth is None else f"tenth {tenth + 1}"
+            cells = slice(None) if tenth is None else slice(tenth, tenth + 1)
+            a, b = (total[:, kind, cells].sum(1) for total in totals)
+            fed = a[0].sum() > 0, b[0].sum() > 0
+            if not all(fed):
+                if any(fed):  # one arm was not fed at all then
+                    checks.append(Check(name, part, None, None, 1.0, 1.0, 1.0, limit))
+                continue
+            with np.errstate(invalid="ignore"):  # a resample without a row: NaN, so inconclusive
+                a, b = a / a.sum(1, keepdims=True), b / b.sum(1, keepdims=True)
+            checks.append(_distance(name, part, a, b, limit, limits))
+            if tenth is None:
+                checks += _ratios(first.cells, name, a, b, limits)
+    return checks + _unlabelled(first, second, limits) + _episodes(first, second, limits)
+
+
+def _ratios(
+    cells: Sequence[str], name: str, a: F64, b: F64, limits: ComparabilityLimits
+) -> list[Check]:
+    after = " after weights" if name.endswith("weights") else ""
+    checks = []
+    for index, cell in enumerate(cells):
+        shares = float(a[0, index]), float(b[0, index])
+        if max(shares) < limits.share_floor:
+            continue
+        checks.append(_ratio(f"share of {cell}{after}", a[:, index], b[:, index], limits))
+    return checks
+
+
+def _unlabelled(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
+    """Rows drawn before they had labels may be of any condition: many of them show nothing."""
+    fresh = [name.startswith("fresh/") for name in first.cells]
+    shares = []
+    for feed in (first, second):
+        drawn = np.bincount(feed.cell, feed.drawn, len(feed.cells))
+        unknown = [name == "fresh/unlabelled" for name in feed.cells]
+        shares.append(float(drawn[unknown].sum() / max(drawn[fresh].sum(), 1e-12)))
+    most = max(shares)
+    if most <= limits.unlabelled:
+        return []
+    name = "unlabelled share of fresh rows"
+    return [Check(name, "whole run", shares[0], shares[1], most, 0.0, most, limits.unlabelled)]
+
+
+def _episodes(first: Feed, second: Feed, limits: ComparabilityLimits) -> list[Check]:
+    """Episodes that each cell was drawn from: a count, with nothing random in it."""
+    checks = []
+    totals = [np.bincount(f.cell, f.drawn, len(f.cells)) / f.drawn.sum() for f in (first, second)]
+    for index, cell in enumerate(first.cells):
+        if max(total[index] for total in totals) < limits.share_floor:
+            continue
+        one, other = _episodes_a_run(first, index), _episodes_a_run(second, index)
+        value = max(one, other) / min(one, other) if min(one, other) else math.inf
+        name = f"episodes of {cell}"
+        checks.append(Check.exact(name, one, other, value, limits.episode_ratio))
+    return checks
+
+
+def _episodes_a_run(feed: Feed, cell: int) -> float:
+    """Distinct episodes that a cell was drawn from, the mean over the arm's runs."""
+    here = feed.cell == cell
+    pairs = np.stack([feed.run[here], feed.episode[here]])
+    return float(np.unique(pairs, axis=1).shape[1] / (int(feed.run.max()) + 1))
+
+
+def _distance(
+    name: str, part: str, a: F64, b: F64, limit: float, limits: ComparabilityLimits
+) -> Check:
+    """Total variation distance of mixes (1 + R, C): the figure, then its resamples."""
+    values = np.abs(a - b).sum(1) / 2
+    value = float(values[0])
+    low, high, lowest, highest = _interval(values[1:], limits)
+    # Two resamples are further apart than what they are from, for noise alone; mirrored about the
+    # figure the interval errs to the other side. The wider of the two at each end says neither
+    # "same" nor "different" for noise.
+    low, high = min(lowest, 2 * value - highest), max(high, 2 * value - low)
+    return Check(name, part, None, None, value, max(low, 0.0), high, limit)
+
+
+def _ratio(name: str, a: F64, b: F64, limits: ComparabilityLimits) -> Check:
+    """The larger share over the smaller; a, b (1 + R,): the figure, then its resamples."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(a) - np.log(b)
+    logs[np.isnan(logs)] = 0.0  # none in both
+    low, high, lowest, highest = _interval(logs[1:], limits)
+    nearest = 0.0 if lowest <= 0 <= highest else min(abs(lowest), abs(highest))
+    return Check(
+        name,
+        "whole run",
+        float(a[0]),
+        float(b[0]),
+        float(np.exp(abs(logs[0]))),
+        math.exp(nearest) if nearest < 700 else math.inf,
+        math.exp(max(abs(low), abs(high))) if max(abs(low), abs(high)) < 700 else math.inf,
+        limits.share_ratio,
+    )
+
+
+def _interval(values: F64, limits: ComparabilityLimits) -> tuple[float, float, float, float]:
+    """The interval that shows "the same", and the wider one that must hold for "different".
+
+    All checks must pass for the same, but any one of them makes a difference: its interval is
+    widened for their number (Bonferroni), or noise would make one of thirty now and then.
+    """
+    tail = (1 - limits.confidence) / 2
+    # By order, not interpolated: between two infinite ratios there is nothing to interpolate.
+    low, high = np.quantile(values, [tail, 1 - tail], method="nearest")
+    if not np.isfinite(values).all():
+        return float(low), float(high), float(values.min()), float(values.max())
+    # So far out there are no resamples to count: the normal's tail.
+    centre, spread = float(values.mean()), float(values.std())
+    reach = NormalDist().inv_cdf(1 - tail / _CHECKS) * spread
+    return float(low), float(high), centre - reach, centre + reach
+
+
+def _resampled(feed: Feed, limits: ComparabilityLimits, rng: np.random.Generator) -> F64:
+    """Draws, then weights, by tenth and cell, (1 + R, 2, 10, C): as they were, then resampled.
+
+    A fresh episode is resampled as a whole: in all tenths and cells that it was drawn in.
+    """
+    from scipy.sparse import csr_array
+
+    cells = len(feed.cells)
+    place = feed.tenth * cells + feed.cell
+    amounts = (feed.drawn, feed.weight)
+    counts = [np.bincount(place, a, 10 * cells).astype(np.float64) for a in amounts]
+    total = np.stack(counts).reshape(2, 10, cells)
+    sums: F64 = np.repeat(total[None], 1 + limits.resamples, axis=0)
+    random = np.array([name.startswith("fresh/") for name in feed.cells])
+    fresh = random[feed.cell]
+    if not fresh.any():
+        return sums
+    _, episode = np.unique(feed.episode[fresh], return_inverse=True)
+    episodes = int(episode.max()) + 1
+    matrices = [
+        csr_array((a[fresh], (episode, place[fresh])), (episodes, 10 * cells)) for a in amounts
+    ]
+    for start in range(0, limits.resamples, 100):
+        stop = min(start + 100, limits.resamples)
+        # Poisson times each: the multinomial's, but for the total, which shares do not have.
+        times = rng.poisson(1.0, (stop - start, episodes)).astype(np.float64)
+        for kind, matrix in enumerate(matrices):
+            drawn = (times @ matrix).reshape(-1, 10, cells)
+            # The source's share of the batch is a setting, not random: it is kept.
+            was, now = total[kind][:, random].sum(-1), drawn[..., random].sum(-1)
+            drawn *= (was / np.maximum(now, 1e-12))[..., None]
+            sums[1 + start : 1 + stop, kind][..., random] = drawn[..., random]
+    return sums
+
+
+Treatment = Literal["algorithm", "target", "mixture", "practice", "data", "method"]
+Kind = Literal[
+    "algorithm",
+    "target",
+    "feed",
+    "practice",
+    "environment",
+    "store",
+    "evaluation",
+    "task",
+    "software",
+    "free",
+]
+
+# What each treatment allows to differ, besides what decides nothing.
+ALLOWED: Mapping[Treatment, frozenset[Kind]] = {
+    "algorithm": frozenset({"algorithm"}),
+    "target": frozenset({"target"}),
+    "mixture": frozenset({"feed", "environment"}),
+    "practice": frozenset({"practice"}),
+    "data": frozenset({"feed", "environment", "practice"}),  # all that is learnt from
+    # Off-policy and policy-gradient methods have no replay in common: what is held is the twin,
+    # its conditions, the environment steps and the evaluation.
+    "method": frozenset({"algorithm", "target", "feed"}),
+}
+_KINDS: dict[str, Kind] = {
+    "config.seed": "free",
+    "config.device": "free",
+    "config.threads": "free",
+    "config.record": "free",
+    "config.env.overlap": "free",
+    "config.profile": "free",  # a name or a file: `profile` says what it held
+    "config.target": "target",
+    "config.evaluation.off_policy": "free",
+    "config.evaluation": "evaluation",
+    "config.network": "algorithm",
+    "config.loss": "algorithm",
+    "config.optimizer": "algorithm",
+    "config.teacher": "algorithm",
+    "config.practice": "practice",
+    "config.env.conditions": "practice",
+    "config.env.perturbation": "environment",
+    "config.env.layouts": "environment",
+    "config.env.missions": "practice",
+    "config.env.missions_share": "practice",
+    "library.replay": "feed",
+    "library.target": "target",
+    "config": "feed",  # replay, schedule, env, epsilon: which rows there are and how often
+    "panel.store": "store",
+    "panel.store_version": "store",
+    "panel.others": "store",
+    "panel.labels_version": "store",
+    "panel.path": "free",
+    "panel": "feed",
+    "task_hash": "task",
+    "labels_version": "task",
+    "profile": "task",
+    "versions": "software",
+}
+_NO_SETTING = frozenset(  # or it follows from the config
+    {"format", "created_ns", "target", "seeds", "update_path", "profile_toml"}
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A setting in which two arms (or two runs of one) differ."""
+
+    setting: str
+    kind: Kind
+    first: Any
+    second: Any
+
+
+class Arm:
+    """Runs of one method. Raises RunError where they are not, or have not learnt anything."""
+
+    def __init__(self, name: str, paths: Sequence[Path | str]) -> None:
+        if isinstance(paths, Path | str):  # a text is a sequence, too: of its letters
+            what = f"{name} must be a list of runs, got {str(paths)!r}"
+            raise ArgumentError(what, remedy=f"give [{str(paths)!r}]")
+        self.name = name
+        self.runs = [Run.open(path) for path in paths]
+        for run in self.runs:
+            fed = run.table("sampled_episodes")
+            if not fed.num_rows or fed["condition"].null_count:
+                raise RunError(
+                    "has no record of the episodes it sampled by condition",
+                    where=str(run.path),
+                    remedy="it has made no update yet, or was written by an older Restock: train "
+                    "it again",
+                )
+        refuse_dependent(self.runs)
+
+    @cached_property
+    def totals(self) -> dict[str, float]:
+        """What a run of this arm did, in the mean: environment steps and updates."""
+        for run in self.runs:
+            if not run.table("progress").num_rows:
+                raise RunError(
+                    "is missing or has no rows, so the length of the run is not known",
+                    where=str(run.path / "progress.parquet"),
+                    remedy="restore the file from a copy, or train the run again",
+                )
+        last = [
+            run.table("progress").slice(run.table("progress").num_rows - 1) for run in self.runs
+        ]
+        return {
+            name: float(np.mean([row[name][0].as_py() for row in last]))
+            for name in ("env_steps", "gradient_steps")
+        }
+
+    def fed(self) -> pa.Table:
+        """Return draws by run, cell, tenth and episode."""
+        import duckdb
+
+        query = files("restock.train.judge").joinpath("fed_mix.sql").read_text(encoding="utf-8")
+        parts = []
+        with duckdb.connect() as connection:
+            for number, run in enumerate(self.runs):
+                connection.register("fed", run.table("sampled_episodes"))
+                table: pa.Table = connection.sql(query).to_arrow_table()
+                runs = pa.array([number] * table.num_rows, pa.int64())
+                parts.append(table.append_column("run", runs))
+        return pa.concat_tables(parts)
+
+
+def refuse_dependent(runs: Sequence[Run]) -> None:
+    """Runs of one method are independent seeds of it, or their spread is too small.
+
+    Raises:
+        RunError: there is none, two are one run (or copies of it) or have one seed, or their
+            settings differ.
+    """
+    if not runs:
+        raise RunError("no run was given", remedy="give at least one of each method")
+    by_seed: dict[Any, Run] = {}
+    for run in runs:
+        unlike = [
+            difference
+            for difference in differences(runs[0], run)
+            if difference.kind not in ("free", "software")
+        ]
+        if unlike:
+            raise RunError(
+                f"differs from {runs[0].path} in {unlike[0].setting}"
+                f" ({unlike[0].first!r} against {unlike[0].second!r}): the runs of one method "
+                "may differ only in their seed",
+                where=str(run.path),
+                remedy="give runs of one method; `restock compare` takes those of another one "
+                "after --against",
+            )
+        seed = run.document["config"].get("seed")
+        other = by_seed.setdefault(seed, run)
+        if other is run or seed is None:
+            continue
+        if other.path.resolve() == run.path.resolve():
+            raise RunError("is given twice", where=str(run.path), remedy="leave one of them out")
+        copied = same_run(other, run)
+        raise RunError(
+            f"is a copy of {other.path}" if copied else f"has the seed of {other.path}, {seed}",
+            where=str(run.path),
+            remedy="runs of one method count as independent seeds: leave one of them out"
+            + ("" if copied else ", or train it again with another --set seed=N"),
+        )
+
+
+def same_run(first: Run, second: Run) -> bool:
+    """Whether two directories hold one run: a copy has the same time of creation and settings."""
+    return first.document == second.document
+
+
+def feeds(first: Arm, second: Arm) -> tuple[Feed, Feed]:
+    """Return what two arms were fed, over the cells of both."""
+    tables = first.fed(), second.fed()
+    cells = sorted({name for table in tables for name in table["cell"].unique().to_pylist()})
+    a, b = (_feed(table, cells) for table in tables)
+    return a, b
+
+
+def _feed(table: pa.Table, cells: list[str]) -> Feed:
+    run = np.asarray(table["run"], np.int64)
+    names = table["episode"].to_numpy(zero_copy_only=False).astype(str)
+    fresh = np.asarray(table["source"].to_numpy(zero_copy_only=False) == "fresh")
+    # Every run has its own fresh episode 7; an episode of the logs is the same one in all runs.
+    owner = np.where(fresh, run, -1)
+    _, episode = np.unique(
+        np.char.add(np.char.add(owner.astype(str), "/"), names), return_inverse=True
+    )
+    place = {name: index for index, name in enumerate(cells)}
+    cell = np.array([place[name] for name in table["cell"].to_pylist()], np.int64)
+
+    def column(name: str) -> F64:
+        return np.asarray(table[name], np.float64)
+
+    return Feed(
+        cells,
+        cell,
+        np.asarray(table["tenth"], np.int64),
+        episode,
+        run,
+        column("drawn"),
+        column("weight"),
+    )
+
+
+def differences(first: Run, second: Run) -> list[Difference]:
+    """The settings in which two runs differ, each with what kind of difference it is."""
+    a, b = _settings(first), _settings(second)
+    if a.get("panel.id") is None or b.get("panel.id") is None:
+        # One was fed no logs at all: that is one difference of the feed, not one of the store.
+        for settings in (a, b):
+            has = settings.get("panel.id") is not None
+            for name in [name for name in settings if name.split(".")[0] == "panel"]:
+                if not (name == "panel.id" and has):
+                    del settings[name]
+    for settings in (a, b):  # what the natural rule does not read makes no difference
+        if settings.setdefault("config.practice.rule", "natural") == "natural":
+            for name in [n for n in settings if n.startswith("config.practice.")]:
+                settings[name] = "natural" if name.endswith(".rule") else None
+    return [
+        Difference(name, kind_of(name), a.get(name), b.get(name))
+        for name in dict.fromkeys([*a, *b])
+        if a.get(name) != b.get(name)
+    ]
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """Return what `config.json` says of a run, by dotted name.
+
+    Shares of strata are left out: `panel.id` stands for them, and two of one name are not the same.
+    """
+    document = run.document
+    settings = by_path({key: document[key] for key in document if key not in _NO_SETTING})
+    shares = ("panel.strata.", "panel.forecast")
+    return {name: value for name, value in settings if not name.startswith(shares)}
+
+
+def kind_of(setting: str) -> Kind:
+    """What kind of difference a setting makes; the longest known prefix decides."""
+    parts = setting.split(".")
+    for length in range(len(parts), 0, -1):
+        if (kind := _KINDS.get(".".join(parts[:length]))) is not None:
+            return kind
+    return "algorithm"

@@ -1,0 +1,505 @@
+"""Do stored labels and ends follow from the stored signals, by the very rules that made them?
+
+A store keeps the signals that conditions were computed from, so conditions can be computed again,
+and so can terminations. A panel is held against the store that it was made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+
+from restock.arrays import F32, F64, Bools
+from restock.errors import ConfigError
+from restock.ingest.profile.profile import Profile
+from restock.ingest.store.episode_rows import label_table
+from restock.ingest.task.conditions import Condition, label
+from restock.ingest.task.signals import STORED_SIGNALS, Signals
+from restock.ingest.task.task import reward_parts, terminated
+from restock.replay.store.parquet_views import passed_in
+from restock.replay.store.store import Store
+from restock.stats import (
+    ConfidenceInterval,
+    cluster_counts,
+    clustered_quantiles,
+    percentiles,
+)
+from restock.train.judge.answers import MIN_CLUSTERS, RESAMPLES, ratio_of
+from restock.train.judge.fed_rows import (
+    MAX_ROWS,
+    Comparison,
+    FedRows,
+    judged,
+    not_run,
+    share_judged,
+    shares_compared,
+)
+from restock.train.twin.calibration.logged_steps import LoggedSteps, logged_steps, rows_of
+
+MOST = 0.02  # of the rows
+_EQUAL = 1e-4
+_MIN_STEPS = 10  # of an episode, for its repetition to be no accident
+
+
+def row_order(rows: FedRows) -> Iterator[Comparison]:
+    """Every check of rows against rows."""
+    joined, before = rows.joined, np.maximum(np.arange(len(rows)) - 1, 0)
+    count = int(joined.sum())
+    apart = _differ(rows.next_observation[before], rows.observation) & joined
+    yield share_judged(
+        "chain", "next observation is not the observation of the next row", int(apart.sum()), count,
+        MOST,
+    )  # fmt: skip
+    acted = rows.previous_action() != rows.action[before]
+    yield share_judged(
+        "previous action", "observation does not hold the action of the row before",
+        int((acted & joined).sum()), count, MOST,
+    )  # fmt: skip
+    after = rows.previous_action(after=True) != rows.action
+    yield share_judged(
+        "own action", "next observation does not hold the row's own action", int(after.sum()),
+        len(rows), MOST,
+    )  # fmt: skip
+    yield _foresight(rows, joined)
+    change = rows.sectors() - rows.sectors()[before]
+    names = enumerate(rows.task.observation_names)
+    first = next((place for place, name in names if name.startswith("closing_")), 0)
+    closing = rows.observation[:, first : first + rows.task.sectors]
+    unlike = (np.abs(change - closing) > 10 * _EQUAL).any(axis=1) & joined
+    yield share_judged(
+        "closing", "clearances did not change as in the observation", int(unlike.sum()),
+        count, MOST,
+    )  # fmt: skip
+    yield _still(rows)
+    yield _repeated(rows)
+
+
+def _foresight(rows: FedRows, joined: Bools) -> Comparison:
+    """An observation that holds the action taken at it, where that is not the one before."""
+    before = np.maximum(np.arange(len(rows)) - 1, 0)
+    changed = joined & (rows.action != rows.action[before])
+    knows = changed & (rows.previous_action() == rows.action)
+    return share_judged(
+        "foresight", "observation contains the action that is only taken "
+            "afterwards", int(knows.sum()),
+        int(changed.sum()), MOST,
+    )  # fmt: skip
+
+
+def _still(rows: FedRows) -> Comparison:
+    """Moving rows whose next observation is the observation."""
+    moving = np.abs(rows.now("wheel_speed")) > 0.1
+    same = ~_differ(rows.observation, rows.next_observation) & moving
+    return share_judged(
+        "unchanged", "next observation is the observation, though the robot moves",
+        int(same.sum()), int(moving.sum()), MOST,
+    )  # fmt: skip
+
+
+def _repeated(rows: FedRows) -> Comparison:
+    """Rows of episodes that are another's, byte for byte, or steps that are there twice."""
+    what = "row belongs to an episode that is stored twice"
+    if not len(rows):
+        return not_run("repeated episodes", what, "no rows")
+    starts = np.append(np.flatnonzero(np.append(True, rows.last[:-1])), len(rows))
+    seen: set[int] = set()
+    same_step = (np.diff(rows.episode) == 0) & (np.diff(rows.step) == 0)
+    repeated = int(same_step.sum())
+    for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        if end - begin < _MIN_STEPS:
+            continue
+        content = hash((rows.observation[begin:end].tobytes(), rows.action[begin:end].tobytes()))
+        repeated += (end - begin) if content in seen else 0
+        seen.add(content)
+    return share_judged("repeated episodes", what, repeated, len(rows), MOST)
+
+
+def _differ(first: F32, second: F32) -> Bools:
+    return np.asarray((np.abs(first - second) > _EQUAL).any(axis=1), np.bool_)
+
+
+SCALE = 1.2
+OTHER = 0.1  # of the rows
+LOST = 0.05  # of the ends
+_JUMP_M = 0.9  # a plan was replaced
+_TOUCHING_M = 0.05
+_TELLING = 0.05  # of a reward: more than float32 and a noisy clearance make
+_ARRIVED_M = 0.15  # of plan beyond the goal's radius: the plan is never shorter than the way
+
+
+def implied_reward(rows: FedRows) -> F64:
+    """The reward (N,) that the observations come to; NaN where they do not say."""
+    task = rows.task
+    clearance = np.full(len(rows), np.nan)
+    if task.lidar:
+        clearance = rows.sectors(after=True).min(axis=1) ** 2 * task.range_max_m
+    unknown: Signals = {signal.name: np.zeros(len(rows), signal.dtype) for signal in STORED_SIGNALS}
+    now: Signals = unknown | {"wheel_speed_mps": rows.now("wheel_speed")}
+    after: Signals = unknown | {
+        "wheel_speed_mps": rows.after("wheel_speed"),
+        "localised_speed_mps": rows.after("localised_speed"),
+        "clearance_m": clearance,
+        "goal_distance_m": np.full(len(rows), np.inf),
+    }
+    progress = _progress(rows)
+    parts = reward_parts(task, now, after, progress, rows.action, rows.previous_action())
+    implied = np.asarray(sum(parts.values()), np.float64)
+    implied[(clearance < _TOUCHING_M) | arrived(rows) | rows.terminated] = np.nan
+    return implied
+
+
+def arrived(rows: FedRows) -> Bools:
+    """The rows (N,) after which the robot is at its goal, as far as its plan says."""
+    if rows.task.goal == "none":
+        return np.zeros(len(rows), np.bool_)
+    to_go = 10.0 * rows.after("goal_distance")
+    return np.asarray(to_go <= rows.task.goal_radius_m + _ARRIVED_M, np.bool_)
+
+
+def _progress(rows: FedRows) -> F64:
+    if rows.task.goal == "none":
+        return rows.after("localised_speed") * rows.task.control_period_s
+    now, after = rows.now("goal_distance"), rows.after("goal_distance")
+    shorter = 10.0 * (now - after)
+    shorter[(now >= 1.0) | (after >= 1.0) | (np.abs(shorter) > _JUMP_M)] = np.nan
+    return np.asarray(shorter)
+
+
+def outcomes(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
+    """Rewards, then ends."""
+    rng = np.random.default_rng([seed, 2])
+    yield from _rewards(logs, twin, rng)
+    yield from _ends(logs, twin)
+
+
+def _rewards(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
+    what = "reward against the task's own, of the same observations"
+    implied = implied_reward(logs)
+    telling = np.abs(implied) > _TELLING  # False for NaN
+    if len(np.unique(logs.cluster[telling])) < MIN_CLUSTERS:
+        yield not_run(
+            "reward scale", what, "too few rows whose reward follows from their observations"
+        )
+        return
+    ratio = logs.reward[telling] / implied[telling]
+    (scale,) = clustered_quantiles(
+        ratio, logs.cluster[telling], (0.5,), rng=rng, resamples=RESAMPLES
+    )
+    yield judged(
+        "reward scale", what, "ratio", scale, logs=float(np.median(ratio)), twin=1.0,
+        least=1 / SCALE, most=SCALE, logs_rows=int(telling.sum()),
+    )  # fmt: skip
+    what = "row's reward is not the task's own, whatever its scale"
+    found = _unlike(logs, implied, scale.value)
+    if twin is None:
+        yield share_judged("reward rows", what, *found, OTHER)
+    else:
+        expected = _unlike(twin, implied_reward(twin), 1.0)
+        yield shares_compared("reward rows", what, found, expected, -1.0, OTHER)
+
+
+def _unlike(rows: FedRows, implied: F64, scale: float) -> tuple[int, int]:
+    """Rows whose reward is not the implied one times `scale`, and of how many that is known."""
+    known = np.isfinite(implied)
+    scale = scale if abs(scale) > _TELLING else 1.0
+    off = np.abs(rows.reward[known] / scale - implied[known]) > _TELLING
+    return int(off.sum()), int(known.sum())
+
+
+def _ends(logs: FedRows, twin: FedRows | None) -> Iterator[Comparison]:
+    inside = logs.terminated & ~logs.last
+    yield share_judged(
+        "goes on after its end", "row is terminated and its episode goes on", int(inside.sum()),
+        int(logs.terminated.sum()), LOST,
+    )  # fmt: skip
+    if logs.task.goal == "none":
+        for check in ("terminated at the goal", "goal reward"):
+            yield not_run(check, "what happens on arrival", "the task has no goal")
+        return
+
+    def at_goal(rows: FedRows) -> tuple[int, int]:
+        there = arrived(rows) & rows.last
+        return int((rows.terminated & there).sum()), int(there.sum())
+
+    what = "of the episodes that end at their goal, those terminated there"
+    if twin is not None:
+        yield shares_compared(
+            "terminated at the goal", what, at_goal(logs), at_goal(twin), -LOST, LOST
+        )
+    else:
+        yield share_judged("terminated at the goal", what, *at_goal(logs), 1.0, least=1 - LOST)
+    yield _goal_reward(logs, twin)
+
+
+def _goal_reward(logs: FedRows, twin: FedRows | None) -> Comparison:
+    what = "reward of the last step of episodes that end at their goal"
+    there = arrived(logs) & logs.last
+    if there.sum() < 5:
+        return not_run("goal reward", what, "fewer than 5 episodes end there")
+    value = float(np.median(logs.reward[there]))
+    expected = logs.task.rewards.goal
+    if twin is not None and (arrived(twin) & twin.last).sum() >= 5:
+        expected = float(np.median(twin.reward[arrived(twin) & twin.last]))
+    if not expected:
+        return not_run("goal reward", what, "arriving earns nothing")
+    ends = np.quantile(logs.reward[there], [0.25, 0.75]) / expected
+    interval = ConfidenceInterval(value / expected, float(ends.min()), float(ends.max()))
+    return judged("goal reward", what, "ratio", interval, logs=value, twin=expected,
+                  least=1 / SCALE, most=SCALE, logs_rows=int(there.sum()))  # fmt: skip
+
+
+BEYOND = 0.02  # of the rows
+SPREAD = 10.0  # of logs over the twin's, or its inverse
+TURNED_DEG = 20.0
+LIDAR_SCALE = 1.5  # of logs over the twin's, or its inverse
+MEASURED = (
+    *("wheel_speed", "localised_speed", "lateral_speed", "gyro_yaw_rate", "accel_x"),
+    "goal_distance",
+)
+CLEARANCES = "clearances"  # of all sectors in the mean
+_MAY_BE_STILL = ("lateral_speed",)  # a robot that does not slide has none
+_WIDER = 1.0  # of the twin's range, on each side
+_STRAIGHT_RADPS = 0.15
+_DRIVING_MPS = 0.25
+_FAR = 0.97  # of the lidar's range
+
+
+def values(logs: FedRows, twin: FedRows | None, seed: int = 0) -> Iterator[Comparison]:
+    """Ranges and spreads of what is measured, then the lidar's bearing and scale."""
+    if twin is None:
+        yield not_run("range", "values against the twin's", "no twin to compare with")
+    else:
+        few = len(np.unique(logs.episode)) < MIN_CLUSTERS
+        for name in (*MEASURED, CLEARANCES) if logs.task.lidar else MEASURED:
+            for row in _entry(name, logs, twin, np.random.default_rng([seed, 4])):
+                yield replace(row, status="undecided") if few and row.off else row
+    yield from _lidar(logs, twin, np.random.default_rng([seed, 3]))
+
+
+def _entry(
+    name: str, logs: FedRows, twin: FedRows, rng: np.random.Generator
+) -> Iterator[Comparison]:
+    of_logs, of_twin = (
+        rows.sectors().mean(axis=1) if name == CLEARANCES else rows.now(name)
+        for rows in (logs, twin)
+    )
+    low, high = float(of_twin.min()), float(of_twin.max())
+    room = _WIDER * (high - low)
+    if room <= 0:
+        return
+    beyond = (of_logs < low - room) | (of_logs > high + room)
+    yield share_judged(
+        f"range: {name}", f"{name} is far beyond any of the twin's", int(beyond.sum()), len(logs),
+        BEYOND, note=f"{float(of_logs.min()):.3g} to {float(of_logs.max()):.3g}, in the twin"
+        f" {low:.3g} to {high:.3g}",
+    )  # fmt: skip
+    least, most = clustered_quantiles(
+        of_logs, logs.cluster, (0.05, 0.95), rng=rng, resamples=RESAMPLES
+    )
+    expected = float(np.subtract(*np.quantile(of_twin, [0.95, 0.05])))
+    spread = ConfidenceInterval(
+        (most.value - least.value) / expected,
+        (most.low - least.high) / expected,
+        (most.high - least.low) / expected,
+    )
+    yield judged(
+        f"spread: {name}", f"spread of {name} against the twin's", "ratio", spread,
+        logs=most.value - least.value, twin=expected,
+        least=0.0 if name in _MAY_BE_STILL else 1 / SPREAD, most=SPREAD,
+        logs_rows=len(logs), twin_rows=len(twin),
+    )  # fmt: skip
+
+
+def _lidar(logs: FedRows, twin: FedRows | None, rng: np.random.Generator) -> Iterator[Comparison]:
+    """By how many degrees the logs' sectors are turned against the twin's (or a cosine), and how
+    much nearer things come for each metre driven, compared with the twin."""
+    what = "bearing in which things come nearer when driving on"
+    if not logs.task.lidar:
+        yield not_run("lidar bearing", what, "the robot has no lidar")
+        return
+    task, width = logs.task, 360 / logs.task.sectors
+    found = _approach(logs, rng)
+    expected = _approach(twin, rng) if twin is not None else None
+    if expected is not None:
+        shape = expected[0]
+    else:
+        shape = np.cos(np.radians((np.arange(task.sectors) + 0.5) * width - 180))
+    if found is None or (twin is not None and expected is None):
+        yield not_run("lidar bearing", what, "too few rows of driving straight on")
+        return
+    turns = np.arange(task.sectors)
+    turned = np.stack([np.roll(shape, turn) for turn in turns])  # (turns, sectors)
+    fits = found @ turned.T  # (1 + R, turns): how alike, at each turn
+    best = fits.argmax(axis=1)
+    degrees = np.where(best > task.sectors // 2, best - task.sectors, best) * width
+    low, high = percentiles(degrees[1:])
+    rows, twin_rows = len(logs), len(twin) if twin is not None else 0
+    yield judged(
+        "lidar bearing", what, "degrees", ConfidenceInterval(float(degrees[0]), low, high),
+        logs=float(degrees[0]), twin=0.0, least=-TURNED_DEG, most=TURNED_DEG,
+        logs_rows=rows, twin_rows=twin_rows,
+    )  # fmt: skip
+    if expected is not None and twin is not None:
+        nearer, of_twin = fits.max(axis=1), expected @ shape
+        fewer = min(len(np.unique(one.cluster)) for one in (logs, twin))
+        at = float(nearer[0]), float(of_twin[0])
+        norm = float(shape @ shape)
+        yield judged(
+            "lidar scale", "how much nearer things come for a metre driven", "ratio",
+            ratio_of(nearer[1:], of_twin[1:], at, fewer), logs=at[0] / norm, twin=at[1] / norm,
+            least=1 / LIDAR_SCALE, most=LIDAR_SCALE,
+            logs_rows=rows, twin_rows=twin_rows,
+        )  # fmt: skip
+
+
+def _approach(rows: FedRows, rng: np.random.Generator) -> F64 | None:
+    """How much nearer each sector comes for each metre driven, (1 + R, sectors), bootstrapped."""
+    task = rows.task
+    now, after = rows.sectors() ** 2 * task.range_max_m, rows.sectors(after=True) ** 2
+    after = after * task.range_max_m
+    driven = rows.after("localised_speed") * task.control_period_s
+    straight = np.abs(rows.after("gyro_yaw_rate")) < _STRAIGHT_RADPS
+    straight &= np.abs(driven) > _DRIVING_MPS * task.control_period_s
+    most = _FAR**2 * task.range_max_m
+    seen: Bools = straight[:, None] & (now < most) & (after < most) & (np.abs(after - now) < 0.5)
+    place = np.unique(rows.cluster, return_inverse=True)[1].reshape(-1)
+    clusters = int(place.max(initial=-1)) + 1
+    if clusters < MIN_CLUSTERS or seen.sum() < 100:
+        return None
+    above, below = np.zeros((2, clusters, task.sectors))
+    np.add.at(above, place, np.where(seen, (now - after) * driven[:, None], 0.0))
+    np.add.at(below, place, np.where(seen, driven[:, None] ** 2, 0.0))
+    counts = np.concatenate([np.ones((1, clusters)), cluster_counts(clusters, RESAMPLES, rng)])
+    bottom = counts @ below
+    slope = np.where(bottom > 1e-9, (counts @ above) / np.maximum(bottom, 1e-9), 0.0)
+    return np.asarray(slope - slope.mean(axis=1, keepdims=True))
+
+
+FAR = 0.25  # from a command to its action, in units of the fastest action
+COARSE = 0.1  # of the commands, those so far
+DIFFERENT = 0.02  # of the rows that have a label, or should
+_LABELS = "row's label differs from what its conditions give on the stored signals"
+_FED = "row's label in the panel differs from that in its store"
+_ENDS = "termination of the row does not agree with its signals"
+
+
+def stored(
+    store: Store, rows: FedRows, profile: Profile, conditions: Sequence[Condition]
+) -> Iterator[Comparison]:
+    """Commands and actions, labels, and terminations; of whole recordings of some 40,000 rows.
+
+    `conditions` are those of the profile that the stored signals can say; `rows` are of the store.
+    """
+    yield _far_commands(store, rows.task.hash)
+    recordings, left_out = _recordings(store, rows.task.hash, profile.labels_version)
+    if not recordings:
+        for check, what in (("labels", _LABELS), ("terminations", _ENDS)):
+            yield not_run(check, what, left_out)
+        return
+    steps = logged_steps(store, rows.task.hash, recordings)
+    whole = _whole(steps)
+    yield from _labels(steps, whole, conditions, left_out)
+    yield _terminations(steps, rows)
+
+
+def fed_labels(store: Store, rows: FedRows) -> Iterator[Comparison]:
+    """Of each condition the rows of a panel whose label is not the one in its store."""
+    fed = pa.table({"transition_id": rows.transition_id, "fed": rows.condition})
+    with passed_in(store.connection, fed=fed):
+        found = store.connection.sql(
+            "WITH labels AS (SELECT fed, coalesce(primary_condition, '') AS stored"
+            " FROM fed JOIN transitions USING (transition_id) WHERE task_hash = ?)"
+            " SELECT name, count(*) FILTER (fed <> stored), count(*)"
+            " FROM (SELECT fed AS name, fed, stored FROM labels UNION ALL"
+            " SELECT stored, fed, stored FROM labels WHERE fed <> stored)"
+            " GROUP BY ALL ORDER BY ALL",
+            params=[rows.task.hash],
+        ).fetchall()
+    for name, differ, either in found:
+        yield share_judged(f"fed labels: {name}", _FED, differ, either, DIFFERENT)
+
+
+def _far_commands(store: Store, task_hash: str) -> Comparison:
+    ((far, count),) = store.connection.sql(
+        "SELECT count(*) FILTER (action_residual > ?), count(action_residual) FROM transitions"
+        " WHERE task_hash = ?",
+        params=[FAR, task_hash],
+    ).fetchall()
+    what = "command is far from the action that represents it"
+    return share_judged("far commands", what, far, count, COARSE)
+
+
+def _recordings(store: Store, task_hash: str, version: str) -> tuple[list[str], str]:
+    """Recordings that these rules labelled and nobody corrected, and what is said of the others."""
+    found = store.connection.sql(
+        "SELECT recording_id, labels_version, count(*) FROM transitions WHERE task_hash = ?"
+        " GROUP BY ALL ORDER BY ALL",
+        params=[task_hash],
+    ).fetchall()
+    same = [(name, count) for name, labels, count in found if labels == version]
+    total = np.cumsum([count for _, count in same])
+    chosen = [name for (name, _), sum_ in zip(same, total, strict=True) if sum_ <= MAX_ROWS]
+    chosen = chosen or [name for name, _ in same[:1]]
+    others = len(found) - len(same)
+    note = (
+        f"{others} of {len(found)} recordings were labelled with other rules than the profile's, "
+        "or corrected by people: `restock store label STORE` updates them"
+        if others
+        else ""
+    )
+    return chosen, note
+
+
+def _whole(steps: LoggedSteps) -> Bools:
+    """The rows (N,) of episodes that are stored whole, their end too."""
+    ended = np.isin(steps.episode_id, steps.episode_id[steps.ending])
+    broken = steps.episode_id[steps.begins & (steps.step_index > 0)]
+    return np.asarray(ended & ~np.isin(steps.episode_id, broken), np.bool_)
+
+
+def _labels(
+    steps: LoggedSteps, whole: Bools, conditions: Sequence[Condition], note: str
+) -> Iterator[Comparison]:
+    if not whole.any():
+        yield not_run("labels", _LABELS, "no episode is stored whole")
+        return
+    kept = np.flatnonzero(whole)
+    ends = np.flatnonzero(whole[steps.ending])
+    rows = np.concatenate([kept, steps.ending[ends]])
+    step = np.concatenate([steps.step_index[kept], steps.step_index[steps.ending[ends]] + 1])
+    episode = np.unique(steps.episode_id[rows], return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((step, episode))
+    of_ends = rows_of(steps.ends, ends)
+    signals = {
+        name: np.concatenate([column[kept], of_ends[name]])[order]
+        for name, column in steps.now.items()
+    }
+    custom = pa.table({"_": pa.nulls(len(order))}).select([])
+    table = label_table(signals, episode[order].astype(np.int64), step[order], custom)
+    try:
+        again = label(table, list(conditions))
+    except ConfigError as error:
+        yield not_run("labels", _LABELS, str(error))
+        return
+    is_row = order < len(kept)
+    back = np.argsort(order[is_row])
+    for name, holds in again.items():
+        now = holds[is_row][back]
+        before = steps.conditions.get(name, np.zeros(len(steps), np.bool_))[kept]
+        either = int((now | before).sum())
+        yield share_judged(
+            f"labels: {name}", _LABELS, int((now != before).sum()), either, DIFFERENT, note=note
+        )
+
+
+def _terminations(steps: LoggedSteps, rows: FedRows) -> Comparison:
+    place = {number: index for index, number in enumerate(rows.transition_id.tolist())}
+    at = np.array([place.get(number, -1) for number in steps.transition_id.tolist()], np.int64)
+    known = steps.followed & (at >= 0)
+    again = terminated(steps.task, rows_of(steps.after, np.flatnonzero(known)))
+    stored_ends = rows.terminated[at[known]]
+    either = int((again | stored_ends).sum())
+    return share_judged("terminations", _ENDS, int((again != stored_ends).sum()), either, DIFFERENT)
