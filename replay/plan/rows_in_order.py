@@ -125,8 +125,11 @@ class _Stretches:
 
 
 def _in_order(batches: list[_Stretches], rank: Ints) -> list[tuple[int, int, int]] | None:
-    """Batch, begin and size of each stretch, in order; None where rows must be sorted: those of one
-    are not in order, two overlap, or they are so short that it would take longer."""
+    """Return batch, begin and size of each stretch, in order; None if rows must be sorted.
+
+    They must if a stretch is not in order, if two overlap, or if stretches are so short that
+    sorting is faster.
+    """
     if not all(one.in_order for one in batches):
         return None
     none = np.empty(0, np.int64)
@@ -175,8 +178,10 @@ def _encoded(column: pa.Array, known: dict[str, int]) -> pa.Array:
 
 
 def _by_appearance(codes: pa.Array, names: list[str]) -> pa.DictionaryArray:
-    """Codes of names as a dictionary's, renumbered in the order of the first rows that have them:
-    which thread read which rows first must not show."""
+    """Dictionary-encode names, numbered in the order in which they first appear.
+
+    So the result does not depend on which thread read which rows first.
+    """
     wide = codes.cast(pa.int32()).fill_null(len(names)) if codes.null_count else codes
     code = wide.to_numpy()
     first = np.full(len(names) + 1, len(code), np.int64)  # the last is of null

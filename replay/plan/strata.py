@@ -87,7 +87,7 @@ class ResolvedStratum:
 
 
 def resolve_strata(mixture: Mixture, conditions: Sequence[Condition]) -> list[ResolvedStratum]:
-    """The mixture's strata, and those of `each_condition`, in the order of the table they make.
+    """Resolve the mixture's strata, then those of `each_condition`, in table order.
 
     `conditions` are the store's, of both kinds.
 

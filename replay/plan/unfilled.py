@@ -86,7 +86,7 @@ def _count(rows: Bools, rule: StratumRule, episode: Codes) -> int:
 
 
 def _usual_steps(table: pa.Table, index: int, admitted: Bools) -> int:
-    """The median number of steps in which a condition holds, of the episodes that meet it."""
+    """Return the median number of steps of a condition, over the episodes that have it."""
     steps = np.bincount(codes(table, "episode_id")[bools(table, f"stratum_{index}") & admitted])
     return int(np.median(steps[steps > 0]))
 

@@ -286,8 +286,11 @@ class OutcomeModel:
 
 
 def _moments(features: NDArray[Any], weight: F64) -> tuple[F64, F64]:
-    """Weighted mean and standard deviation of each column (D,), some columns at a time: a copy of
-    all would be the most memory that a panel needs."""
+    """Compute the weighted mean and standard deviation of each column (D,).
+
+    It takes some columns at a time: a copy of all would need more memory than anything else in a
+    panel.
+    """
     mean, spread = np.zeros(features.shape[1]), np.zeros(features.shape[1])
     for begin in range(0, len(mean), COLUMNS):
         some = np.asarray(features[:, begin : begin + COLUMNS], np.float64)

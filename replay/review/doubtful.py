@@ -67,8 +67,10 @@ def doubtful_events(store: Store, most: int) -> list[DoubtfulEvent]:
 
 
 def opened_by(event: DoubtfulEvent, store: str) -> str:
-    """The command that shows an event's first step, with the messages that it was made of where
-    the recording is at hand."""
+    """Return the command that shows an event's first step.
+
+    It also shows the messages behind that step if the recording is there.
+    """
     words = ["restock", "trace", store, str(event.transition_id)]
     if Path(event.source_file).exists():
         words += ["--recording", event.source_file]

@@ -228,7 +228,7 @@ class _Reading:
         return None
 
     def _episodes(self, verdicts: list[Verdict]) -> dict[str, list[_Episode]]:
-        """The episodes of each place that is named: one of an episode's id, or a recording's."""
+        """Return the episodes of each place named in a verdict: an episode id or a recording."""
         wanted = sorted({verdict.place for verdict in verdicts})
         table = self.store.connection.sql(_ROWS, params={"wanted": wanted}).to_arrow_table()
         found: dict[str, list[_Episode]] = {}

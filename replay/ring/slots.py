@@ -141,7 +141,10 @@ class Reserve(Stateful):
         return slots
 
     def _choose(self, at_least: int) -> None:
-        """The slots to overwrite next: the oldest of conditions above their reserve.
+        """Choose the slots to overwrite next: the oldest of conditions above their reserve.
+
+        If those do not suffice, for example before the first episode ends, add the oldest
+        unlabelled ones. If all that the ring holds is reserved, add the oldest of all.
 
         Where those do not suffice, as while no episode has ended, also the oldest without a label,
         and where all that the ring holds is reserved, the oldest of all.

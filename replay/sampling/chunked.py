@@ -90,7 +90,7 @@ class ChunkedSampler(BlockSampler):
         super()._draw_block()
 
     def gather(self, out: F32) -> None:
-        """The packed rows of the batch last drawn into `out` (B, W)."""
+        """Copy the packed rows of the batch last drawn into `out` (B, W)."""
         begin = 0
         for buffer in self._buffers:
             end = begin + len(buffer.slots)

@@ -77,7 +77,7 @@ class RowFile:
         self._advise_rows(rows, "POSIX_FADV_DONTNEED")
 
     def expect(self, rows: Ints) -> None:
-        """These rows (n,), ascending, are read next: the system may begin."""
+        """Tell the operating system that these rows (n,), ascending, are read next."""
         if len(rows):
             self._advise_rows(rows, "POSIX_FADV_WILLNEED")
 

@@ -148,14 +148,14 @@ class Quotas(Stateful):
         self._carry = (carry - np.where(drawn, carry.sum() / drawn.sum(), 0.0)).tolist()
 
     def set_batch_size(self, batch_size: int) -> None:
-        """Another size from the next batch on."""
+        """Set the size of batches from the next one on."""
         if not isinstance(batch_size, int | np.integer) or batch_size < 1:
             raise MixtureError(f"batch_size must be an integer of at least 1, got {batch_size!r}")
         self.batch_size = int(batch_size)
         self._mean = (self.shares * batch_size).tolist()
 
     def restored(self) -> None:
-        """What follows from shares and batch size."""
+        """Compute again what depends on shares and batch size."""
         self._mean = (self.shares * self.batch_size).tolist()
 
     def next(self) -> Ints:
@@ -415,7 +415,10 @@ def _dealt(values: NDArray[Any], order: Ints) -> NDArray[Any]:
 
 
 def _by_stratum(quota: Ints) -> Ints:
-    """The places of a block's rows, which lie batch by batch, stratum by stratum: (rows,)."""
+    """Return where each of a block's rows goes, (rows,).
+
+    Rows are drawn stratum by stratum; a block lies batch by batch, stratum by stratum.
+    """
     begins = np.cumsum(quota).reshape(quota.shape) - quota  # of a batch's rows of a stratum
     counts = quota.T.ravel()
     return np.repeat(begins.T.ravel() - np.cumsum(counts) + counts, counts) + np.arange(

@@ -85,7 +85,7 @@ def shipped_audits() -> list[Audit]:
 
 
 def load_audits(folder: str | Path | None = None) -> list[Audit]:
-    """The shipped audits and those of a folder; one of the same name takes a shipped one's place.
+    """Load the shipped audits and those of a folder; the folder's win if names are equal.
 
     Raises ConfigError for a folder without audits, or a file whose header is not as it must be.
     """
@@ -170,7 +170,7 @@ def run_audits(
 
 
 def _tables(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str]]:
-    """Schema and name of every table and view."""
+    """Return schema and name of every table and view."""
     query = "SELECT table_schema, table_name FROM information_schema.tables"
     rows: list[tuple[str, str]] = connection.sql(query).fetchall()
     return rows

@@ -96,7 +96,7 @@ def install_columns(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def _custom(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, ...]]:
-    """Custom signals of the store's profiles: name, unit, meaning, topic and path."""
+    """Return the custom signals of the store's profiles: name, unit, meaning, topic and path."""
     has = connection.sql(
         "SELECT 1 FROM duckdb_columns() WHERE table_name = 'recordings' AND column_name = 'signals'"
     ).fetchall()

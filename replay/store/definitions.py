@@ -78,9 +78,10 @@ _VIEW = re.compile(r"^(CREATE OR REPLACE VIEW \w+) AS\b", re.MULTILINE)
 
 
 class Definitions:
-    """The views and macros of one connection over `stored_transitions`, `stored_recordings` and
-    `stored_ingests`: which ingests there are, so that no row is scanned for it. They last for as
-    long as the object does.
+    """Views and macros of one connection to a store, made when a query names them.
+
+    They read `stored_transitions`, `stored_recordings` and `stored_ingests`, the list of ingests,
+    which spares a scan of all rows. They last as long as this object.
 
     Args:
         connection: that of a store.
@@ -112,7 +113,7 @@ class Definitions:
         _OF[connection] = ref(self)
 
     def make(self, text: str) -> None:
-        """Those that a text names, or all of them where it asks what there is."""
+        """Create the views that a query names, or all of them if it lists views."""
         words = set(re.findall(r"\w+", text.lower()))
         if words & _LISTS:
             self.make_all()
@@ -155,8 +156,10 @@ class Definitions:
         order[name] = None
 
     def hold(self, views: Sequence[str]) -> None:
-        """Have the rows of these in memory, as tables of these names; a view waits under another
-        as it is, which need not be how it was made here."""
+        """Copy the rows of these views into tables of the same names.
+
+        Meanwhile each view has another name.
+        """
         self._make(views)
         for view in views:
             self._connection.execute(
@@ -192,7 +195,7 @@ def install_named(connection: duckdb.DuckDBPyConnection, text: str) -> None:
 
 @contextmanager
 def rows_held(connection: duckdb.DuckDBPyConnection, texts: Sequence[str]) -> Iterator[None]:
-    """Views of a store as tables in memory, for as long as these queries follow."""
+    """Hold views that several of these queries name in memory until the queries are done."""
     made = _of(connection)
     if made is None:
         yield

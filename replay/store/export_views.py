@@ -16,7 +16,7 @@ STORAGE_VERSION = "v1.4.0"
 
 
 def init_script(store: Store) -> str:
-    """SQL that makes the store's views and macros: `duckdb -init FILE`.
+    """Return SQL that creates the store's views and macros, for `duckdb -init FILE`.
 
     Paths are absolute, and of the version that is open: write it again after an ingest.
     """

@@ -153,5 +153,5 @@ def _of_events(part: int, whole: int) -> ConfidenceInterval:
 
 
 def reliability(store: Store) -> pa.Table:
-    """The view `label_reliability`: of rows whose probability is about p, are a share p true?"""
+    """Return the view `label_reliability`: how often labels of each probability are true."""
     return store.sql("FROM label_reliability").to_arrow_table()

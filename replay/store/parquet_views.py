@@ -1,5 +1,7 @@
-"""Views over Parquet files, and Arrow tables under a name, on a DuckDB connection; and what DuckDB
-says of damaged files of a store, as errors that say what to do."""
+"""Views over Parquet files and Arrow tables on a DuckDB connection.
+
+DuckDB's errors about damaged files of a store become errors that say what to do.
+"""
 
 from __future__ import annotations
 
@@ -53,8 +55,10 @@ def read_parquet(
     absent: Sequence[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> None:
-    """A view over Parquet files; columns that only some have are null in the others, and so are
-    text columns that are `absent` from all. With `kinds` of columns, no file is looked at.
+    """Create a view over Parquet files.
+
+    A column that a file lacks is null in its rows; text columns that are `absent` from all files
+    are null everywhere. If `kinds` gives the types of the columns, no file is opened.
 
     Raises:
         StoreError: one of them is missing or damaged.
@@ -80,8 +84,10 @@ def parquet_view(
     schema: str | None = None,
     absent: Sequence[str] = (),
 ) -> str:
-    """The statement that makes such a view; each time that a query names it, every file is opened
-    to find out its columns."""
+    """Return the statement that creates such a view.
+
+    Each query that names the view opens every file to find out its columns.
+    """
     name = f'"{schema}"."{view}"' if schema else f'"{view}"'
     nulls = "".join(f", NULL::VARCHAR AS {column}" for column in absent)
     return (
@@ -98,8 +104,11 @@ def _view_of_known(
     *,
     schema: str,
 ) -> None:
-    """Make a view of columns of these types. Files and types are variables of the connection: as
-    part of the view they would be read again wherever a query names it."""
+    """Create a view of columns of these types.
+
+    Files and types are variables of the connection. If they were part of the view, each query that
+    names it would parse them again.
+    """
     fields = ", ".join(
         f"{_literal(column)}: {{name: {_literal(column)}, type: {_literal(kind)},"
         " default_value: NULL}"
@@ -115,8 +124,10 @@ def _view_of_known(
 
 
 def damage(error: duckdb.Error, *, where: str | None = None) -> StoreError | None:
-    """The error of a query, if what is wrong is a damaged or missing file; `where` is the place
-    that was asked, for damage of which DuckDB does not name the file."""
+    """Translate a query's error if its cause is a damaged or missing file; else return None.
+
+    `where` is the store to name if DuckDB does not name the file.
+    """
     text = str(error)
     if isinstance(error, _OTHER):
         return None

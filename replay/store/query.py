@@ -36,8 +36,10 @@ _PIVOT = re.compile(r"[\s(]*(?:PIVOT|FROM|SELECT|WITH|CREATE)\b", re.IGNORECASE)
 def query(
     connection: duckdb.DuckDBPyConnection, text: str, *, where: str, alone: bool = False
 ) -> duckdb.DuckDBPyRelation:
-    """Run one query (the last of several statements), which is `alone` where nothing is asked of
-    the connection after it: then what only creates or sets is a mistake.
+    """Run one query, the last of several statements.
+
+    Set `alone` if nothing else uses the connection afterwards. Then a last statement that returns
+    no rows is refused.
 
     Raises:
         StoreError: a file of the store is damaged or missing.
@@ -105,15 +107,21 @@ def _pivots(statement: duckdb.Statement) -> bool:
 
 
 def _by_commas(connection: duckdb.DuckDBPyConnection, text: str) -> bool:
-    """Whether tables are joined by commas: as they are written some would be crossed, row by row,
-    so DuckDB finds their order, from here on in this connection."""
+    """Return whether the query joins tables by commas.
+
+    In the order in which they are written some would be cross joined, so DuckDB has to find the
+    order, from here on in this connection.
+    """
     tree = connection.execute("SELECT json_serialize_sql($1::VARCHAR)", [text]).fetchall()[0][0]
     return '"ref_type":"CROSS"' in tree
 
 
 def _named(connection: duckdb.DuckDBPyConnection, job: Callable[[], T]) -> T:
-    """Do it again with every view of a store where one is not found: a text may put the name of
-    a view together, and of a misspelt one DuckDB says which it is like."""
+    """Run the job; if a table is not found, create all views of the store and run it again.
+
+    A query may build a view's name from parts. For a misspelt name DuckDB then suggests the nearest
+    one.
+    """
     try:
         return job()
     except duckdb.CatalogException:
@@ -238,7 +246,7 @@ def _translated(error: duckdb.Error, where: str) -> QueryError | StoreError:
 
 
 def _message(error: duckdb.Error) -> str:
-    """What DuckDB says, or what a function in Python said, without DuckDB's words around it."""
+    """Return DuckDB's message, or that of a Python function without DuckDB's words around it."""
     text = _OWN_TABLE.sub("", str(error)).strip().expandtabs(4)
     _, of_python, cause = text.partition("occurred while executing the UDF: ")
     return cause.partition(": ")[2] if of_python else text

@@ -54,7 +54,7 @@ class MovingRows:
 
 
 def install_same_drives(connection: duckdb.DuckDBPyConnection) -> None:
-    """The table `same_drives` over the connection's `transitions`: see `same_drives`."""
+    """Create the table `same_drives` over the connection's `transitions`."""
     connection.register("same_drives", same_drives(_moving_rows(connection)))
 
 
@@ -127,9 +127,11 @@ def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
 def _distinctive(
     rows: MovingRows,
 ) -> tuple[NDArray[np.int32], NDArray[np.uint64], Ints, Ints]:
-    """Recording, content and stamp (M,) of rows whose content is their recording's only one and may
-    be another's, too, by content and recording; and how many rows of each recording (R,) have a
-    content that is its only one, another's or not."""
+    """Find rows whose content occurs once in their recording and maybe in another one, too.
+
+    Return their recording, content and stamp (M,), sorted by content and recording. Also return,
+    for each recording (R,), the number of rows whose content occurs in it just once.
+    """
     observed = MetTwice(len(rows.content))
     observed.add(rows.content)
     again = observed.maybe(rows.content)

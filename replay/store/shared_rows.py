@@ -64,9 +64,11 @@ def install_shared_rows(
 
 
 class MetTwice:
-    """Which of up to `count` numbers come more than once, without holding them: `add` all, then
-    ask for each again. Marks are bytes, at least four a number and mostly more: of numbers that
-    come once up to a quarter are taken for others, and none that comes again is missed.
+    """Set of the numbers, out of up to `count`, that occur more than once, as a hash filter.
+
+    First `add` all numbers, then ask for each again. It takes at least four bytes a number, mostly
+    more, and does not store the numbers. Up to a quarter of the numbers that occur once are
+    reported, too; none that occurs again is missed.
     """
 
     def __init__(self, count: int) -> None:
@@ -76,7 +78,7 @@ class MetTwice:
         self._last = np.zeros(MARKED << 4, np.int32)  # by a place's low bits, who was last there
 
     def add(self, values: NDArray[np.integer]) -> None:
-        """Mark these, (n,) of 64 bits."""
+        """Mark these 64-bit numbers, (n,)."""
         for part in _stretches(values):
             place = self._places(part)
             number = np.arange(len(part), dtype=np.int32)
@@ -88,7 +90,7 @@ class MetTwice:
             self._marks[place[again]] = 3
 
     def maybe(self, values: NDArray[np.integer]) -> Bools:
-        """Whether these, (n,), may come more than once."""
+        """Return whether each of these numbers, (n,), may occur more than once."""
         result = [self._marks[self._places(part)] == 3 for part in _stretches(values)]
         return np.concatenate([np.empty(0, np.bool_), *result])
 
@@ -110,7 +112,7 @@ def occurs_again(values: Ints) -> Bools:
 def _of_ingests(
     manifests: Iterable[pa.Table], recordings: Mapping[str, str]
 ) -> Iterator[tuple[list[str], pa.Array]]:
-    """Recordings of the ingests that count, and the lists of their rows."""
+    """Yield the recordings of the current ingests with the lists of their distinctive rows."""
     for table in manifests:
         for part in table.combine_chunks().to_batches():
             named = [recordings.get(ingest) for ingest in part.column("ingest_id").to_pylist()]

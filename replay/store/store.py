@@ -215,12 +215,12 @@ class Store:
         return tuple(self._decode(rows[0][0], list[Condition], "conditions"))
 
     def priority(self) -> list[str]:
-        """Names of the conditions, the highest priority first; nominal is the last."""
+        """Return the names of the conditions by priority, the highest first and nominal last."""
         held = sorted(self.conditions(), key=lambda condition: (condition.priority, condition.name))
         return [*(condition.name for condition in held), NOMINAL]
 
     def exposures(self) -> tuple[Condition, ...]:
-        """The exposures listed beside them, of the newest ingest; an older store has none."""
+        """Return the exposures of the newest ingest; older stores have none."""
         rows = self.sql(
             "SELECT exposures_json FROM recordings ORDER BY ingested_at DESC, ingest_id LIMIT 1"
         ).fetchall()
@@ -228,13 +228,13 @@ class Store:
         return tuple(msgspec.structs.replace(one, kind="exposure") for one in found)
 
     def profile_name(self, task_hash: str) -> str:
-        """The profile that read the rows of a task, by the newest ingest; "" where none did."""
+        """Return the name of the profile that last read rows of a task; "" if none did."""
         self._definitions.make("recordings")
         profiles = profiles_of(self.bare, task_hash)
         return profiles[0].name if profiles else ""
 
     def task_hashes(self) -> list[str]:
-        """Of the store's rows, sorted; more than one where profiles of several tasks read them."""
+        """Return the hashes of the tasks of the store's rows, sorted."""
         return sorted(self._tasks)
 
     def task_json(self, task_hash: str | None = None) -> str:
@@ -260,8 +260,10 @@ class Store:
         return self._decode(self.task_json(task_hash), Task, "task")
 
     def episode_ends(self, recordings: Sequence[str] = ()) -> Iterator[tuple[str, pa.Table]]:
-        """Each recording's id with the ends of its episodes, a row an episode; of these recordings,
-        or of all where none is named. An older store has none."""
+        """Yield the id of each recording with a table of its episodes' ends, one row each.
+
+        Without `recordings` these are all recordings. Older stores have no such ends.
+        """
         held = [
             Ingest(one["recording_id"], one["ingest_id"], one["rows"])
             for one in self._ingests.to_pylist()
@@ -304,7 +306,7 @@ class Store:
         return f"FLOAT[{size}]" if size else "FLOAT[]"
 
     def attach(self, connection: duckdb.DuckDBPyConnection, schema: str) -> None:
-        """The common views of this store in a schema of another connection, beside other stores'.
+        """Create this store's common views in a schema of another connection, beside other stores.
 
         The connection's joins are done as they are written from here on.
 
@@ -319,8 +321,10 @@ class Store:
             connection.execute("USE main")
 
     def _count_changed(self, held: Sequence[StoredFile]) -> list[str]:
-        """The ingests whose rows are not known to be those that their manifests describe, which
-        get the number of rows that Delta's log says."""
+        """Return the ingests whose rows other tools may have changed since the manifest.
+
+        Their manifests get the number of rows in Delta's log.
+        """
         ids, place = self._manifests["ingest_id"], self._manifests.column_names.index("transitions")
         written = dict(zip(ids.to_pylist(), self._manifests[place].to_pylist(), strict=True))
         changed = changed_by_others(held, written)
@@ -331,8 +335,11 @@ class Store:
         return sorted(changed)
 
     def _present_summaries(self) -> bool:
-        """`stored_summaries`, where every manifest has one and no other tool changed rows; else
-        rows are scanned."""
+        """Create `stored_summaries` if it covers all rows; return whether it does.
+
+        It does if every manifest has a summary and no other tool changed rows. If not, rows are
+        scanned.
+        """
         versions = self._manifests["summary_version"].to_pylist()
         reported = zip(self._manifests["ingest_id"].to_pylist(), versions, strict=True)
         summarised = {ingest_id for ingest_id, version in reported if version == SUMMARY_VERSION}
@@ -394,8 +401,10 @@ class Store:
 
 
 def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[StoredProfile]:
-    """The profiles that read the rows of a task, of a connection with a view `recordings`; that of
-    the newest ingest first."""
+    """Return the profiles that read rows of a task, the newest ingest's first.
+
+    The connection must have a view `recordings`.
+    """
     # Recordings of an older store carry no text: null.
     rows = connection.execute(
         "SELECT profile, profile_hash, arg_max(coalesce(profile_toml, ''), ingested_at)"
@@ -408,7 +417,10 @@ def profiles_of(connection: duckdb.DuckDBPyConnection, task_hash: str) -> list[S
 
 
 def corrected_versions(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]:
-    """The versions of labels that people corrected, of a connection with a view `recordings`."""
+    """Return the versions of labels that people corrected.
+
+    The connection must have a view `recordings`.
+    """
     rows = connection.sql(
         "SELECT DISTINCT labels_version FROM recordings WHERE contains(labels_version, '+')"
         " ORDER BY ALL"

@@ -53,7 +53,7 @@ class StoredTable:
         return [f"{folder}/{path}" for path in self.paths]
 
     def present(self, connection: duckdb.DuckDBPyConnection, *, schema: str = "main") -> None:
-        """The view; files on S3 are read at each query.
+        """Create the view; files on S3 are read at each query.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.
@@ -130,8 +130,10 @@ class StoredTable:
 def manifest_tables(
     place: Location, recordings: DeltaTable, held: Sequence[StoredFile]
 ) -> tuple[StoredTable, StoredTable]:
-    """The manifests of these files of transitions without their summaries (but for its version),
-    `stored_recordings`, and the summaries, `stored_summaries`."""
+    """Return two tables of these transition files' manifests: without summaries, and summaries.
+
+    They are `stored_recordings`, which keeps the version of the summary, and `stored_summaries`.
+    """
     paths = _manifests(place, recordings, held)
     columns = pa.schema(recordings.schema().to_arrow())
     reported = [one for one in columns if one.name not in set(SUMMARY_SCHEMA.names)]
@@ -150,7 +152,7 @@ def register(
     *,
     schema: str = "main",
 ) -> None:
-    """An Arrow table or data set as a view of a schema, which must be there."""
+    """Create a view of an Arrow table or data set in a schema that exists."""
     name = view if schema == "main" else f"{schema}_{view}"
     connection.register(name, rows)
     if name != view:

@@ -164,9 +164,9 @@ def _read(source: StoreVersion, transition: int) -> Origin | None:
 def _frames(
     store: Store, path: str, row: Mapping[str, Any], manifest: Mapping[str, Any] | None
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """The camera frames in force at a row with the file each lies in, and why some are not told.
+    """Return each camera's frame at a row, with its file, and notes on frames that are missing.
 
-    Frames are replaced with the rows of their recording: those of a later ingest are not the row's.
+    A later ingest replaces the frames of a recording along with its rows.
     """
     kept = {one["camera"]: one for one in (manifest or {}).get("cameras") or []}
     if manifest is None or not kept:
@@ -218,7 +218,10 @@ def _changes(row: Mapping[str, Any], now: Origin | None) -> list[str]:
 
 
 def _interpret(origin: Origin, recording: Path | str | None, name: str | None) -> None:
-    """What the profile says of the recording: which topics were read, and what they held."""
+    """Add the topics that the profile read, and the messages of the row's tick.
+
+    The messages need the recording.
+    """
     manifest, row = origin.recording, origin.transition
     if manifest is None:
         return
@@ -266,7 +269,10 @@ def _utc(stamp_ns: int) -> str:
 def _reward_parts(
     row: Mapping[str, Any], near: Mapping[int, Mapping[str, Any]], task_json: str
 ) -> dict[str, float] | None:
-    """What the events of a step were worth; None at an episode's last step, whose end is no row."""
+    """Return the reward of each event of a step; None at an episode's last step.
+
+    The end of that step is not a row.
+    """
     after = near.get(row["step_index"] + 1)
     if after is None:
         return None
@@ -293,8 +299,10 @@ def _reward_parts(
 
 
 def profile_of(origin: Origin, manifest: Mapping[str, Any], given: str | None) -> Profile | None:
-    """The profile that read the recording: the one given, the manifest's own, or the shipped one
-    of that name."""
+    """Return the profile that read the recording; None if it cannot be read.
+
+    It is the given one, the manifest's own, or the shipped one of that name.
+    """
     name, text = given or manifest["profile"], manifest.get("profile_toml")
     try:
         if given is None and text:

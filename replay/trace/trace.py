@@ -91,7 +91,7 @@ def trace_row(place: str | Path, row: str | int, where: TracePlaces | None = Non
 
 
 def audited_rows(run: str | Path, limit: int = 20) -> list[dict[str, Any]]:
-    """The audited rows of a run with the largest TD errors, each with its name for `trace_row`."""
+    """Return a run's audited rows with the largest TD errors, with the names `trace_row` takes."""
     if not (Path(run) / RUN_CONFIG).is_file():
         raise RunError(
             "is not a run: rows can be listed for a run only",
@@ -163,7 +163,7 @@ def _origin(sources: list[StoreVersion], transition: int, where: TracePlaces) ->
 def _of_twin(
     trace: Trace, run: Path, document: Mapping[str, Any], audit: Mapping[str, Any]
 ) -> None:
-    """A fresh row: its episode of the twin, and how that is laid out again."""
+    """Trace a fresh row: add its episode in the twin and how to generate it again."""
     query = "FROM episodes WHERE episode = $episode"
     table = _run_table(run, "episodes")
     with duckdb.connect() as connection, passed_in(connection, episodes=table):

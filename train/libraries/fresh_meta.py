@@ -109,7 +109,7 @@ class FreshMeta:
         return codes
 
     def forget(self) -> None:
-        """The library emptied its buffer."""
+        """Forget all rows after the library emptied its buffer."""
         self.by_condition.move(np.flatnonzero(self.filled), NONE)
         self.filled[:] = False
         self._episode_step[:] = 0

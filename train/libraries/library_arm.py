@@ -96,7 +96,10 @@ def resolve(settings: tuple[str, ...], library: Library) -> TrainConfig:
 
 
 def dqn_arguments(config: TrainConfig) -> dict[str, Any]:
-    """What makes `stable_baselines3.DQN` follow a config: its clocks count calls and steps."""
+    """Return the arguments that make `stable_baselines3.DQN` follow a config.
+
+    Its intervals count calls and steps.
+    """
     count, schedule = config.env.num_envs, config.schedule
     per_call = schedule.updates_per_env_step * count
     calls, updates = (1, round(per_call)) if per_call >= 1 else (round(1 / per_call), 1)
@@ -202,7 +205,7 @@ def train_library(arm: LibraryArm) -> None:
 
 
 def as_network(config: TrainConfig, task: Task, linears: list[Any]) -> QNetwork:
-    """A library's layers, in order, as Restock's network: the same numbers for the same input."""
+    """Copy a library's linear layers, in order, into Restock's network, which computes the same."""
     import torch
 
     network = make_network(config, task.observation_size, len(task.actions))

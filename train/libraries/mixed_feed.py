@@ -45,9 +45,11 @@ NO_LOGS = BatchDraw(_NO_ROWS, _NO_ROWS, None, np.empty(0))
 
 
 class FeedOptions(TypedDict, total=False):
-    """What every library's buffer takes by keyword; each may be left out. Defaults: no run, the
-    panel's own share and profile (without a panel warehouse_amr), seed 0, a hundredth of the
-    batches, 500 batches."""
+    """Keyword options of every library's buffer, all optional.
+
+    Defaults: no run, the panel's own share and profile (without a panel warehouse_amr), seed 0, a
+    hundredth of the batches, 500 batches.
+    """
 
     run: str | Path | None  # the run directory to make; None, the default: no record is kept
     logs_share: float | None  # of a batch; default the panel's own
@@ -224,7 +226,7 @@ class MixedFeed:
         td: F32 | None = None,
         q: F32 | None = None,
     ) -> None:
-        """The batch of one update, logs first: packed rows (B, W), and what is known of them.
+        """Record the batch of one update, logs first: packed rows (B, W) and what is known of them.
 
         `weight` as applied, `td` (Q - target) and `q` (B,); unknown ones are null in the tables.
         Priorities follow `td` where it is known.

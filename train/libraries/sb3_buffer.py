@@ -199,7 +199,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         self.pos, self.full = ring.appended % ring.capacity, ring.appended >= ring.capacity
 
     def _drop(self, key: int, step: int) -> None:
-        """A step whose physics blew up must not be learnt from: its row repeats the one before."""
+        """Replace the row of a step whose physics diverged by the row before it."""
         meta, ring = self.ring.meta, self.ring
         rows = np.flatnonzero(meta["episode"][: len(ring)] == key)
         steps = meta["episode_step"][rows]
@@ -284,7 +284,9 @@ def dqn_critic(model: Any) -> Critic:
 
 
 def logged_commands(panel: Panel | str | Path, store: str | Path) -> F32:
-    """The command (m/s, rad/s) of every row of a panel (or its folder), (n, 2), from its store.
+    """Read the command (m/s, rad/s) of every row of a panel (or its folder), (n, 2).
+
+    Commands come from the store of the panel.
 
     Raises:
         MixtureError: the store lacks rows of the panel.

@@ -200,7 +200,7 @@ class _OnPolicyFeed(BaseCallback):
         return self.num_timesteps < self.budget or self.calls % self.rollout_calls == 0
 
     def _on_rollout_end(self) -> None:
-        """The rollout is whole, and about to be learnt from."""
+        """Count the updates of a complete rollout, just before they are made."""
         self.updates += self.updates_a_rollout
         self.fed_calls = self.calls
         self._write()

@@ -102,7 +102,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         self._fill_logs(len(panel))
 
     def _fill_logs(self, count: int) -> None:
-        """The logs' sub-buffer is full, always."""
+        """Mark the logs' sub-buffer as full."""
         logs = self.buffers[-1]
         logs._size, logs._insertion_idx = count, 0
         logs.last_index[0] = count - 1
@@ -110,7 +110,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         self.last_index[-1] = self.fresh.capacity + count - 1
 
     def reset(self, keep_statistics: bool = False) -> None:
-        """Empties the fresh part; the logs stay."""
+        """Empty the fresh part and keep the logs."""
         self.feed.flush()  # no labels will come of episodes that are cut off here
         super().reset(keep_statistics=keep_statistics)
         self.fresh.forget()
