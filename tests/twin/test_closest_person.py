@@ -18,7 +18,7 @@ angles = st.floats(-3.1, 3.1)
 
 
 def outline(x: float, y: float, yaw: float, half: tuple[float, float]) -> np.ndarray:
-    """Points all along a rectangle's edge."""
+    """Return points all along a rectangle's edge."""
     along = np.linspace(-1, 1, 201)
     edge = np.full_like(along, 1.0)
     local = np.concatenate(

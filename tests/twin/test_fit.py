@@ -104,7 +104,10 @@ def test_every_step_of_a_store_is_in_a_segment_or_left_out_with_a_reason(known: 
 
 
 def test_a_late_pose_or_tick_moves_segments_on_and_does_not_lose_them(known: Path) -> None:
-    """A Neato's poses come in bursts: 2 of the 12 stretches of its drive began on a fresh one."""
+    """Keep segments if poses come in bursts, as a Neato's do.
+
+    Only 2 of the 12 stretches of its drive began on a fresh pose.
+    """
     with Store(known) as store:
         steps = logged_steps(store)
     usual = log_segments(steps, 2.0)
@@ -363,7 +366,7 @@ def test_all_of_a_known_robot_is_recovered(tmp_path: Path) -> None:
 def test_friction_that_a_dry_log_does_not_identify_is_not_fitted_at_an_end_of_its_range(
     tmp_path: Path,
 ) -> None:
-    """The search once stopped at twice the floor's friction there, and called that fitted."""
+    """Leave friction unfitted: the search once stopped at twice the floor's, as if fitted."""
     logs = ROOT / "sample_logs" / "amr_monday.mcap"
     ingest(logs, load_profile("warehouse_amr"), store=StoreWriter(tmp_path / "store"))
     with Store(tmp_path / "store") as store:

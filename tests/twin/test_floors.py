@@ -168,7 +168,7 @@ def test_ascii_and_16_bit_greymaps_with_comments_are_read(tmp_path: Path) -> Non
 
 
 def png_header(width: int, height: int) -> bytes:
-    """Return a PNG that says how large it is, and ends there."""
+    """Return a PNG header that gives a size, without any data."""
 
     def chunk(kind: bytes, data: bytes = b"") -> bytes:
         return (
@@ -204,7 +204,7 @@ def test_a_broken_map_is_refused_with_its_reason(tmp_path: Path, data: bytes, me
 
 
 def test_a_map_with_black_and_white_exchanged_is_told_by_its_remedy(tmp_path: Path) -> None:
-    """Only its racks are free then: 2 x .7 m."""
+    """Suggest exchanged colours if only the racks, 2 x .7 m, are free."""
     pixels = np.zeros((80, 100), np.uint8)
     pixels[30:44, 20:60] = 254
     write_pgm(tmp_path / "map.pgm", pixels)

@@ -70,7 +70,7 @@ CONFIG = GapConfig(max_segments=60, limits=TrustLimits(segments=10, episodes=3))
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Missions on a dry and on a slippery floor, by a robot that TRUE describes."""
+    """Return a store of missions on dry and slippery floor, by a robot with TRUE's parameters."""
     folder = tmp_path_factory.mktemp("gap")
     shares = {"nominal": 0.5, "wheel_slip": 0.5}
     plan = RecordingPlan(missions=14, seed=5, conditions=shares, policy="planner", hardware=TRUE)

@@ -28,7 +28,7 @@ KINDS = {"nominal": 0.2, "wheel_slip": 0.2, "blocked_aisle": 0.3, "near_collisio
 
 
 def environment(layouts: str, robot: Robot | None = None) -> WarehouseVectorEnv:
-    """Eight robots with everything that an episode may hold, a few steps in."""
+    """Return eight robots in all that an episode may hold, a few steps in."""
     env = WarehouseVectorEnv(8, task=TASK, robot=robot, layouts=layouts, conditions=KINDS)
     env.reset(seed=5)
     for _ in range(30):
@@ -123,7 +123,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_people_and_forklifts_stand_on_the_floor() -> None:
-    """A forklift hung .4 m above it: no lidar saw it, and robots drove through below."""
+    """Check heights: a forklift once hung .4 m above the floor, unseen by any lidar."""
     env = WarehouseVectorEnv(64, task=TASK, conditions={"near_collision": 1.0})
     env.reset(seed=0)
     simulation, handles = env.simulation, env.simulation.handles

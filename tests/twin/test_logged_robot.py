@@ -1,4 +1,4 @@
-"""The robot that a store's logs are of: its profile's, also after only [robot] changed."""
+"""The robot of a store's logs is that of its profile, even after only [robot] changed."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def test_packed_odometry_is_what_rosbags_serialises() -> None:
 def test_any_shape_packs_as_rosbags_serialises_it(
     frame: str, names: list[str], ranges: list[float]
 ) -> None:
-    """Alignment after strings and sequences of any length, empty ones too."""
+    """Check alignment after strings and sequences of any length, empty ones too."""
     numbers = np.arange(len(names), dtype=float)
     for shape, columns in [
         (

@@ -158,7 +158,7 @@ def test_missions_of_a_file_are_recorded_and_counted_by_what_they_met(
 def test_a_list_that_is_driven_and_ingested_closes_its_gaps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is missing, driven, and asked again: closed, or within what the intervals said."""
+    """Drive what is missing and measure again: gaps are closed, or within their intervals."""
 
     def run(*args: str) -> dict[str, object]:
         assert main([*args, "--json"]) == 0

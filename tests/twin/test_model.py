@@ -76,7 +76,7 @@ def wheel_share() -> float:
 
 
 def mass(sim: Simulation) -> float:
-    """Of the robot without payload, kg."""
+    """Return the robot's mass without payload, in kg."""
     return float(sim.model.body_subtreemass[sim.handles.chassis_body])
 
 

@@ -64,7 +64,7 @@ def steps(store: Path) -> Iterator[LoggedSteps]:
 
 
 def start_of(steps: LoggedSteps, rows: np.ndarray, count: int) -> OpenLoopStart:
-    """Return what a drive of `count` periods from these rows begins with."""
+    """Return the start of a drive of `count` periods from these rows."""
     now = {name: column[rows] for name, column in steps.now.items()}
     pose = np.stack([now[name] for name in POSE], axis=-1)
     return OpenLoopStart(pose, now, steps.commands(rows, 0, count), past=steps.commands(rows, 5, 0))
@@ -113,7 +113,7 @@ def test_one_step_is_the_first_of_a_longer_drive(steps: LoggedSteps, mapped: boo
 
 
 def test_an_empty_floor_has_no_middle_and_no_end(steps: LoggedSteps) -> None:
-    """Robots are driven where there is room, and reported where they were put."""
+    """Move robots to where there is room, and report them where they were put."""
     rows = log_segments(steps, 1.2).row[:2]
     near = start_of(steps, rows, 5)
     shift = np.array([1e4, -2e4, 0.0])

@@ -90,7 +90,7 @@ def test_a_training_config_takes_one() -> None:
 
 
 def drive(steps: int = 6, **changed: float) -> list[dict[str, np.ndarray]]:
-    """Signals of one robot that drives the same way, from its first step on."""
+    """Return the signals of one robot on a fixed drive, from its first step on."""
     env = WarehouseVectorEnv(1, perturbation=Perturbation(**changed))
     env.set_episodes([EpisodeSpec("nominal", 7)])
     env.reset(seed=0)
@@ -210,7 +210,7 @@ def test_a_recording_holds_what_was_said_from_then_on() -> None:
 
 @pytest.fixture
 def old_store(tmp_path: Path) -> Path:
-    """Return a store from before there were such columns."""
+    """Return a store written before these columns existed."""
     manifest, rows = one(1)
     StoreWriter(tmp_path / "s").write(manifest, rows.drop_columns(COLUMNS))
     return tmp_path / "s"

@@ -26,7 +26,7 @@ TASK = load_profile("warehouse_amr").task
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    """Of a robot on FLOOR, among people and pallets, with the noise of its sensors."""
+    """Return the drive of a robot on FLOOR among people and pallets, with sensor noise."""
     env = WarehouseVectorEnv(1, task=TASK, seed=5)
     env.reset(seed=5)
     driver = PlannerFollower(epsilon=0.1, seed=5)

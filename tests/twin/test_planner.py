@@ -91,7 +91,7 @@ def test_the_lidar_finds_full_blocks_and_passes_partial_ones(block: str) -> None
 
 
 class _Straight:
-    """Follows the near waypoint and stops .5 m before anything."""
+    """A driver that follows the near waypoint and stops .5 m before anything."""
 
     def act(self, env: WarehouseVectorEnv) -> np.ndarray:
         near = np.arctan2(env.signals["waypoint_near_y_m"], env.signals["waypoint_near_x_m"])

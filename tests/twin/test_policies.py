@@ -30,7 +30,7 @@ def success(
     task: Task | None = None,
     layouts: str = "default",
 ) -> dict[str, float]:
-    """Success by block kind ('none' outside blocked aisles), over fixed episodes."""
+    """Return success by block kind ('none' outside blocked aisles), over fixed episodes."""
     env = WarehouseVectorEnv(count, task=task, layouts=layouts)
     env.set_episodes([EpisodeSpec(kind, 500 + index) for index in range(count)])
     observation, _ = env.reset(seed=0)
@@ -66,13 +66,13 @@ def test_the_operator_mostly_succeeds_everywhere(kind: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("layouts", ["default", "generated:test"])
 def test_the_operator_gets_past_pallets(layouts: str) -> None:
-    """Through the gap where there is one, and around where there is none, on floors of any kind."""
+    """Drive through the gap if there is one, else around, on floors of any kind."""
     passed = success(Operator(epsilon=0.0), "blocked_aisle", layouts=layouts)
     assert min(passed.values()) >= 0.9
 
 
 def test_an_operator_goes_on_as_it_was_from_its_state() -> None:
-    """Its lattices are not kept: another process makes the same again."""
+    """Rebuild the lattices, which the state does not hold, identically in another process."""
     env = WarehouseVectorEnv(4, conditions={"blocked_aisle": 1.0}, layouts="generated:test")
     observation, _ = env.reset(seed=4)
     first = Operator(seed=6)
@@ -89,7 +89,7 @@ def test_an_operator_goes_on_as_it_was_from_its_state() -> None:
 
 
 def test_the_operator_of_a_fast_robot_comes_over_slippery_floor() -> None:
-    """None of its actions is as gentle as the operator would like: it takes the gentlest."""
+    """Take the gentlest action if none is as gentle as the operator would like."""
     task = load_profile("warehouse_amr").task
     fast = [(0, 0), (0.5, 0), (1, 0), (0.8, 0.6), (0.8, -0.6), (0, 1.2), (0, -1.2), (-0.4, 0)]
     actions = tuple((float(v), float(w)) for v, w in fast)
@@ -155,7 +155,7 @@ def test_a_policy_is_reproducible_from_its_seed() -> None:
 
 
 def test_a_lattice_guides_the_operator_where_it_was_stuck_until_the_episode_ends() -> None:
-    """A real Neato's robot was stuck before passages of .5 m, which its outline fits through."""
+    """Get a real Neato's outline through passages of .5 m, which it was stuck before."""
     env = WarehouseVectorEnv(4, conditions={"nominal": 1.0})
     first = Operator(seed=6)
     observation, _ = env.reset(seed=3)
@@ -198,7 +198,7 @@ def test_a_slow_robot_that_drives_is_not_taken_for_stuck() -> None:
 
 
 def small_slow_robot() -> Task:
-    """As a TurtleBot3 Burger: .14 x .18 m, .22 m/s, a tick every .1 s."""
+    """Return a robot like a TurtleBot3 Burger: .14 x .18 m, .22 m/s, a tick every .1 s."""
     speeds = (
         (0, 0),
         (0.11, 0),
@@ -219,7 +219,7 @@ def small_slow_robot() -> Task:
 
 
 def test_the_operator_of_a_small_slow_robot_drives_through_a_gap_that_is_wide_for_it() -> None:
-    """It turned left and right before any gap narrower than one that the stand-in wants."""
+    """Drive on: it once turned left and right before gaps too narrow for the stand-in."""
     gap = Rect(1.5, 0.0, 2.5, 0.8), Rect(1.5, 1.2, 2.5, 2.0)
     ends = (3.4, 1.0), (0.6, 1.0)
     floor = Warehouse(

@@ -41,7 +41,7 @@ from restock.train.twin.recording.recorder import (
 
 @pytest.mark.long
 def test_both_formats_hold_the_same_drive(tmp_path: Path) -> None:
-    """Whose it is, too: ingest reads the tags that the recorder writes."""
+    """Compare the drives, and the tags that say whose they are, as ingest reads them."""
     tables = []
     tags, start_ns = {"robot": "amr-07", "line": "007"}, parse_start("2026-10-05T10:00+02:00")
     for name, file_format in (("a.mcap", "mcap"), ("a", "rosbag2")):
@@ -241,7 +241,7 @@ def test_missions_on_other_floors_come_with_their_maps(tmp_path: Path) -> None:
 
 
 class _Creeper:
-    """A policy of a user's own."""
+    """A user's own policy."""
 
     name, version = "creeper", "3"
 

@@ -49,7 +49,7 @@ ROBOTS = {
 def driven(
     robot: Robot | None, body: Body, commands: list[tuple[float, float]], friction: float = 1.0
 ) -> tuple[Simulation, NDArray[np.float64]]:
-    """Steady speeds ahead and yaw rates (N, 2) under commands (N, 2)."""
+    """Return steady forward speeds and yaw rates (N, 2) under commands (N, 2)."""
     task = Task(body=body, actions=((0.0, 0.0), commands[0]))
     model = robot_model(robot, body)
     sim = Simulation(len(commands), task, empty_floor(), 0.01, 1, robot=model)
@@ -104,9 +104,10 @@ def test_it_drives_what_it_is_commanded(name: str) -> None:
 
 
 def test_a_skid_steer_robot_slides_where_one_axle_rolls() -> None:
-    """Compare skid steer with one axle: its scrubbing wheels turn it further.
+    """Compare skid steer, whose wheels scrub in every turn, with one axle.
 
-    On slippery floor, a turn while driving goes wide, which one axle follows.
+    By their contact points alone, scrubbing wheels turn a robot too far. On slippery floor a skid
+    steer's turn while driving changes; that of one axle does not.
     """
     sim, _ = driven(HUSKY, Body(0.99, 0.67), [(1.0, 0.0)])
     assert sim.robot.turn_track_m / sim.robot.track_m == pytest.approx(1.96, abs=0.2)

@@ -27,7 +27,7 @@ GOAL = (AISLE.x_max + 1.2, AISLE.center[1])  # in the cross-aisle behind it
 
 
 def with_gap(gap_m: float, motion: Motion = BODY, goal: tuple[float, float] = GOAL) -> StateLattice:
-    """Aisle 1 east with a pallet against its north rack, and so much room south of it."""
+    """Return aisle 1 east with a pallet against its north rack and this much room south of it."""
     half = np.array([[0.6, (AISLE.y_max - AISLE.y_min - gap_m) / 2]])
     box = np.array([[AISLE.center[0], AISLE.y_max - half[0, 1], 0.0]])
     planner = Planner(FLOOR)
@@ -58,7 +58,7 @@ def test_a_wide_gap_is_driven_through_and_a_narrow_one_gone_around() -> None:
 
 
 def test_a_gap_that_fits_the_width_alone_must_be_entered_straight() -> None:
-    """.75 m: the body's .7 x .5 m pass in line with the gap, and not askew."""
+    """Pass a .75 m gap with a .7 x .5 m body in line with it, but not askew."""
     lattice = with_gap(0.75)
     in_gap = (AISLE.center[0], AISLE.y_min + 0.375)
     straight, askew = (lattice.time_s(np.array([*in_gap, yaw])) for yaw in (0.0, 1.2))
@@ -99,7 +99,7 @@ def test_headings_are_the_same_all_the_way_round() -> None:
 
 @pytest.mark.long
 def test_where_a_rule_leaves_no_way_around_a_block_it_is_broken() -> None:
-    """As plans do: behind a block in a one-way aisle a goal is reached against its heading."""
+    """Plan against a one-way rule if a block leaves no other way, as `Planner.plan` does."""
     broken = 0
     for floor in open_floors("generated:test")[:24]:
         if not floor.one_way:
@@ -119,13 +119,13 @@ def test_where_a_rule_leaves_no_way_around_a_block_it_is_broken() -> None:
 
 
 def clear_of(plan: np.ndarray, pallets: np.ndarray) -> bool:
-    """Whether no point of a plan lies within a pallet's inner circle."""
+    """Return whether no point of a plan is within a pallet's inner circle."""
     gap = np.hypot(*(plan[:, None] - pallets[None, :, :2]).transpose(2, 0, 1))
     return bool(gap.min() > min(PALLET_HALF_M[:2]))
 
 
 def against(floor: Warehouse, plan: np.ndarray) -> bool:
-    """Whether a plan runs against a one-way rule for half a metre."""
+    """Return whether a plan runs against a one-way rule for half a metre."""
     along = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
     step = np.diff(plan, axis=0)
     for rule in floor.one_way:

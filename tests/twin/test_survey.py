@@ -47,7 +47,7 @@ CELL_M = 0.05
 
 
 def hall() -> np.ndarray:
-    """Occupancy (X, Y) of 9 x 7 m: a ring of corridors 1.5 m wide around one block."""
+    """Return occupancy (X, Y) of 9 x 7 m: a ring of corridors 1.5 m wide around one block."""
     occupancy = np.full((180, 140), 100, np.int8)
     occupancy[4:176, 4:136] = 0
     occupancy[34:146, 34:106] = 100
@@ -55,7 +55,7 @@ def hall() -> np.ndarray:
 
 
 def lap(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Poses (N, 3) once around the hall, in the middle of its corridors, in the map's frame."""
+    """Return poses (N, 3) once around the hall, along its corridors' middle, in the map's frame."""
     corners = np.array([[0.95, 0.95], [8.05, 0.95], [8.05, 6.05], [0.95, 6.05], [0.95, 0.95]])
     parts = []
     for start, end in pairwise(corners):
@@ -153,7 +153,7 @@ def write_bag(
 
 
 def seen_from(occupancy: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Ranges (120,) to the first occupied cell from a pose; 0, as of a Neato, beyond 6 m."""
+    """Return ranges (120,) to occupied cells from a pose; 0 beyond 6 m, as a Neato reports."""
     bearing = at[2] - np.pi + np.arange(120) * 2 * np.pi / 120
     reach = np.arange(0.0, 6.0, 0.01)
     x = at[0] + np.cos(bearing)[:, None] * reach
@@ -182,7 +182,7 @@ def test_scans_make_the_map_that_was_scanned_by_the_clock_that_fits(
 
 
 def test_scans_of_a_lidar_upside_down_make_the_same_map(tmp_path: Path) -> None:
-    """No transform says so: the profile does."""
+    """Read the mounting from the profile, since no transform gives it."""
     known = OccupancyGrid(hall(), CELL_M)
     bag = write_bag(tmp_path / "bag", poses=lap(), grid=known, scanned=hall(), clockwise=True)
     hanging = WAREHOUSE.replace("[inputs.scan]", "[inputs.scan]\nupside_down = true")
@@ -254,7 +254,7 @@ def test_poses_that_lie_off_the_map_are_refused_with_both_frames(tmp_path: Path)
 def test_a_map_whose_walls_the_lidar_did_not_see_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All poses lie on the free floor of a larger, empty room; its walls are elsewhere."""
+    """Refuse a larger, empty room: all poses are on its free floor, but its walls are elsewhere."""
     room = np.zeros((240, 200), np.int8)
     room[[0, -1]] = room[:, [0, -1]] = 100
     elsewhere = OccupancyGrid(room, CELL_M, (-1.5, -1.5, 0.0))
@@ -356,7 +356,7 @@ def test_the_picture_shows_map_way_and_places_to_scale(tmp_path: Path) -> None:
     scale = LONG_SIDE / max(made.floor.width_m, made.floor.depth_m)
 
     def extent(color: tuple[int, ...]) -> tuple[float, float]:
-        """How wide and high what has this colour is, in metres."""
+        """Return the width and height of the area with this colour, in metres."""
         rows, columns = np.nonzero(np.abs(pixels - color[:3]).sum(axis=2) < 30)
         on_floor = columns < MARGIN + made.floor.width_m * scale
         return np.ptp(columns[on_floor]) / scale, np.ptp(rows[on_floor]) / scale
@@ -394,7 +394,7 @@ def test_a_store_gives_the_floor_of_its_recording_and_without_it_the_corridor(
 
 
 def lapped(recording: int, away_m: float) -> pa.Table:
-    """Rows of a drive around the hall, in a frame that is so far off."""
+    """Return the rows of a drive around the hall, in a frame shifted by this much."""
     poses, rows = lap(), with_clear_view(recording_transitions(recording, episodes=8))
     poses[:, 0] += away_m
     at = np.minimum(np.arange(len(rows)), len(poses) - 1)
@@ -433,7 +433,7 @@ class _Zones(Checked, frozen=True):
 
 
 def test_a_robot_that_hardly_moved_starts_where_it_was_and_goes_where_it_could() -> None:
-    """Its places are nearer to each other than any mission: of the room that it saw, some are."""
+    """Send missions into the room that it saw if its own places are too close together."""
     cells = np.full((120, 80), 100, np.int8)
     cells[2:-2, 2:-2] = 0
     around = np.array([(3.65, 2.65), (3.75, 2.65), (3.75, 2.75)])  # in three squares

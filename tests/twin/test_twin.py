@@ -33,7 +33,7 @@ from restock.train.twin.physics.perturbation import (
 
 
 def roll(env: WarehouseVectorEnv, steps: int, seed: int) -> list[np.ndarray]:
-    """Everything `steps` random steps give, as arrays."""
+    """Return everything that `steps` random steps give, as arrays."""
     rng = np.random.default_rng(seed)
     seen = []
     for action in rng.integers(env.single_action_space.n, size=(steps, env.num_envs)):
@@ -415,7 +415,7 @@ def test_a_step_needs_a_reset_and_a_mask_an_entry_for_every_environment() -> Non
 
 
 def test_the_seed_of_a_single_environment_is_that_of_its_first_reset() -> None:
-    """The seed was replaced by a random one."""
+    """Keep the given seed, which a random one once replaced."""
     first, again = (WarehouseEnv(seed=5).reset()[1]["episode_seed"] for _ in range(2))
     assert first == again == WarehouseVectorEnv(1, seed=5).reset()[1]["episode_seed"][0]
     unseeded = {int(WarehouseEnv().reset()[1]["episode_seed"]) for _ in range(2)}

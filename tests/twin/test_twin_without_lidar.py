@@ -22,7 +22,7 @@ STEPS = 12
 
 
 def drive(task):
-    """Observations, rewards and signals of the same actions on the same episodes."""
+    """Return observations, rewards and signals of the same actions on the same episodes."""
     env = WarehouseVectorEnv(2, task=task, seed=3, nav_command=False)
     observation, _ = env.reset(seed=3)
     seen, earned, tight, over = [observation], [], [], []

@@ -1,1 +1,1 @@
-"""How a robot moves and what it senses: the MuJoCo model, traffic, friction, perturbations."""
+"""Robot motion and sensing: the MuJoCo model, traffic, friction, perturbations."""

@@ -1,4 +1,4 @@
-"""Contact in the twin: which geoms touch which, and how much friction the floor has where.
+"""Contact in the twin: which geoms touch which, and the floor's friction.
 
 The parameters of wheels are measured, not guessed: stiff wheel contacts chatter when they slide and
 then do not converge with the timestep; these soft ones do (see docs/twin.md).
@@ -49,7 +49,7 @@ class FloorFriction:
 
     @property
     def icy(self) -> Ints:
-        """The environments that have patches."""
+        """Return the environments that have patches."""
         return np.flatnonzero(self._has_patches)
 
     def lay(self, env: int, patches: F64) -> None:
@@ -76,7 +76,7 @@ class FloorFriction:
         return self._slippery(ids, friction)
 
     def on_patch(self, pose: F64) -> Bools:
-        """Whose wheel stands on a slippery patch, (N,), at poses (N, 3)."""
+        """Return whose wheel stands on a slippery patch, (N,), at poses (N, 3)."""
         stands = np.zeros(len(pose), np.bool_)
         icy = self.icy
         if len(icy):
@@ -87,12 +87,12 @@ class FloorFriction:
         return friction_at(self._wheel_points(pose), self.patches[ids], self.base[ids])
 
     def _slippery(self, ids: Ints, friction: F64) -> Bools:
-        """Which wheels (n, W) stand on a patch, by the friction under them and the floor's."""
+        """Return which wheels (n, W) stand on a patch, by their friction and the floor's."""
         least = np.minimum(SLIPPERY_BELOW, self.base[ids, None] - 1e-9)
         return np.asarray(friction < least, np.bool_)
 
     def _wheel_points(self, pose: F64) -> F64:
-        """Where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
+        """Return where the wheels of robots at poses (n, 3) stand, (n, W, 2)."""
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         ahead, across = np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)
         x, y = self._wheels_m[:, 0, None], self._wheels_m[:, 1, None]
@@ -101,7 +101,7 @@ class FloorFriction:
 
 
 def friction_at(points_m: F64, patches: F64, base: F64) -> F64:
-    """Friction (N, K) under points (N, K, 2), from patches (N, P, 5) and base (N,).
+    """Return the friction (N, K) at points (N, K, 2), from patches (N, P, 5) and base (N,).
 
     A patch row is x, y, half x, half y (metres) and its friction coefficient. Where patches overlap
     the slipperiest counts.

@@ -1,4 +1,4 @@
-"""An episode: where it starts and goes, and what stands, lies and walks in the way.
+"""An episode: its start, its goal, and the obstacles, patches and traffic on its route.
 
 `draw_episode` makes all of it from an `EpisodeSpec` alone, so an episode can be repeated, named
 in a table, and looked at again. Its kind is a module of
@@ -29,7 +29,7 @@ Way = tuple[float, float, float, float, float]  # start x, y, yaw, goal x, y: on
 
 
 class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What determines an episode. `perturbation` None: the environment's.
+    """The settings that determine an episode. `perturbation` None: the environment's.
 
     `layout` is the name of a floor; None: the environment's, or the one of its floors that the seed
     draws. `way` is where it starts and goes, instead of what the seed draws.
@@ -52,7 +52,7 @@ class EpisodeSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode laid out."""
+    """An episode as drawn."""
 
     spec: EpisodeSpec
     start: tuple[float, float, float]  # x, y, yaw

@@ -46,7 +46,7 @@ WALL_HALF_HEIGHT_M = 0.5
 
 @dataclass(frozen=True)
 class Handles:
-    """Where things are in the model's arrays."""
+    """The indices of the twin's parts in the model's arrays."""
 
     chassis_body: int
     wheel_bodies: tuple[int, ...]  # left, right; of a front axle before those of a rear one
@@ -82,7 +82,7 @@ def build_model(
 
 
 def build_robot_alone(robot: RobotModel, timestep_s: float = 0.01) -> mujoco.MjModel:
-    """Build the robot on a floor without an end."""
+    """Build the robot on an endless floor."""
     spec = _spec(timestep_s)
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=FLOOR, **FLOOR_MASK
@@ -111,7 +111,7 @@ def _spec(timestep_s: float) -> Any:
 def building_boxes(
     warehouse: Warehouse, rack_slots: int, lidar_z_m: float = 0.0
 ) -> tuple[F64, F64]:
-    """Middles and half sizes (rack_slots + 4, 3) of racks and walls, in the model's order.
+    """Return centres and half sizes (rack_slots + 4, 3) of racks and walls, in model order.
 
     They are no lower than a lidar needs to see them.
     """
@@ -206,7 +206,7 @@ def _handles(model: mujoco.MjModel, robot: RobotModel) -> Handles:
 
 
 def passed_over(lidar_z_m: float) -> list[str]:
-    """Return what a lidar at this height never sees, with its own height."""
+    """Return the kinds of obstacles that a lidar at this height passes over, with their heights."""
     heights = {
         "pallets": PALLET_HALF_M[2],
         "forklifts": FORKLIFT_HALF_M[2],
@@ -216,7 +216,7 @@ def passed_over(lidar_z_m: float) -> list[str]:
 
 
 def yaw_of(quat: F64) -> F64:
-    """Heading (N,) from unit quaternions (N, 4), w first."""
+    """Return headings (N,) of unit quaternions (N, 4), w first."""
     w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
     heading: F64 = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return heading

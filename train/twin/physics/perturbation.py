@@ -1,4 +1,4 @@
-"""A perturbation: how the floor, the robot and its sensors differ from the nominal twin.
+"""A perturbation: the difference of floor, robot and sensors from the nominal twin.
 
 Every field is a number with a unit and a range; the defaults are the nominal twin, which has
 small noise as every robot has.
@@ -27,7 +27,7 @@ UpToTwo = Annotated[float, Meta(ge=0, le=2)]
 
 
 class Perturbation(Checked, frozen=True):
-    """One set of effective parameters. `Perturbation()` is the nominal twin."""
+    """A set of effective parameters. `Perturbation()` is the nominal twin."""
 
     name: str = "nominal"
     friction_scale: Annotated[float, Meta(ge=0.05, le=2)] = 1.0  # factor of the floor's .8
@@ -57,7 +57,7 @@ class Perturbation(Checked, frozen=True):
     timestep_s: Annotated[float, Meta(ge=5e-4, le=0.02)] = 0.01  # one per vector environment
 
     def changed(self) -> dict[str, float]:
-        """Return the fields that are not the nominal twin's: what every transition keeps."""
+        """Return the fields that differ from the nominal twin's, which every transition keeps."""
         values = {field: getattr(self, field) for field in RANGES}
         return {field: value for field, value in values.items() if value != NOMINAL[field]}
 
@@ -91,13 +91,13 @@ class Schedule(Checked, frozen=True):
                 )
 
     def draw(self, rng: np.random.Generator) -> Perturbation:
-        """One perturbation, named like the schedule."""
+        """Draw one perturbation, named like the schedule."""
         drawn = {field: float(rng.uniform(*self.ranges[field])) for field in sorted(self.ranges)}
         return msgspec.structs.replace(self.base, name=self.name, **drawn)
 
 
 def load_perturbation(path: Path | str) -> Perturbation:
-    """Read a perturbation from TOML: one `field = number` a line.
+    """Read a perturbation from TOML, with one `field = number` per line.
 
     Raises:
         ConfigError: no such file, a field that does not exist, a value out of its range, or a
@@ -110,7 +110,7 @@ def load_perturbation(path: Path | str) -> Perturbation:
 
 
 def is_schedule(where: str) -> ConfigError:
-    """Return the refusal of a schedule where one set of parameters is needed."""
+    """Return the error for a schedule given where one set of parameters is needed."""
     return ConfigError(
         "is a schedule, whose parameters differ from episode to episode: here they must be fixed",
         where=where,
@@ -129,7 +129,7 @@ def load_schedule(path: Path) -> Schedule:
 
 
 def find_perturbation(given: str | Mapping[str, Any], *, where: str) -> Perturbation | Schedule:
-    """Return a ready-made perturbation by its name, what a TOML file holds, or what a table says.
+    """Return a perturbation from a built-in name, a TOML file or a table.
 
     Raises:
         ConfigError: there is no such perturbation or file, or a value is not valid.

@@ -1,4 +1,4 @@
-"""The robot that the twin builds: every number of it, by a profile's `[robot]` and outline.
+"""The robot that the twin builds from a profile's `[robot]` and outline.
 
 `stand_in` is the twin's own robot, which drives where a profile has no `[robot]`. `design` makes
 one from a profile's: what that leaves out follows from the outline's size, by what is usual among
@@ -43,7 +43,7 @@ USUAL_STEERING_RADPS = 2.0  # how fast wheels steer, where nothing says
 
 @dataclass(frozen=True)
 class RobotModel:
-    """One robot with two or four wheels; x is ahead of the axle, z above the floor.
+    """A robot with two or four wheels; x is ahead of the axle, z above the floor.
 
     Of a robot that steers (ackermann) the axle is the rear one, whose wheels are driven; of the
     others with two it is the point halfway.
@@ -82,7 +82,7 @@ class RobotModel:
 
     @property
     def wheels_m(self) -> F64:
-        """x and y of every wheel (W, 2): left before right, front before rear."""
+        """Return x and y of every wheel (W, 2): left before right, front before rear."""
         axles = (0.0,) if not self.wheelbase_m else (self.wheelbase_m / 2, -self.wheelbase_m / 2)
         if self.steers:
             axles = (self.wheelbase_m, 0.0)
@@ -91,7 +91,7 @@ class RobotModel:
 
     @property
     def steers(self) -> bool:
-        """Whether its front wheels steer, and only the rear ones are driven."""
+        """Return whether its front wheels steer, so that only the rear ones are driven."""
         return self.drive == "ackermann"
 
     @property
@@ -107,7 +107,7 @@ class RobotModel:
 
     @property
     def min_turning_radius_m(self) -> float:
-        """Of its tightest circle; 0: it turns on the spot."""
+        """Return the radius of its tightest circle, in metres; 0 if it turns on the spot."""
         return self.wheelbase_m / math.tan(self.max_steering_rad) if self.steers else 0.0
 
     @property
@@ -116,17 +116,17 @@ class RobotModel:
         return self.chassis_kg + wheels + len(self.casters_m) * self.caster_kg
 
     def wheel_commands(self, speed_mps: F64, yaw_rate_radps: F64) -> tuple[F64, F64]:
-        """Body velocity to the left and right wheels' speeds in rad/s, at the nominal radius."""
+        """Convert body velocity to left and right wheel speeds in rad/s, at the nominal radius."""
         turn = yaw_rate_radps * (self.turn_track_m / 2)
         return (speed_mps - turn) / self.wheel_radius_m, (speed_mps + turn) / self.wheel_radius_m
 
     def body_velocity(self, left_radps: F64, right_radps: F64) -> tuple[F64, F64]:
-        """Wheel speeds in rad/s to forward speed (m/s) and yaw rate (rad/s): wheel odometry."""
+        """Convert wheel speeds in rad/s to speed (m/s) and yaw rate (rad/s): wheel odometry."""
         speed = (left_radps + right_radps) * (self.wheel_radius_m / 2)
         return speed, (right_radps - left_radps) * (self.wheel_radius_m / self.turn_track_m)
 
     def by_side(self, wheels: F64) -> F64:
-        """Values (N, W) of the wheels as those of the two sides (N, 2), left and right."""
+        """Return values of the left and right side (N, 2), from those of the wheels (N, W)."""
         if self.steers:
             return wheels[:, 2:]
         return wheels if wheels.shape[1] == 2 else wheels.reshape(-1, 2, 2).mean(axis=1)
@@ -134,7 +134,7 @@ class RobotModel:
     # -- steering -------------------------------------------------------------------------------
 
     def steering_for(self, motion: F64, held_rad: F64) -> F64:
-        """Steering angles (...) for speeds and yaw rates (..., 2); `held_rad` where it is to stand.
+        """Return steering angles (...) for speeds and yaw rates (..., 2); `held_rad` at a stop.
 
         Turned on the spot, which it cannot, it steers as far as it can.
         """
@@ -145,11 +145,11 @@ class RobotModel:
         return np.clip(angle, -self.max_steering_rad, self.max_steering_rad)
 
     def yaw_rate(self, speed_mps: F64, steering_rad: F64) -> F64:
-        """Yaw rates in rad/s by the kinematic bicycle."""
+        """Return yaw rates in rad/s by the kinematic bicycle model."""
         return np.asarray(speed_mps * np.tan(steering_rad) / self.wheelbase_m)
 
     def front_angles(self, steering_rad: F64) -> F64:
-        """Angles (..., 2) of the left and the right front wheel: both on one circle's middle."""
+        """Return the left and right front wheels' angles (..., 2): both turn about one centre."""
         tangent, half = np.tan(steering_rad) / self.wheelbase_m, self.track_m / 2
         return np.stack(
             [
@@ -161,7 +161,7 @@ class RobotModel:
 
 
 def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
-    """Return the twin's own robot, in this outline."""
+    """Return the twin's own robot with this outline."""
     bearings = np.arange(beams) * (2 * np.pi / beams) - np.pi
     return RobotModel(
         length_m=body.length_m,
@@ -194,7 +194,7 @@ def stand_in(body: Body, beams: int = LIDAR_BEAMS) -> RobotModel:
 
 
 def design(robot: Robot, body: Body) -> RobotModel:
-    """Return a profile's robot, before it was tried.
+    """Return a profile's robot as designed, before it was tried.
 
     Raises:
         ConfigError: parts that do not go together.
@@ -251,7 +251,7 @@ def design(robot: Robot, body: Body) -> RobotModel:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a robot measures, by its profile, and by its outline where that leaves something out."""
+    """The dimensions of a robot, by its profile or estimated from its outline."""
 
     wheel_radius_m: float
     track_m: float
@@ -286,7 +286,7 @@ def measures(robot: Robot, body: Body) -> Measures:
 
 
 def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
-    """All around, a beam short of a full turn; else from one end to the other."""
+    """Return beams' bearings: all around, short of a full turn, or else from end to end."""
     span = lidar.angle_max_rad - lidar.angle_min_rad
     around = span > 2 * math.pi * (1 - 0.5 / beams)
     step = span / beams if around else span / (beams - 1)
@@ -294,7 +294,7 @@ def _bearings(lidar: Lidar, beams: int) -> tuple[float, ...]:
 
 
 def _refuse_misfit(robot: Measures, body: Body, axle_x_m: float) -> None:
-    """Parts that cannot be on one robot."""
+    """Raise ConfigError for parts that cannot be on one robot."""
     problem = None
     if 2 * robot.wheel_radius_m > 1.5 * body.length_m:
         problem = f"wheels of radius {robot.wheel_radius_m:g} m are longer than the outline"

@@ -1,4 +1,4 @@
-"""The robot's part of the MuJoCo model: built of chassis, casters, wheels and motors, or its own.
+"""The robot's part of the MuJoCo model: built from parts, or a profile's own model.
 
 Wheels collide as spheres, because a sphere's one contact point costs less than a cylinder's, and
 are drawn as cylinders. A mecanum wheel is a sphere that is driven about one diagonal and rolls
@@ -95,7 +95,7 @@ def own_model(robot: Robot, body: Body, built: RobotModel) -> RobotModel:
 
 
 def _robot_alone(mjcf: str) -> str:
-    """Without what is the world's to say, of which MuJoCo warns wherever the robot is attached."""
+    """Remove the world's settings from MJCF: MuJoCo warns of them if the robot is attached."""
     root = ET.fromstring(mjcf)
     for part in [part for part in root if part.tag in WORLD]:
         root.remove(part)
@@ -103,7 +103,7 @@ def _robot_alone(mjcf: str) -> str:
 
 
 def attach_own(spec: Any, robot: RobotModel) -> Any:
-    """Put the robot's own model into the twin's; returns its base."""
+    """Attach a profile's own model to the twin's; return its base."""
     child = mujoco.MjSpec.from_string(robot.mjcf)
     for part in (*child.worldbody.geoms, *child.worldbody.sites, *child.lights, *child.cameras):
         child.delete(part)
@@ -116,7 +116,7 @@ def attach_own(spec: Any, robot: RobotModel) -> Any:
 
 
 def wheel_joints(model: mujoco.MjModel, drive: Drive, prefix: str = PREFIX) -> list[int]:
-    """Return the joints of the wheels, left before right and front before rear, as everywhere."""
+    """Return the wheels' joints, left before right and front before rear."""
     rolling = [
         int(model.actuator_trnid[model.actuator(prefix + name).id, 0])
         for name in ROLES[drive]
@@ -136,12 +136,12 @@ def steering_joints(model: mujoco.MjModel, prefix: str = PREFIX) -> list[int]:
 
 
 def actuators(model: mujoco.MjModel, robot: RobotModel) -> list[int]:
-    """Where in `ctrl` what `ROLES` names is."""
+    """Return the indices in `ctrl` of the actuators that `ROLES` names."""
     return [model.actuator(PREFIX + name).id for name in ROLES[robot.drive]]
 
 
 def wheel_geom(model: mujoco.MjModel, body: int) -> int | None:
-    """Return the one geom of a wheel that touches; None: there is not one."""
+    """Return the only colliding geom of a wheel; None if there is not exactly one."""
     geoms = [
         int(geom)
         for geom in np.flatnonzero(model.geom_bodyid == body)
@@ -153,7 +153,7 @@ def wheel_geom(model: mujoco.MjModel, body: int) -> int | None:
 def _problems(
     model: mujoco.MjModel, robot: Robot, body: Body, built: RobotModel
 ) -> tuple[list[str], list[int]]:
-    """Return what is wrong, by name, and the wheels' bodies."""
+    """Return what is wrong with a profile's model, by name, and the wheels' bodies."""
     free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
     bases = [i for i in range(1, model.nbody) if model.body_parentid[i] == 0]
     if len(bases) != 1 or len(free) != 1 or model.jnt_bodyid[free[0]] != bases[0]:
@@ -229,7 +229,7 @@ def _place_problems(model: mujoco.MjModel, wheels: list[int], steers: bool) -> l
 
 
 def _rolling_of(model: mujoco.MjModel, steering: int) -> int:
-    """Return the hinge that comes after a steering one on the same body; -1: none."""
+    """Return the hinge after a steering hinge on the same body, or -1."""
     after = steering + 1
     same = after < model.njnt and model.jnt_bodyid[after] == model.jnt_bodyid[steering]
     return after if same else -1
@@ -248,7 +248,7 @@ STEERING_RADPS = 50.0  # the natural frequency of a steering motor with its whee
 
 
 def add_robot(spec: Any, robot: RobotModel) -> None:
-    """Put the robot into the twin's model: built, or its own in that place."""
+    """Add the robot to the twin's model: a built one, or a profile's own in its place."""
     if robot.mjcf is not None:
         _add_own(spec, robot)
         return
@@ -353,7 +353,7 @@ def _add_steering(wheel: Any, name: str, robot: RobotModel) -> None:
 
 
 def _add_steering_motors(spec: Any, robot: RobotModel) -> None:
-    """Critically damped, and much faster than wheels are steered."""
+    """Add steering motors, critically damped and much faster than wheels are steered."""
     inertia = robot.armature + 0.4 * robot.wheel_kg * robot.contact_radius_m**2
     for side in ("left", "right"):
         motor = spec.add_actuator(
@@ -408,7 +408,7 @@ def grip(model: mujoco.MjModel, robot: RobotModel) -> None:
 
 
 class Wheels(NamedTuple):
-    """Where a model has the wheels: left before right, front before rear."""
+    """The wheels of a model: left before right, front before rear."""
 
     bodies: list[int]
     geoms: list[int]  # that touch the floor
@@ -438,7 +438,7 @@ def _own_wheels(model: mujoco.MjModel, robot: RobotModel) -> Wheels:
 
 
 def actuator_places(model: mujoco.MjModel, robot: RobotModel) -> tuple[int, ...]:
-    """Where in ctrl what drives and steers is."""
+    """Return the indices in `ctrl` of the driving and steering actuators."""
     return tuple(range(model.nu)) if robot.mjcf is None else tuple(actuators(model, robot))
 
 

@@ -1,4 +1,4 @@
-"""The robot of a profile as the twin drives it: designed, then tried on an empty floor.
+"""The profile's robot as the twin drives it: designed, then tried on an empty floor.
 
 Wheels' soft contacts sink a little into the floor, which a small wheel rolls slower for, and a
 robot whose wheels scrub turns slower than they say. Both are measured here once, so that every
@@ -32,7 +32,7 @@ TRY_SPEED, TRY_TURN = 0.5, 1.0  # m/s and rad/s, or as fast as its limits allow
 
 
 def robot_model(robot: Robot | None, body: Body) -> RobotModel:
-    """Return the model of a profile's `[robot]`; the stand-in where it has none.
+    """Return the model of a profile's `[robot]`, or the stand-in if it has none.
 
     Raises:
         ConfigError: a drive that the twin does not have, parts that do not go together, or a robot
@@ -42,7 +42,7 @@ def robot_model(robot: Robot | None, body: Body) -> RobotModel:
 
 
 class _Key:
-    """A robot and its outline, hashed by what they hold."""
+    """A robot and its outline, hashed by their content."""
 
     def __init__(self, robot: Robot, body: Body) -> None:
         self.robot, self.body = robot, body
@@ -77,7 +77,7 @@ def _tried(key: _Key) -> RobotModel:
 
 
 def _rolling_m(robot: RobotModel, ahead_mps: float, speed_mps: float) -> float:
-    """Return the radius that its wheels roll on, by how fast it drives at a commanded speed."""
+    """Return its wheels' rolling radius, from how fast it drives at a commanded speed."""
     if not 0.5 * speed_mps < ahead_mps < 2 * speed_mps:
         raise _unfit(f"it drives {ahead_mps:.2f} m/s where {speed_mps:.2f} m/s is commanded")
     return robot.wheel_radius_m * ahead_mps / speed_mps
@@ -114,7 +114,7 @@ def driven_actions(
 
 
 def measured(model: RobotModel, robot: Robot | None) -> list[tuple[str, Any, str]]:
-    """Return the values of a robot in the twin: name, value, and where it is from."""
+    """Return a robot's values in the twin as rows of name, value and source."""
     own = robot is not None and robot.mjcf is not None
     lidar = Lidar() if robot is None else robot.lidar
     of_file = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg", "lidar.z_m")
@@ -167,7 +167,7 @@ def outlined(body: Body) -> list[tuple[str, Any, str]]:
 
 
 def outside(model: RobotModel, body: Body) -> list[str]:
-    """Return the parts of a robot that are not within its outline, and by how much."""
+    """Return the parts of a robot that are outside its outline, and by how much."""
     places = {"the lidar": (body.lidar_x_m, 0.0)}
     for number, (x, y) in enumerate(model.casters_m):
         places[f"caster {number + 1}"] = (x + model.axle_x_m, y)
@@ -217,7 +217,7 @@ def _control(
 
 
 def _motion(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float]:
-    """One step further: speed ahead and yaw rate."""
+    """Step the physics once; return forward speed (m/s) and yaw rate (rad/s)."""
     mujoco.mj_step(model, data)
     w, x, y, z = data.qpos[3:7]
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -1,4 +1,4 @@
-"""What stands and moves around the robots: boxes of the one model, written into its batch.
+"""Racks, pallets, people and forklifts around the robots, written into the batch.
 
 Racks and walls are geoms, placed again where an episode is on another floor; pallets, people and
 forklifts are mocap bodies.
@@ -53,7 +53,7 @@ _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 class Traffic(Stateful):
-    """The agents of N environments: positions over time. All arrays are (N, AGENTS, ...)."""
+    """The people and forklifts of N environments over time. Arrays are (N, AGENTS, ...)."""
 
     # What changes on the way; ways and triggers are those of the episodes.
     STATE = (
@@ -83,7 +83,7 @@ class Traffic(Stateful):
         self.active = np.zeros(num_envs, np.bool_)  # whether the environment has any traffic
 
     def reset(self, env: int, walks: tuple[Walk | None, ...]) -> None:
-        """Lay out the ways of one environment's agents."""
+        """Set the ways of one environment's agents."""
         self.active[env] = any(walk is not None for walk in walks)
         self.state[env] = HIDDEN
         self.closest_m[env] = np.nan
@@ -100,7 +100,7 @@ class Traffic(Stateful):
                 self._place(np.array([env]))
 
     def advance(self, robot: F64, velocity: F64, touched: Bools, elapsed_s: float) -> Ints:
-        """Move the agents for `elapsed_s`; returns the environments where some are under way.
+        """Move the agents for `elapsed_s`; return the environments where any are under way.
 
         `robot` (N, 3) is x, y, yaw, `velocity` (N, 2) in the map frame; `touched` (N,) says whose
         bumper was pressed in the time before.
@@ -142,7 +142,7 @@ class Traffic(Stateful):
         return ids
 
     def gaps_m(self, pose: F64) -> F64:
-        """From each agent's circle to the outline of a robot at `pose` (N, 3); inf: not there."""
+        """Return gaps from agents' circles to robots' outlines at `pose` (N, 3); inf if absent."""
         gaps = np.full(self.state.shape, np.inf)
         ids = np.flatnonzero(self.active)
         if len(ids):
@@ -151,7 +151,7 @@ class Traffic(Stateful):
         return gaps
 
     def _place(self, ids: Ints) -> None:
-        """Positions from how far each has travelled along its way."""
+        """Set positions by how far each agent has gone along its way."""
         shown = self.state[ids] != HIDDEN
         share = self.travelled_m[ids] / self.length_m[ids] * (WAY_POINTS - 1)
         first = np.clip(share.astype(np.int64), 0, WAY_POINTS - 2)
@@ -164,7 +164,7 @@ class Traffic(Stateful):
         self.heading_rad[ids] = np.where(shown, np.arctan2(step[..., 1], step[..., 0]), 0.0)
 
     def _driven_at(self, ids: Ints, pose: F64, velocity: F64) -> Bools:
-        """Which agents (n, AGENTS) the robot comes nearer to by driving."""
+        """Return which agents (n, AGENTS) the robot approaches by driving."""
         delta = self.position_m[ids] - pose[:, None, :2]
         distance = np.maximum(np.hypot(delta[..., 0], delta[..., 1]), 1e-9)
         closing = (
@@ -173,7 +173,7 @@ class Traffic(Stateful):
         return np.asarray(closing > DRIVEN_AT_MPS, np.bool_)
 
     def note_closest(self, place_m: F64, yaw_of: Callable[[Ints], F64]) -> None:
-        """Note how near anyone is to the robots' outlines now, (N, 2) their middles.
+        """Note the agents' current distance to robots' outlines; (N, 2) are robots' centres.
 
         `yaw_of` is asked where somebody may be nearer than ever in the episode.
         """
@@ -189,7 +189,7 @@ class Traffic(Stateful):
             self.closest_m[ids] = np.minimum(self.closest_m[ids], gap)
 
     def _outline_gap(self, ids: Ints, delta: F64, yaw: F64) -> F64:
-        """From the robots' outlines to the nearest person, a circle, or forklift, a box, (n,).
+        """Return the gap (n,) from robots' outlines to the nearest person or forklift.
 
         Args:
             delta: from the robots' middles to theirs, (n, AGENTS, 2); yaw: the robots', (n, 1).
@@ -209,7 +209,7 @@ class Traffic(Stateful):
         return np.asarray(np.maximum(gap.min(axis=1), 0.0), np.float64)
 
     def _gap(self, ids: Ints, pose: F64) -> tuple[F64, Bools]:
-        """From each agent's circle to the robot's outline, and whether it walks toward it."""
+        """Return gaps from agents' circles to robots' outlines, and who walks toward them."""
         delta = self.position_m[ids] - pose[:, None, :2]
         gap = _outside_m(_turned(delta, -pose[:, None, 2]), self.body_half_m) - self.radius_m
         heading = self.heading_rad[ids]
@@ -218,14 +218,14 @@ class Traffic(Stateful):
 
 
 def _turned(vectors: F64, angle_rad: F64) -> F64:
-    """Vectors (..., 2) turned to the left by angles that broadcast against (...)."""
+    """Turn vectors (..., 2) to the left by angles that broadcast against (...)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x, y = vectors[..., 0], vectors[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _outside_m(points: F64, half_m: F64) -> F64:
-    """From a rectangle around 0 to points (..., 2); 0 inside."""
+    """Return the distance from a rectangle around 0 to points (..., 2); 0 inside."""
     outside = np.maximum(np.abs(points) - half_m, 0.0)
     return np.asarray(np.hypot(outside[..., 0], outside[..., 1]), np.float64)
 
@@ -261,7 +261,7 @@ class Scenery(Stateful):
         self.floor = np.zeros(num_envs, np.int64)  # whose building stands
 
     def build(self, env: int, floor: int) -> None:
-        """Racks and walls of a floor."""
+        """Put up the racks and walls of a floor."""
         if floor == self.floor[env]:
             return
         self.floor[env] = floor
@@ -272,7 +272,7 @@ class Scenery(Stateful):
         self.batch.expand("geom_rbound")[env, where] = np.sqrt((half**2).sum(axis=1))
 
     def reset(self, env: int, episode: Episode) -> None:
-        """Pallets, people and forklifts as an episode begins."""
+        """Place pallets, people and forklifts as an episode begins."""
         self.pallets[env] = episode.pallets
         self.position_m[env, :, :2] = PARKED_M[:2]
         self.position_m[env, :, 2] = MOVING_HALF_M[:, 2]  # they stand on the floor
@@ -286,7 +286,7 @@ class Scenery(Stateful):
         self.stand_still(ids)
 
     def walk(self, ids: Ints) -> None:
-        """Show traffic in `ids` where it now is, at the end of the coming block.
+        """Move the traffic in `ids` to its current place by the end of the coming block.
 
         On the way there it moves a little at every substep: a jump of a block's length would
         strike the robot like a hammer.
@@ -305,11 +305,11 @@ class Scenery(Stateful):
         self.moves[ids] = path.reshape(len(ids), substeps, -1)
 
     def stand_still(self, ids: Ints) -> None:
-        """Nothing moves in `ids` during the coming block."""
+        """Keep everything in `ids` in place during the coming block."""
         self.moves[ids] = self.position_m[ids].reshape(len(ids), 1, self.moves.shape[2])
 
     def restored(self) -> None:
-        """Bodies stand where the restored physics has them."""
+        """Keep all bodies where the restored physics has them."""
         self.stand_still(np.arange(len(self.moves)))
 
     def _show_traffic(self, ids: Ints) -> None:
@@ -327,7 +327,7 @@ def quaternion(yaw_rad: F64) -> F64:
 
 
 def rotated(quat: F64, vector: F64) -> F64:
-    """Vectors (..., 3) turned by unit quaternions (..., 4), w first."""
+    """Rotate vectors (..., 3) by unit quaternions (..., 4), w first."""
     axis = quat[..., 1:]
     across = 2 * np.cross(axis, vector)
     turned: F64 = vector + quat[..., :1] * across + np.cross(axis, across)
@@ -338,10 +338,10 @@ FAR_AWAY = (1e9, 1e9, 1.0, 0.0, 0.1, 0.1)  # of a shape that the beams pass over
 
 
 class Lidar:
-    """Beams of N lidars, `height_m` above the floor."""
+    """The beams of N lidars, `height_m` above the floor."""
 
     def __init__(self, batch: Any, scenery: Scenery, bearings_rad: F64, height_m: float) -> None:
-        """`bearings_rad` (beams,) are from the robot's heading."""
+        """Set up lidars; `bearings_rad` (beams,) are relative to the robot's heading."""
         self.batch, self.scenery, self.height_m = batch, scenery, height_m
         self._beam = np.stack([np.cos(bearings_rad), np.sin(bearings_rad)], axis=-1)
         self._order = np.argsort(bearings_rad)
@@ -355,12 +355,12 @@ class Lidar:
         self._half_m[scenery.handles.people, 1] = 0.0  # they are round
 
     def _in_plane(self, middle: F64, half: F64) -> F64:
-        """Boxes (G, 4) that the plane of the beams cuts: x, y and half sizes."""
+        """Return the boxes (G, 4) that the beams' plane cuts: x, y and half sizes."""
         cut = np.abs(middle[:, 2] - self.height_m) <= half[:, 2]
         return np.column_stack([middle[cut, :2], half[cut, :2]])
 
     def ranges(self, ids: Ints, place_m: F64, heading_rad: F64) -> F64:
-        """Distances (n, beams) in metres from lidars at (n, 2); inf where nothing is hit."""
+        """Return distances (n, beams) in metres from lidars at (n, 2); inf if nothing is hit."""
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         rays = np.empty((len(ids), len(self._beam), 2))
         rays[..., 0] = cos[:, None] * self._beam[:, 0] - sin[:, None] * self._beam[:, 1]
@@ -383,7 +383,7 @@ class Lidar:
         return ranges
 
     def _moved(self, ids: Ints) -> F64:
-        """Pallets, people and forklifts (n, M, 6) as `compiled.ranges` takes them."""
+        """Return pallets, people and forklifts (n, M, 6) for `compiled.ranges`."""
         position, quat = self.scenery.position_m[ids], self.scenery.quat[ids]
         shapes = np.empty((*position.shape[:2], 6))
         shapes[..., :2] = position[..., :2]
@@ -395,7 +395,7 @@ class Lidar:
         return shapes
 
     def _cast(self, ids: Ints, place_m: F64, rays: F64) -> F64:
-        """By MuJoCo."""
+        """Return the ranges as MuJoCo's ray casting finds them."""
         origin = np.full((len(ids), 1, 3), self.height_m)
         origin[:, 0, :2] = place_m
         level = np.zeros((*rays.shape[:2], 3))

@@ -1,4 +1,4 @@
-"""What the twin's robot senses: the signals of `restock.ingest.task.signals`, from the simulation.
+"""The robot's sensors: the signals of `restock.ingest.task.signals` from the simulation.
 
 The functions that turn ranges into clearances and plans into waypoints are ingest's own; here are
 only the sensors: lidar, localisation, encoders, gyroscope, accelerometer and bumper, with the
@@ -100,7 +100,7 @@ class Sensing(Stateful):
             axis[:] = list(accumulate(axis.tolist(), lambda before, new: new + keep * before))
 
     def sense(self, ids: Ints, step: Ints) -> Signals:
-        """Everything but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
+        """Sense all but the route and localised speeds, for `ids` (n,) at their steps (n,)."""
         sim, task = self.simulation, self.task
         noise = self._noise[ids, step]
         scalar = noise[:, :_SCALARS] * self._scale[ids]
@@ -155,10 +155,10 @@ class Sensing(Stateful):
         }
 
     def add_motion(self, ids: Ints, signals: Signals, before: Signals | None = None) -> None:
-        """Speeds from the last two localised poses, and who came nearer.
+        """Add speeds from the last two localised poses, and how far others came nearer.
 
-        Of all robots at once; of `ids` (n,) at their episodes' first step, where there is none
-        `before`: speeds are the wheels', and nobody came.
+        Signals are those of all robots. At the first step of an episode they are only those of
+        `ids` (n,), without `before`: then speeds are the wheels', and nobody came nearer.
         """
         forward, lateral = localised_velocity(signals, signals if before is None else before)
         signals["localised_speed_mps"], signals["localised_lateral_mps"] = forward, lateral
@@ -173,7 +173,7 @@ class Sensing(Stateful):
 
 
 class _Around:
-    """The room around robots whose own lidar does not see all around, or over what stands there."""
+    """The room around robots whose lidar does not see all around, or sees over obstacles."""
 
     def __init__(self, simulation: Simulation) -> None:
         body, bearings = simulation.task.body, np.array(stand_in(simulation.task.body).bearings_rad)
@@ -182,14 +182,14 @@ class _Around:
         self._lidar = Lidar(simulation.batch, simulation.scenery, bearings, LIDAR_Z_M)
 
     def room_m(self, ids: Ints) -> F64:
-        """From the outlines (n,) to what is nearest along each bearing, (n, beams)."""
+        """Return distances (n, beams) from outlines (n,) to what is nearest along each bearing."""
         middle = self._simulation.middle(self._simulation.pose()[ids])
         ranges: F64 = self._lidar.ranges(ids, middle[:, :2], middle[:, 2]) - self._reach_m
         return ranges
 
 
 def _sees_everything(simulation: Simulation) -> bool:
-    """Whether no bearing is far from a beam, and none passes over what stands on a floor."""
+    """Return whether beams cover all bearings and pass over nothing that stands on a floor."""
     bearings = np.sort(simulation.bearings_rad % (2 * np.pi))
     widest = np.diff(bearings, append=bearings[0] + 2 * np.pi).max()
     return bool(widest < WIDEST_GAP_RAD) and not passed_over(simulation.robot.lidar_z_m)

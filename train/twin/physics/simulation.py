@@ -1,4 +1,4 @@
-"""The physics of N warehouses at once: one `mujoco.batch.Batch`, and what is written into it.
+"""The physics of N warehouses at once: one `mujoco.batch.Batch` and its inputs.
 
 A control period is driven in blocks of .1 s, or where it is no multiple of that in equal parts.
 Before each block, friction is looked up under every wheel and traffic moves; within it the base
@@ -60,11 +60,11 @@ class BaseController(Stateful):
         self.left_gain = np.ones(num_envs)
 
     def reset(self, env: int) -> None:
-        """Stand still, as after a stop command long ago."""
+        """Reset to a standstill, as after a stop command long ago."""
         self.commands[env] = self.set_point[env] = 0.0
 
     def begin(self, motion: F64) -> None:
-        """Drive steadily at speeds and yaw rates (N, 2) of the wheels, as commanded long ago."""
+        """Begin at steady speeds and yaw rates (N, 2) of the wheels, as commanded long ago."""
         command = motion / self.gain[:, None]
         self.commands[:], self.set_point[:] = command[:, None], command
 
@@ -77,7 +77,7 @@ class BaseController(Stateful):
         self.commands[:, 0] = _limit(np.asarray(command, np.float64), self._speed_limit)
 
     def controls(self, since_s: float) -> F64:
-        """Return what the actuators are told over a block that begins `since_s` into a period.
+        """Return the actuators' inputs over a block that begins `since_s` into a period.
 
         (N, substeps, actuators), in the model's order: wheel speeds in rad/s. The controller ramps
         toward the command in force.
@@ -104,7 +104,7 @@ class BaseController(Stateful):
         return old, new, switch
 
     def _ramp(self, begin: F64, old: F64, new: F64, switch: Ints) -> F64:
-        """From `begin` (N, 2) toward the commands in force, (N, substeps, 2), in closed form."""
+        """Ramp from `begin` (N, 2) toward the commands in force, (N, substeps, 2), exactly."""
         reach = self._accel_limit * self._timestep_s
         begin = begin[:, None]
         count = (np.arange(self._substeps) + 1)[None, :, None]
@@ -115,7 +115,7 @@ class BaseController(Stateful):
         return ramp
 
     def _wheels(self, ramp: F64) -> F64:
-        """Wheel speeds (N, substeps, 2) of both sides in rad/s, at speeds and yaw rates."""
+        """Return both sides' wheel speeds (N, substeps, 2) in rad/s, from speeds and yaw rates."""
         left, right = self.robot.wheel_commands(ramp[..., 0], ramp[..., 1])
         speeds: F64 = np.stack([left, right], axis=-1) * self.gain[:, None, None]
         speeds[..., 0] *= self.left_gain[:, None]
@@ -139,17 +139,17 @@ class SteeringController(BaseController):
         self.steering_rad = np.zeros(num_envs)  # of the wheel in the middle of the front axle
 
     def reset(self, env: int) -> None:
-        """As of every controller, with the wheels straight ahead."""
+        """Reset to a standstill with the wheels straight ahead."""
         super().reset(env)
         self.steering_rad[env] = 0.0
 
     def begin(self, motion: F64) -> None:
-        """As of every controller, steering as it takes to drive so."""
+        """Begin at steady motion, with the steering angles it needs."""
         super().begin(motion)
         self.steering_rad = self.robot.steering_for(motion, np.zeros(len(motion)))
 
     def controls(self, since_s: float) -> F64:
-        """As of every controller: speeds of the rear wheels, and angles (rad) of the front ones."""
+        """Return speeds of the rear wheels and angles (rad) of the front ones over a block."""
         old, new, switch = self._in_force(since_s)
         begin = np.stack([self.set_point[:, 0], self.steering_rad], axis=-1)
         first = self._steered(old, begin[:, None, 1])
@@ -163,7 +163,7 @@ class SteeringController(BaseController):
         return np.concatenate([self._wheels(driven), self.robot.front_angles(steering)], axis=-1)
 
     def _steered(self, command: F64, held_rad: F64) -> F64:
-        """Commands (N, 1, 2) as speeds and steering angles."""
+        """Convert commands (N, 1, 2) to speeds and steering angles."""
         steering = self.robot.steering_for(command, held_rad)
         return np.stack([command[..., 0], steering], axis=-1)
 
@@ -171,7 +171,7 @@ class SteeringController(BaseController):
 def base_controller(
     num_envs: int, robot: RobotModel, period_s: float, timestep_s: float, substeps: int
 ) -> BaseController:
-    """Return the controllers that robots of this model have."""
+    """Build the controllers for robots of this model."""
     kind = SteeringController if robot.steers else BaseController
     return kind(num_envs, robot, period_s, timestep_s, substeps)
 
@@ -181,7 +181,7 @@ def _limit(change: F64, most: F64) -> F64:
 
 
 class RobotBody:
-    """What a perturbation changes of N robots, written into the batch that holds them.
+    """The perturbed properties of N robots, written into their batch.
 
     Fields are made per-simulation when first needed: as long as no episode needs one, all share
     the model's.
@@ -227,7 +227,7 @@ class RobotBody:
             self.batch.set_const(np.array([env]))
 
     def _slope(self, env: int, perturbation: Perturbation) -> None:
-        """Gravity along a sloping floor, as a force on the chassis in place of a tilted floor."""
+        """Apply gravity along a sloping floor as a force on the chassis."""
         rise = np.array([perturbation.slope_x, perturbation.slope_y])
         if not rise.any() and not self._sloped:
             return
@@ -290,7 +290,7 @@ class Simulation(Stateful):
         beams: int = LIDAR_BEAMS,
         robot: RobotModel | None = None,
     ) -> None:
-        """On several `floors`, `reset` says on which of them each episode is.
+        """Build N warehouses; with several `floors`, `reset` chooses the one of each episode.
 
         Without a `robot` it is the stand-in, with so many `beams`.
         """
@@ -368,7 +368,7 @@ class Simulation(Stateful):
         self.bumped[env] = self.slipped[env] = self.diverged[env] = False
 
     def place_robot(self, env: int, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Stand the robot still at a pose."""
+        """Put the robot at a pose, standing still."""
         self.qpos[env] = self.model.qpos0
         self.qpos[env, :3] = x_m, y_m, self.robot.rest_z_m
         self.qpos[env, 3:7] = quaternion(np.array([yaw_rad]))[0]
@@ -475,11 +475,11 @@ class Simulation(Stateful):
         return np.stack([pose[..., 0] - x, pose[..., 1] - y, pose[..., 2]], axis=-1)
 
     def wheel_speeds(self) -> F64:
-        """Speeds (N, 2) of the wheels on the left and on the right, rad/s."""
+        """Return the speeds (N, 2) of the left and right wheels, in rad/s."""
         return self.robot.by_side(self._turning(np.arange(self.num_envs)))
 
     def _turning(self, ids: Ints) -> F64:
-        """Speeds (n, W) of the wheels, rad/s."""
+        """Return the speeds (n, W) of the wheels, in rad/s."""
         if self._rollers is None:
             return np.asarray(self.qvel[np.ix_(ids, self._wheel_qvel)])
         spin = self.qvel[np.ix_(ids, self._wheel_qvel)].reshape(len(ids), -1, 3)
@@ -487,18 +487,18 @@ class Simulation(Stateful):
         return np.asarray((about * self._rollers).sum(axis=-1))
 
     def _wheel_angles(self) -> F64:
-        """How far the wheels (N, W) have turned, rad."""
+        """Return how far the wheels (N, W) have turned, in rad."""
         return self._rolled if self._rollers is not None else self.qpos[:, self._wheel_qpos]
 
     def roll(self, speed_mps: F64, yaw_rate_radps: F64) -> None:
-        """Let the wheels turn as at speeds (N,) and yaw rates (N,) of their own."""
+        """Set the wheels' speeds to those for speeds (N,) and yaw rates (N,) of their own."""
         left, right = self.robot.wheel_commands(speed_mps, yaw_rate_radps)
         for wheel, dof in enumerate(self.handles.wheel_qvel):
             # A mecanum wheel that has not turned yet turns about y.
             self.qvel[:, dof + (self._rollers is not None)] = right if wheel % 2 else left
 
     def steer(self) -> None:
-        """Let the front wheels of robots that steer stand as their controllers have them."""
+        """Set the front wheels of robots that steer to their controllers' angles."""
         if isinstance(self.controller, SteeringController):
             angles = self.robot.front_angles(self.controller.steering_rad)
             self.qpos[:, self._steering_qpos] = angles
@@ -507,7 +507,7 @@ class Simulation(Stateful):
         return yaw_of(self.qpos[ids, 3:7])
 
     def _slipping(self, ids: Ints, slippery: Bools) -> Bools:
-        """Whose wheel (n, W) is on a patch and moves over the floor faster than the limit."""
+        """Return where (n,) a wheel on a patch (n, W) slides over the floor above the limit."""
         velocity, heading = self.qvel[ids], yaw_of(self.qpos[ids, 3:7])
         cos, sin = np.cos(heading), np.sin(heading)
         forward = cos * velocity[:, 0] + sin * velocity[:, 1]
@@ -529,7 +529,7 @@ class Simulation(Stateful):
 
     @property
     def lidar_x_m(self) -> float:
-        """How far ahead of the pose the lidar is."""
+        """Return how far ahead of the pose the lidar is, in metres."""
         return self.task.body.lidar_x_m - self.robot.axle_x_m
 
     def cast(self, ids: Ints) -> F64:
@@ -542,7 +542,7 @@ class Simulation(Stateful):
 
     @property
     def _physics(self) -> NDArray[Any]:
-        """The batch's own state, (N, …)."""
+        """Return the batch's own state, (N, …)."""
         state: NDArray[Any] = self.batch.state
         return state
 

@@ -1,1 +1,1 @@
-"""Drives, written as a robot would log them."""
+"""Drives in the twin, written as a robot would log them."""

@@ -1,4 +1,4 @@
-"""Where a recording goes: an MCAP file, or a rosbag2 folder with sqlite3 storage.
+"""Writers of recordings: an MCAP file, or a rosbag2 folder with sqlite3 storage.
 
 Both are written whole or not at all: under a temporary name beside the target, renamed at the
 end, removed when anything (Ctrl-C included) stops the writing. The same messages give the same
@@ -39,7 +39,7 @@ CHUNK_BYTES = 2 << 20  # some twenty seconds of one robot: still cheap to seek, 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic to be recorded, and how its publisher offers it."""
+    """A topic to record, with its publisher's QoS."""
 
     name: str
     type_name: str  # package/msg/Type
@@ -49,7 +49,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Message:
-    """One serialised message: received at `log_ns`, sent at `publish_ns`."""
+    """A serialised message: received at `log_ns`, sent at `publish_ns`."""
 
     log_ns: int
     publish_ns: int
@@ -58,7 +58,7 @@ class Message:
 
 
 class Sink(Protocol):
-    """Takes messages in the order of their log times."""
+    """A writer that takes messages in the order of their log times."""
 
     def write(self, messages: Sequence[Message]) -> None: ...
 
@@ -107,7 +107,7 @@ def recording_sink(
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise RecordingError where something stands at `path` already."""
+    """Raise RecordingError if anything exists at `path`."""
     if path.exists() or path.is_symlink():
         raise RecordingError(
             "it already exists, and recordings are never overwritten",
@@ -117,7 +117,7 @@ def refuse_existing(path: Path) -> None:
 
 
 class McapSink:
-    """MCAP, profile ros2: zstd chunks with CRCs and message indexes, `ros2msg` schemas."""
+    """An MCAP file, profile ros2: zstd chunks with CRCs and message indexes, `ros2msg` schemas."""
 
     def __init__(self, path: Path, topics: Sequence[Topic], tags: Mapping[str, str]) -> None:
         self._stream = path.open("wb")
@@ -200,7 +200,7 @@ class Rosbag2Sink:
 
 
 def _forget_sqlite_version(database: Path) -> None:
-    """Set the "version of the library that wrote last" in the header to one fixed value.
+    """Fix the header's "version of the library that wrote last", so that bytes are reproducible.
 
     SQLite only shows it to people (https://sqlite.org/fileformat2.html#the_database_header); it
     would make the same bag differ from one machine to the next.
@@ -229,7 +229,7 @@ def _qos(topic: Topic) -> Qos:
 
 
 def _qos_yaml(topic: Topic) -> str:
-    """Return the profile as rosbag2's MCAP storage writes it into a channel's metadata."""
+    """Return a QoS profile as rosbag2's MCAP storage writes it into a channel's metadata."""
     qos = _qos(topic)
     lines = [
         f"- history: {qos.history.name.lower()}",

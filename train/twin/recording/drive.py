@@ -1,4 +1,4 @@
-"""One mission as the twin drove it, and the wheel odometry that a robot makes of it."""
+"""A mission as the twin drove it, and the wheel odometry that a robot makes of it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Motion:
     bumped: Bools  # (M,) the bumper touched something
 
     def at(self, values: F64, time_s: F64) -> F64:
-        """One of the columns above, (M,) or (M, 2), interpolated at times (n,)."""
+        """Return a column, (M,) or (M, 2), interpolated at times (n,)."""
         if values.ndim == 1:
             return np.interp(time_s, self.time_s, values)
         columns = [np.interp(time_s, self.time_s, column) for column in values.T]
@@ -46,7 +46,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands, lies and walks in the way of one mission of T steps."""
+    """The obstacles, patches and traffic of one mission of T steps."""
 
     pallets: F64  # (P, 3) x_m, y_m, yaw_rad; parked off the floor where there is none
     patches: F64  # (K, 5) x_m, y_m, half sizes, friction; no size where there is none
@@ -68,7 +68,7 @@ EMPTY = Scene(
 
 @dataclass(frozen=True)
 class Drive:
-    """A mission: true motion between the control ticks, and what the twin saw and did at them.
+    """A mission: true motion between the control ticks, and signals and actions at them.
 
     There are T commands and T + 1 ticks: the last tick is where the mission ended.
     """
@@ -115,7 +115,7 @@ class Odometer:
         )
 
     def speeds(self, rate_radps: F64) -> tuple[F64, F64]:
-        """Speed in m/s and yaw rate in rad/s (n,) of wheels that turn at these rates (n, 2)."""
+        """Return speeds in m/s and yaw rates in rad/s (n,) of wheels turning at rates (n, 2)."""
         speed = rate_radps.mean(axis=1) * self.wheel_radius_m
         turn = (rate_radps[:, 1] - rate_radps[:, 0]) * (self.wheel_radius_m / self.track_m)
         return speed, turn

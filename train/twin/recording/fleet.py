@@ -1,4 +1,4 @@
-"""Drives missions in the twin, several robots at a time, and keeps what a recorder needs.
+"""A fleet that drives missions in the twin, several robots at a time, for a recorder.
 
 The missions come out in the order they were given, each as a `Drive`, however long each took.
 
@@ -50,7 +50,7 @@ class CarefulPlanner(PlannerFollower):
 
 
 class ExternalPolicy:
-    """A policy from outside at the wheel; with probability `epsilon` its action is any action."""
+    """A policy from outside that drives, with a random action at probability `epsilon`."""
 
     def __init__(self, policy: Policy, *, epsilon: float = 0.0, seed: int = 0) -> None:
         self.policy, self.epsilon = policy, epsilon
@@ -60,7 +60,7 @@ class ExternalPolicy:
         self.acting_version = np.array([], np.str_)
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """Actions (N,) and the probabilities (N,) they had.
+        """Return actions (N,) and the probabilities (N,) they had.
 
         Raises:
             ConfigError: epsilon is set for a policy that is itself stochastic.
@@ -84,7 +84,7 @@ class ExternalPolicy:
 
 
 class BehaviourPolicies:
-    """The drivers of N robots that run side by side. A driver that no robot has now does not act.
+    """The drivers of N robots side by side. A driver without a robot does not act.
 
     Args:
         epsilon: share of random actions of the scripted drivers; None: each one's default.
@@ -105,11 +105,11 @@ class BehaviourPolicies:
         self._keys: list[_Key] = [("planner", "1", False)] * robots
 
     def begin(self, robot: int, mission: Mission) -> None:
-        """Robot `robot` starts a mission."""
+        """Start a mission on one robot."""
         self._keys[robot] = (mission.driver, mission.version, mission.handover)
 
     def act(self, env: WarehouseVectorEnv) -> tuple[Ints, list[tuple[str, str]], F64]:
-        """Actions (N,), who chose each as (policy, version), and its probability (N,)."""
+        """Return actions (N,), who chose each as (policy, version), and its probability (N,)."""
         action = np.zeros(env.num_envs, np.int64)
         probability = np.ones(env.num_envs)
         tags = [("", "")] * env.num_envs
@@ -142,7 +142,7 @@ MOTION_PERIOD_S = 0.02
 
 @dataclass(frozen=True)
 class DrivenMission:
-    """A mission that was driven: its T steps as the twin has them."""
+    """A driven mission, with its T steps as the twin has them."""
 
     mission: Mission
     drive: Drive
@@ -156,7 +156,7 @@ class DrivenMission:
 
 @dataclass
 class _Log:
-    """One robot's mission while it is driven."""
+    """The log of one robot's mission under way."""
 
     place: int  # among the missions
     mission: Mission
@@ -221,7 +221,7 @@ class Fleet:
     def drive(
         self, missions: Iterator[Mission], policies: BehaviourPolicies
     ) -> Iterator[DrivenMission]:
-        """Drive missions, for as long as there are more and the caller wants them."""
+        """Drive missions as long as there are more and the caller wants them."""
         env, numbered = self.env, enumerate(missions)
         finished: dict[int, DrivenMission] = {}
         delivered = 0
@@ -314,7 +314,7 @@ class Fleet:
             log.plan_number = number
 
     def _measured(self, log: _Log, true_ranges_m: F64) -> F64:
-        """Return a scan between ticks: the same noise and dropout, drawn for itself."""
+        """Return a scan between ticks, with its own draw of the same noise and dropout."""
         hardware = log.hardware
         ranges = true_ranges_m + log.rng.normal(0, hardware.lidar_noise_m, len(true_ranges_m))
         lost = log.rng.random(len(ranges)) < hardware.lidar_dropout
@@ -361,7 +361,7 @@ class Fleet:
 
 
 def _motion_of(states: list[BodyState], robot: int) -> Motion:
-    """One robot's motion out of all robots'."""
+    """Return one robot's motion out of all robots'."""
     pose = np.array(
         [(state.x_m[robot], state.y_m[robot], state.yaw_rad[robot]) for state in states]
     )

@@ -1,4 +1,4 @@
-"""Columns of values to serialised ROS 2 messages, a whole topic at a time.
+"""Serialisation of columns of values to ROS 2 messages, a whole topic at a time.
 
 rosbags serialises one exemplar of a message; every further message of the same shape differs
 from it only in numbers at fixed places. `MessageLayout` finds those places by CDR's alignment
@@ -35,7 +35,7 @@ def typestore() -> Typestore:
 
 
 def build(type_name: str, /, **fields: Any) -> Any:
-    """Build a message of `type_name` with every field zero, empty or identity, but for `fields`.
+    """Build a message of `type_name`: every field zero, empty or identity, except `fields`.
 
     A dict for a field that is itself a message fills that message in the same way.
     """
@@ -48,13 +48,13 @@ def build(type_name: str, /, **fields: Any) -> Any:
 
 
 def serialise(message: Any) -> bytes:
-    """One message as little-endian CDR, with its encapsulation header."""
+    """Serialise one message as little-endian CDR with its encapsulation header."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a number (or a run of them) stands in the serialised message."""
+    """The position of a number (or a run of them) in the serialised message."""
 
     offset: int
     dtype: np.dtype[Any]
@@ -63,7 +63,7 @@ class Place:
 
 @dataclass(frozen=True)
 class MessageLayout:
-    """A message shape: the exemplar's bytes, and the place of every number in them.
+    """The layout of a message: an exemplar's bytes, and the place of every number in them.
 
     Places are named by path: `pose.pose.position.x`, `ranges` (the whole run),
     `transforms[0].header.stamp` (a time is one place: int64 nanoseconds). When packing, `[]`
@@ -76,7 +76,7 @@ class MessageLayout:
 
     @classmethod
     def of(cls, exemplar: Any) -> MessageLayout:
-        """Return the layout of every message with the exemplar's strings and sequence lengths."""
+        """Return the layout of all messages with the exemplar's strings and sequence lengths."""
         places: dict[str, Place] = {}
         data = serialise(exemplar)
         end = _walk(exemplar, "", ENCAPSULATION_BYTES, places)
@@ -85,7 +85,7 @@ class MessageLayout:
         return cls(exemplar.__msgtype__, data, places)
 
     def pack(self, columns: Mapping[str, NDArray[Any]], rows: int) -> list[bytes]:
-        """`rows` messages: the exemplar with the places in `columns` overwritten.
+        """Pack `rows` messages: the exemplar with the places in `columns` overwritten.
 
         Each column is (rows,), or (rows, count) for a run and for `[]`.
 
@@ -109,7 +109,7 @@ class MessageLayout:
         return [whole[start : start + size] for start in range(0, len(whole), size)]
 
     def _slots(self, path: str) -> tuple[NDArray[np.intp], np.dtype[Any]]:
-        """Return the offset of every number that a path names, and their type."""
+        """Return the offset of every number at a path, and their type."""
         if "[]" not in path:
             place = self.places[path]
             step = place.dtype.itemsize
@@ -124,18 +124,18 @@ class MessageLayout:
 
 
 class Exemplar:
-    """A message whose layout is worked out when it is first needed: typestores take a while."""
+    """A message whose layout is computed on first use, since typestores are slow to build."""
 
     def __init__(self, type_name: str, /, **fields: Any) -> None:
         self._type_name, self._fields = type_name, fields
 
     @functools.cached_property
     def layout(self) -> MessageLayout:
-        """The layout of every message like this one."""
+        """Return the layout of messages like this one."""
         return MessageLayout.of(build(self._type_name, **self._fields))
 
     def pack(self, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
-        """As many messages as the columns, of which there is one or more, have rows."""
+        """Pack one message per row of the columns, of which there is at least one."""
         return self.layout.pack(columns, len(next(iter(columns.values()))))
 
 
@@ -143,20 +143,20 @@ _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 
 
 def split_stamps(stamp_ns: NDArray[Any]) -> NDArray[Any]:
-    """Nanoseconds (…) int64 to `builtin_interfaces/Time` records of the same shape."""
+    """Convert nanoseconds (…) int64 to `builtin_interfaces/Time` records of the same shape."""
     stamps = np.empty(stamp_ns.shape, _STAMP)
     stamps["sec"], stamps["nanosec"] = np.divmod(stamp_ns, 1_000_000_000)
     return stamps
 
 
 def stamp(stamp_ns: int) -> Any:
-    """One `builtin_interfaces/Time`."""
+    """Return one `builtin_interfaces/Time`."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
     return typestore().types[_TIME](sec=sec, nanosec=nanosec)
 
 
 def _walk(message: Any, prefix: str, at: int, places: dict[str, Place]) -> int:
-    """Note the places of one message that starts at or after byte `at`; returns its end."""
+    """Note the places in a message that starts at or after byte `at`; return its end."""
     if message.__msgtype__ == _TIME:
         at = _align(at, 4)
         places[prefix.removesuffix(".")] = Place(at, _STAMP, 1)
@@ -198,7 +198,7 @@ def _align(at: int, size: int) -> int:
 
 
 def _value(kind: Any, details: Any, given: Any) -> Any:
-    """Return a field's value: what was given, in the type rosbags wants, or the field's nothing."""
+    """Return a field's given value in the type rosbags expects, or the field's empty value."""
     if kind.name == "NAME":
         if given is None or isinstance(given, Mapping):
             defaults = {"w": 1.0} if details.endswith("/Quaternion") else {}

@@ -1,4 +1,4 @@
-"""Which missions a recorded fleet drives: conditions at their rarity, drivers at their shares."""
+"""The missions that a recorded fleet drives: conditions and drivers at their shares."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MAX_DRIVEN = 3  # missions for each that was ordered, where some do not meet wha
 
 @dataclass(frozen=True)
 class Mission:
-    """One mission to be driven and recorded."""
+    """A mission to be driven and recorded."""
 
     spec: EpisodeSpec
     driver: str  # planner, operator, random, or the name of a policy
@@ -51,7 +51,7 @@ def schedule(
     *,
     version: str = "1",
 ) -> Iterator[Mission]:
-    """Yield the missions of a recording, without end; the same for the same arguments.
+    """Yield the missions of a recording, endlessly; the same for the same arguments.
 
     `driver` is `handover` (the fleet) or the name of whoever drives all of them.
     """
@@ -71,7 +71,7 @@ def schedule(
 
 
 class OrderedMissions:
-    """The missions of a file, in rounds: until as many as were ordered met their kind.
+    """The missions of a file, in rounds until the ordered number met their kind.
 
     Who plans pallets in an aisle cannot know that the robot comes past them. Each round drives
     what is still owed, mixed, and never more than MAX_DRIVEN times what was ordered.
@@ -96,13 +96,13 @@ class OrderedMissions:
         self.observed: Counter[int] = Counter()
 
     def rounds(self) -> Iterator[Iterator[Mission]]:
-        """Drive each round to its end, and `note` its missions, before the next."""
+        """Yield rounds: drive each to its end, and `note` its missions, before the next."""
         while owed := self.owed():
             numbers = np.repeat(list(owed), list(owed.values()))
             yield iter([self._mission(int(number)) for number in self._rng.permutation(numbers)])
 
     def owed(self) -> dict[int, int]:
-        """Missions that are still to be driven, by order."""
+        """Return how many missions are still to be driven, by order."""
         owed = {}
         for number, order in enumerate(self.orders.orders):
             wanted = order.missions or 0
@@ -134,7 +134,7 @@ class OrderedMissions:
 
 
 def meets(kind: str, true_conditions: Sequence[str]) -> bool:
-    """Whether a mission of a kind met it at one of its steps; a nominal one has nothing to meet."""
+    """Return whether a mission met its kind at one of its steps; a nominal one always does."""
     return MISSIONS[kind].is_true is None or any(
         kind in text.split(",") for text in true_conditions
     )
@@ -147,7 +147,7 @@ def _in_force(hardware: Perturbation | Schedule, mission_seed: int) -> Perturbat
 
 
 def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str]:
-    """Names at their shares, block by block: what rounding leaves over is carried on."""
+    """Yield names at their shares, block by block, carrying over what rounding leaves."""
     names = [name for name, share in shares.items() if share > 0]
     share = np.array([shares[name] for name in names])
     owed = np.zeros(len(names))
@@ -164,7 +164,7 @@ def _deal(shares: Mapping[str, float], rng: np.random.Generator) -> Iterator[str
 
 
 def parse_shares(text: str) -> dict[str, float]:
-    """`nominal=0.8,wheel_slip=0.2` to shares; conditions left out get none.
+    """Parse `nominal=0.8,wheel_slip=0.2` to shares; omitted conditions get none.
 
     Raises:
         ConfigError: no such condition, no number, or nothing above 0.
@@ -181,7 +181,7 @@ def parse_shares(text: str) -> dict[str, float]:
 
 
 def parse_numbers(text: str, flag: str, names: Sequence[str]) -> dict[str, float]:
-    """`name=number,name=number` as a flag has it.
+    """Parse a flag's `name=number,name=number`.
 
     Raises:
         ConfigError: a name that is none of `names` or is given twice, or a value that is not a

@@ -1,4 +1,4 @@
-"""A drive to the messages a robot would have logged: rates, stamps, delays and resolution.
+"""Conversion of a drive to a robot's log messages: rates, stamps, delays and resolution.
 
 Three times belong to a message. The header's stamp is when the thing was measured; the publish
 time is when the driver sent it; the log time is when the recorder received it. Sensors run on
@@ -41,7 +41,7 @@ TICK_TOLERANCE_S = 1e-6
 
 @dataclass(frozen=True)
 class Delay:
-    """From the measurement to the publisher, and on to the recorder; both jitter."""
+    """The delay from measurement to publisher, and on to the recorder; both jitter."""
 
     driver_ms: float
     network_ms: float = 0.4
@@ -76,7 +76,7 @@ Hertz = Annotated[float, Meta(gt=0, le=200)]
 
 
 class Rates(Checked, frozen=True):
-    """Messages a second of each periodic topic. Commands come once a control tick."""
+    """The rate of each periodic topic in Hz. Commands come once per control tick."""
 
     odom: Hertz = 50.0
     imu: Hertz = 50.0
@@ -96,7 +96,7 @@ class Rates(Checked, frozen=True):
 
 @dataclass
 class Robot:
-    """The robot that logs: what it carries from one mission to the next, and its generator."""
+    """The robot that logs: its generator, and the state it carries from mission to mission."""
 
     rng: np.random.Generator
     lidar: Lidar
@@ -106,7 +106,7 @@ class Robot:
     _start_ns: int = 0  # of the mission at hand
 
     def publish(self, drive: Drive, start_ns: int) -> list[Message]:
-        """All messages of one mission that starts at `start_ns`, in the order of log time."""
+        """Return all messages of a mission that starts at `start_ns`, in order of log time."""
         self._start_ns = start_ns
         reckoned = self.odometer.dead_reckoning(drive.motion)  # (M, 3), at the motion's times
         messages = [
@@ -209,7 +209,7 @@ class Robot:
         return self._send("/scan", drive.scan_s, data)
 
     def _localisation(self, drive: Drive, reckoned: F64) -> list[Message]:
-        """/amcl_pose, and /tf with it: the localiser corrects `odom` within `map`."""
+        """Return /amcl_pose, with the /tf by which the localiser corrects `odom` within `map`."""
         times, tick = self._sample(drive, self.rates.amcl_pose)
         age_s = (drive.signals["stamp_ns"] - drive.signals["pose_stamp_ns"]) * 1e-9
         if drive.scene.perturbation.localisation_period_s:  # slow: nothing new at other times
@@ -313,7 +313,7 @@ class Robot:
         ]
 
     def _sample(self, drive: Drive, rate_hz: float) -> tuple[F64, NDArray[np.intp]]:
-        """When a sensor measures (n,), and the tick of each sample (n,), or -1 between ticks.
+        """Return when a sensor measures (n,), and the tick of each sample, -1 between ticks.
 
         Between ticks its timer jitters.
         """
@@ -329,7 +329,7 @@ class Robot:
         return send(topic, at_ns, data, self.rng)
 
     def _stamps(self, time_s: F64) -> Ints:
-        """Header stamps, at the microsecond."""
+        """Return header stamps, rounded to microseconds."""
         stamps: Ints = self._start_ns + np.rint(time_s * 1e6).astype(np.int64) * 1000
         return stamps
 
@@ -338,7 +338,7 @@ class Robot:
 
 
 def _at_ticks(between: F64, tick: NDArray[np.intp], seen: NDArray[Any]) -> F64:
-    """`between` (n, …), with the twin's own measurement `seen` (T + 1, …) at the ticks."""
+    """Replace `between` (n, …) by the twin's own measurements `seen` (T + 1, …) at ticks."""
     on_tick = (tick >= 0).reshape(-1, *[1] * (between.ndim - 1))
     return np.where(on_tick, seen[tick], between)
 
@@ -348,7 +348,7 @@ def _rounded(values: F64, lsb: float) -> F64:
 
 
 def _f32(values: F64) -> F64:
-    """Return the values as the robot's controllers compute them, in single precision."""
+    """Round values to single precision, as the robot's controllers compute them."""
     return values.astype(np.float32).astype(np.float64)
 
 
@@ -374,7 +374,7 @@ def _between(inner: F64, outer: F64) -> F64:
 def send(
     topic: str, measured_ns: Ints, data: Sequence[bytes], rng: np.random.Generator
 ) -> list[Message]:
-    """Messages measured at these times (n,), sent and received after the topic's delays.
+    """Return messages measured at these times (n,), with the topic's delays.
 
     Networks are mostly quick and now and then slow, but here never slower than a command waits
     for its measurements: the latest sensor is there before the command is sent.

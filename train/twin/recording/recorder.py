@@ -1,4 +1,4 @@
-"""`restock twin record`: missions driven by the simulated hardware, written as logs.
+"""`restock twin record`: missions driven by simulated hardware, written as logs.
 
 The stand-in is the twin with other effective parameters than training assumes, so that there is a
 gap between logs and simulator to be found, and physics at half the timestep. Missions are driven,
@@ -90,7 +90,7 @@ MAP_CELL_M = 0.1
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """What is to be recorded. `minutes` or `missions` says when to stop."""
+    """The settings of a recording. `minutes` or `missions` says when to stop."""
 
     format: Format = "mcap"
     minutes: float | None = None
@@ -106,7 +106,7 @@ class RecordingPlan:
     tags: Mapping[str, str] = field(default_factory=dict)  # whose drive it is: robot, site, …
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where the recording would have no end, or nothing in it."""
+        """Raise ConfigError if the recording would have no end, or nothing in it."""
         if self.format not in get_args(Format):
             has = ", ".join(get_args(Format))
             raise ConfigError(f"no format {self.format!r}", where="recording", remedy=f"give {has}")
@@ -137,7 +137,7 @@ class RecordingPlan:
 
     @property
     def kinds(self) -> Mapping[str, float]:
-        """Kinds of missions to come, by their shares or numbers."""
+        """Return the kinds of missions to come, by their shares or numbers."""
         if not isinstance(self.missions, MissionsFile):
             return self.conditions
         amounts: Counter[str] = Counter()
@@ -166,7 +166,7 @@ class RecordingPlan:
         return chosen
 
     def describe(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the plan as plain values for JSON."""
         return {
             "format": self.format,
             "minutes": self.minutes,
@@ -190,7 +190,7 @@ class RecordingPlan:
 
 @dataclass
 class RecordingSummary:
-    """What was recorded."""
+    """A summary of what was recorded."""
 
     path: Path
     plan: RecordingPlan
@@ -205,7 +205,7 @@ class RecordingSummary:
     work_s: float = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """As `restock twin record --json` prints it."""
+        """Return the summary as `restock twin record --json` prints it."""
         files = [self.path] if self.path.is_file() else list(self.path.iterdir())
         return {
             "path": str(self.path),
@@ -341,7 +341,7 @@ def _drive(
 
 
 def parse_start(text: str) -> int:
-    """When a recording begins, in nanoseconds: an ISO date or time, UTC where it names no zone.
+    """Parse the start, an ISO date or time (UTC by default), to nanoseconds.
 
     Raises:
         ConfigError: it is none.
@@ -357,13 +357,13 @@ def parse_start(text: str) -> int:
 
 
 def date_text(moment_ns: int) -> str:
-    """Return a moment as ISO has it, UTC."""
+    """Return a moment in ISO format, UTC."""
     moment = datetime.fromtimestamp(moment_ns // 10**9, UTC)
     return moment.isoformat().replace("+00:00", "Z")
 
 
 def parse_rates(text: str) -> Rates:
-    """`odom=20,scan=5` to rates; topics left out keep their default.
+    """Parse `odom=20,scan=5` to rates; omitted topics keep their default.
 
     Raises:
         ConfigError: no such topic, or a rate that it cannot have.

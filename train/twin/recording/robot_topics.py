@@ -1,4 +1,4 @@
-"""The topics of the recorded robot: their names, types and frames, and columns to messages.
+"""The topics of the recorded robot: names, types and frames, and messages from columns.
 
 They are the topics the `warehouse_amr` profile reads, named and framed as a Nav2 robot names
 them (REP 105: map > odom > base_link), so that Foxglove and RViz show a recording as it is.
@@ -110,7 +110,7 @@ _TWIST, _BOOL = Exemplar("geometry_msgs/msg/Twist"), Exemplar("std_msgs/msg/Bool
 def odometry(
     stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64, speed_mps: F64, yaw_rate_radps: F64
 ) -> list[bytes]:
-    """Dead reckoning in `odom`, twist in `base_link`."""
+    """Return dead reckoning in `odom`, twist in `base_link`."""
     return _ODOMETRY.pack(
         {
             "header.stamp": stamp_ns,
@@ -124,7 +124,7 @@ def odometry(
 
 
 def imu(stamp_ns: Ints, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F64) -> list[bytes]:
-    """Rates and accelerations; no orientation (covariance[0] = -1, as sensor_msgs/Imu has it)."""
+    """Return rates and accelerations; no orientation (covariance[0] = -1, by sensor_msgs/Imu)."""
     return _IMU.pack(
         {
             "header.stamp": stamp_ns,
@@ -136,12 +136,12 @@ def imu(stamp_ns: Ints, yaw_rate_radps: F64, accel_x_mps2: F64, accel_y_mps2: F6
 
 
 def joint_states(stamp_ns: Ints, angle_rad: F64, rate_radps: F64) -> list[bytes]:
-    """Wheel angles and rates, each (n, 2): left, right."""
+    """Return wheel angles and rates, each (n, 2): left, right."""
     return _JOINTS.pack({"header.stamp": stamp_ns, "position": angle_rad, "velocity": rate_radps})
 
 
 def scans(stamp_ns: Ints, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> list[bytes]:
-    """Lidar scans: ranges (n, B), inf where nothing came back."""
+    """Return lidar scans: ranges (n, B), inf if nothing came back."""
     beams = ranges_m.shape[1]
     scan = Exemplar(
         "sensor_msgs/msg/LaserScan",
@@ -158,12 +158,12 @@ def scans(stamp_ns: Ints, ranges_m: F64, lidar: Lidar, scan_time_s: float) -> li
 
 
 def commands(speed_mps: F64, yaw_rate_radps: F64) -> list[bytes]:
-    """Velocity commands."""
+    """Return velocity commands."""
     return _TWIST.pack({"linear.x": speed_mps, "angular.z": yaw_rate_radps})
 
 
 def localised_poses(stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> list[bytes]:
-    """Poses in `map`, as a localiser publishes them."""
+    """Return poses in `map`, as a localiser publishes them."""
     return _POSE.pack(
         {
             "header.stamp": stamp_ns,
@@ -177,7 +177,7 @@ def localised_poses(stamp_ns: Ints, x_m: F64, y_m: F64, yaw_rad: F64) -> list[by
 def transforms(
     stamp_ns: Ints, map_to_odom: tuple[F64, F64, F64], odom_to_base: tuple[F64, F64, F64]
 ) -> list[bytes]:
-    """map > odom > base_link, each (x, y, yaw) of (n,) values."""
+    """Return map > odom > base_link, each (x, y, yaw) of (n,) values."""
     columns: dict[str, NDArray[Any]] = {}
     for index, (x_m, y_m, yaw_rad) in enumerate((map_to_odom, odom_to_base)):
         at = f"transforms[{index}]"
@@ -191,7 +191,7 @@ def transforms(
 
 
 def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -> bytes:
-    """Where the lidar and the IMU sit on the robot."""
+    """Return the places of the lidar and the IMU on the robot."""
     return serialise(
         build(
             "tf2_msgs/msg/TFMessage",
@@ -208,18 +208,18 @@ def static_transforms(stamp_ns: int, lidar_x_m: float, lidar_z_m: float = 0.2) -
 
 
 def bumpers(pressed: Bools) -> list[bytes]:
-    """Bumper states."""
+    """Return bumper states."""
     return _BOOL.pack({"data": pressed})
 
 
 @functools.lru_cache(maxsize=256)
 def text(content: str) -> bytes:
-    """Return a string."""
+    """Return a text as a serialised string message."""
     return serialise(build("std_msgs/msg/String", data=content))
 
 
 def behaviour_policy(name: str, version: str, probability: float) -> bytes:
-    """Who drives from here on, and with what probability it chose what it commands."""
+    """Return who drives from here on, and the probability of each of its commands."""
     content = {"policy": name, "version": version, "probability": round(probability, 4)}
     return text(json.dumps(content))
 
@@ -263,7 +263,7 @@ def occupancy_map(
     resolution_m: float,
     origin_m: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:
-    """Return the known map: cells (rows north, columns east from `origin_m`), occupied or free."""
+    """Return the known map of cells (rows north, columns east from `origin_m`)."""
     return serialise(
         build(
             "nav_msgs/msg/OccupancyGrid",
@@ -283,7 +283,7 @@ def occupancy_map(
 def diagnostics(
     stamp_ns: int, statuses: Sequence[tuple[str, int, str, Mapping[str, str]]]
 ) -> bytes:
-    """Statuses as (name, level, message, values): level 0 OK, 1 warning, 2 error."""
+    """Return statuses from (name, level, message, values): level 0 OK, 1 warning, 2 error."""
     return serialise(
         build(
             "diagnostic_msgs/msg/DiagnosticArray",
@@ -320,7 +320,7 @@ _CUBE, _CYLINDER, _DELETE_ALL = 1, 3, 3
 
 
 def perturbation_text(perturbation: Perturbation) -> str:
-    """`{"name", "values"}`: the fields that differ from the nominal twin's."""
+    """Return `{"name", "values"}` with the fields that differ from the nominal twin's."""
     return json.dumps({"name": perturbation.name, "values": perturbation.changed()})
 
 
@@ -355,7 +355,7 @@ def mission_markers(stamp_ns: int, scene: Scene, goal_m: tuple[float, float]) ->
 
 
 def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
-    """People and forklifts at (n, A, 3) places, one message a row."""
+    """Return people and forklifts at (n, A, 3) places, one message per row."""
     messages: list[bytes] = [b""] * len(places)
     shown = on_floor(places)
     for seen in {tuple(row) for row in shown.tolist()}:
@@ -379,7 +379,7 @@ def traffic_markers(stamp_ns: Ints, places: F64) -> list[bytes]:
 
 
 def on_floor(places: F64) -> Bools:
-    """Which places (…, 2 or more) are not where bodies are parked that no episode uses."""
+    """Return which places (…, 2 or more) are on the floor, not where unused bodies are parked."""
     return np.asarray(places[..., 0] > PARKED_M[0] / 2, np.bool_)
 
 

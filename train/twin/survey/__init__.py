@@ -1,1 +1,1 @@
-"""The floor that recordings show: maps, scans and poses in them, as a floor of the twin."""
+"""Surveys: floors of the twin made from the maps, scans and poses of recordings."""

@@ -1,4 +1,4 @@
-"""What a recording or store has that a floor can be made from: a map, poses, scans, its robot.
+"""The evidence for a floor in a recording or store: a map, poses, scans, its robot.
 
 The map is a recording's last `nav_msgs/OccupancyGrid` that is no costmap. Map servers write 0, 100
 or -1; some SLAM (Cartographer) writes how likely each cell is occupied. Below 25 percent counts as
@@ -74,7 +74,7 @@ def map_topic(recording: Recording) -> TopicInfo | None:
 
 
 def recorded_map(recording: Recording) -> tuple[OccupancyGrid, str] | None:
-    """Return the last map of the recording and where it is from, in words; None where it has none.
+    """Return a recording's last map and where it is from, in words; None if it has none.
 
     Raises:
         RecordingError: the message is not a map: its size, resolution or origin are not.
@@ -127,7 +127,7 @@ _POSES = (
 
 @dataclass(frozen=True)
 class StoredDrive:
-    """The drive of one recording of a store, and whose poses they are."""
+    """A drive of one recording of a store, and whose poses they are."""
 
     poses: Poses
     everywhere: (
@@ -140,7 +140,7 @@ class StoredDrive:
 
 
 def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
-    """Return the recording with the most rows, of those that are still there if any is.
+    """Return the recording with the most rows, preferring those whose files still exist.
 
     Args:
         recording: which one instead: its id, or its file's name or the end of its path.
@@ -176,7 +176,7 @@ def stored_drive(path: Path, recording: str | None = None) -> StoredDrive:
 
 
 def _named(recording: str, rows: list[tuple[Any, ...]], where: str) -> tuple[Any, ...]:
-    """Return the one row of the recordings that this names.
+    """Return the only row of the recordings that this names.
 
     Raises:
         StoreError: none, or several.
@@ -214,7 +214,7 @@ def _stored_profile(toml: str | None, source: str) -> Profile | None:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a floor can be made from; None where there is none."""
+    """The data that a floor can be made from; None for what is missing."""
 
     poses: Poses | None
     known: tuple[OccupancyGrid, str] | None  # a map, and where it is from
@@ -294,7 +294,7 @@ def _of_profile(profile: Profile | None) -> Footprint | None:
 
 
 def _free_on(known: tuple[OccupancyGrid, str] | None) -> Callable[[F64], Bools]:
-    """Which places (N, 2) are on free floor of a map; all of them, without one."""
+    """Return a test whether places (N, 2) are free on a map; without a map, all are."""
 
     def on_map(places_m: F64) -> Bools:
         if known is None:

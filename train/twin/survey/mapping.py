@@ -1,4 +1,4 @@
-"""Occupancy grids made from drives: of scans, or of the corridor that a robot drove in.
+"""Occupancy grids made from scans, or from the corridor that a robot drove in.
 
 Scans are traced ray by ray: each makes the cells that its beams pass less likely occupied, and
 those they end in more (log-odds, Elfes 1989); a cell counts once a scan. Poses are taken as they
@@ -38,7 +38,7 @@ _SUB = 3  # points a cell and axis that a turned cell is looked up at
 
 
 def main_direction(angles_rad: F64, weights: F64) -> float:
-    """Return the main direction in (-pi/4, pi/4], 0 where they do not agree on one."""
+    """Return the main direction in (-pi/4, pi/4], 0 if the directions do not agree on one."""
     total = float(weights.sum())
     if total <= 0:
         return 0.0
@@ -54,7 +54,7 @@ def walls_direction(grid: OccupancyGrid) -> float:
 
 
 def along_walls(grid: OccupancyGrid) -> tuple[OccupancyGrid, float]:
-    """Return the grid with its axes along its walls, and by how much it was turned (rad).
+    """Return the grid with its axes along its walls, and the angle it was turned by (rad).
 
     A turned cell is occupied where any part of it was, so that no wall gets a hole.
     """
@@ -99,7 +99,7 @@ MARGIN_M = 0.25  # around the circle in which the robot turns
 
 
 def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
-    """Return the corridor, along the directions that were mostly driven.
+    """Return the driven corridor as a grid along the directions that were mostly driven.
 
     `turn_m` is what the robot needs around its middle to turn.
     """
@@ -123,7 +123,7 @@ def driven_corridor(poses: Poses, turn_m: float) -> OccupancyGrid:
 
 
 def way_between(places_m: F64) -> F64:
-    """Places (N, 2) with points in between, no cell apart, where one drove from one to the next."""
+    """Return places (N, 2) with points less than a cell apart between those driven in turn."""
     parts = [places_m]
     length = np.hypot(*np.diff(places_m, axis=0).T)
     for index in np.flatnonzero((length > CORRIDOR_CELL_M / 2) & (length <= JUMP_M)):
@@ -135,7 +135,7 @@ def way_between(places_m: F64) -> F64:
 
 
 def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
-    """Intersection over union of the occupied cells of two maps, within one cell.
+    """Return the intersection over union of two maps' occupied cells, within one cell.
 
     A cell counts as shared where the other map has an occupied cell within one cell (of the coarser
     of both, diagonals too). Of `known` only what lies where `made` knows something, or next to it,
@@ -159,7 +159,7 @@ def walls_agreement(made: OccupancyGrid, known: OccupancyGrid) -> float | None:
 
 
 def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
-    """Return the share of a lidar's returns that lie within NEAR_M of an occupied cell of a map.
+    """Return the share of lidar returns within NEAR_M of an occupied cell of a map.
 
     Returns farther than `WITHIN_M` from the lidar do not count: an error of the pose's yaw moves
     them. None where there are too few to say.
@@ -177,7 +177,7 @@ def returns_on_walls(scans: PlacedScans, grid: OccupancyGrid) -> float | None:
 
 
 def _wall_middles(grid: OccupancyGrid) -> F64:
-    """Return the middles (N, 2) of the occupied cells, in the map's frame."""
+    """Return the centres (N, 2) of the occupied cells, in the map's frame."""
     cells = np.argwhere(grid.occupancy == OCCUPIED)
     return out_of_frame(np.asarray((cells + 0.5) * grid.cell_m, np.float64), grid.origin)
 
@@ -225,7 +225,7 @@ def scan_map(
 
 
 def _walls(scans: PlacedScans) -> tuple[F64, F64]:
-    """Directions and lengths of the pieces of wall between the ends of beams."""
+    """Return the directions and lengths of the wall pieces between the ends of beams."""
     steps = []
     for hit, beam in zip(scans.hit_m, scans.order, strict=True):
         if len(hit) > _APART:
@@ -250,7 +250,7 @@ def _cells(places: F64, low: F64) -> Ints:
 
 
 def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> tuple[F64, Ints]:
-    """Log-odds (X, Y) of being occupied, and how many scans ended in each cell (X, Y)."""
+    """Return log-odds (X, Y) of being occupied, and how many scans ended in each cell."""
     odds = np.zeros(shape)
     flat, ended = odds.reshape(-1), np.zeros(odds.size, np.int64)
     passed, stopped = np.zeros((2, odds.size), np.bool_)  # of one scan
@@ -274,7 +274,7 @@ def _traced(origins: F64, hits: list[F64], low: F64, shape: tuple[int, ...]) -> 
 
 
 def _speckles(walls: Bools, occupancy: np.ndarray, notes: list[str]) -> Bools:
-    """Single cells of wall within free floor: a person's legs, or one beam gone wrong. Free."""
+    """Free single wall cells within free floor, such as a person's legs; return which (X, Y)."""
     neighbours = ndimage.convolve(walls.astype(np.int8), np.ones((3, 3), np.int8), mode="constant")
     alone = walls & (neighbours == 1)
     surrounded = ndimage.convolve(

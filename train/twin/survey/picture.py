@@ -41,7 +41,7 @@ def draw_survey(surveyed: Surveyed) -> Image.Image:
 
 
 def write_picture(surveyed: Surveyed, path: Path) -> None:
-    """Write it as PNG. Raises ConfigError where it cannot be written."""
+    """Write the picture as PNG. Raises ConfigError if it cannot be written."""
     image = draw_survey(surveyed)
     try:
         image.save(path, format="PNG")
@@ -91,7 +91,7 @@ class _Picture:
         return self.margin + x_m * self.scale, self.top + self.height - y_m * self.scale
 
     def _occupancy(self) -> Image.Image:
-        """Return the grid as the floor was made of it, on the floor's extent."""
+        """Return the grid that the floor was made from, on the floor's extent."""
         grid: OccupancyGrid = self.surveyed.grid
         colors = np.full((*grid.occupancy.shape, 3), UNKNOWN_GREY, np.uint8)
         colors[grid.occupancy == FREE] = FREE_WHITE
@@ -230,7 +230,7 @@ def moved_apart(boxes: Sequence[tuple[float, float, float, float]]) -> list[floa
 
 
 def _round_length(floor: Warehouse) -> float:
-    """About a fifth of the floor's width: 1, 2 or 5 times a power of ten."""
+    """Return about a fifth of the floor's width: 1, 2 or 5 times a power of ten."""
     wanted = floor.width_m / 5
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))

@@ -1,4 +1,4 @@
-"""Where a robot was in a recording: from a pose topic, or along its transforms.
+"""The poses of a robot in a recording, from a pose topic or along its transforms.
 
 Unlike steps, which know nothing of the future, a survey looks at a whole drive: poses are
 interpolated between messages. Times are kept on both clocks of a recording, as a scan is placed on
@@ -45,14 +45,14 @@ FURTHEST_M = 1e5  # from the middle of the poses: one beyond is a fault
 
 @dataclass(frozen=True)
 class Times:
-    """When N messages were measured and received, in ns; measured is 0 where nothing says."""
+    """The times of N messages in ns, measured and received; measured is 0 if unknown."""
 
     stamp_ns: Ints  # (N,)
     log_ns: Ints  # (N,)
 
     @classmethod
     def of(cls, columns: TopicColumns) -> Times:
-        """Return the clocks of a topic's messages."""
+        """Return the times of a topic's messages."""
         stamp = columns.fields.get(STAMP)
         none = np.zeros(len(columns), np.int64)
         stamps = np.asarray(stamp).astype(np.int64) if isinstance(stamp, np.ndarray) else none
@@ -67,7 +67,7 @@ class Times:
 
 
 def shared_clock(one: Times, other: Times) -> bool:
-    """Whether both carry stamps of one clock: most of `other`'s lie within `one`'s."""
+    """Return whether both carry stamps of one clock: most of `other`'s are within `one`'s."""
     if not (one.stamped and other.stamped):
         return False
     low, high = one.stamp_ns.min() - MAX_APART_NS, one.stamp_ns.max() + MAX_APART_NS
@@ -90,12 +90,12 @@ class Poses:
 
     @property
     def places_m(self) -> F64:
-        """(N, 2)."""
+        """Return the places, (N, 2)."""
         return np.stack([self.x_m, self.y_m], axis=-1)
 
     @property
     def driven_m(self) -> float:
-        """The length of its way in steps of a decimetre; where it jumped it did not drive."""
+        """Return the length of its way in steps of a decimetre, jumps left out."""
         kept, way = self.places_m[:1], 0.0
         for place in self.places_m[1:]:
             step = float(np.hypot(*(place - kept[-1])))
@@ -104,7 +104,7 @@ class Poses:
         return way
 
     def at(self, times: Times, *, by_stamp: bool) -> tuple[F64, Bools]:
-        """Poses (M, 3) at these times, and which of them (M,) lie between two near ones."""
+        """Return poses (M, 3) at these times, and which of them (M,) are between two near ones."""
         values = np.stack([self.x_m, self.y_m, self.yaw_rad], axis=-1)
         return interpolated(
             self.times.clock(by_stamp=by_stamp), values, times.clock(by_stamp=by_stamp)
@@ -112,7 +112,7 @@ class Poses:
 
 
 def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bools]:
-    """Values (N, K) at other times (M,), and which are between two that are near in time."""
+    """Interpolate values (N, K) at times (M,); also return which are between near samples."""
     if not len(known_ns):
         return np.zeros((len(asked_ns), values.shape[1])), np.zeros(len(asked_ns), np.bool_)
     order = np.argsort(known_ns, kind="stable")
@@ -131,7 +131,7 @@ def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bool
 
 
 def candidate_poses(recording: Recording, profile: Profile | None = None) -> list[Poses]:
-    """Return what may say where the recording's robot was, best first; nothing where nothing does.
+    """Return the pose sources of a recording, best first; empty if there are none.
 
     Only what the profile says, where there is one. Else transforms that lead to a map, pose topics,
     localised ones first, and other transforms.
@@ -275,7 +275,7 @@ def along_transforms(recording: Recording, frames: Frames) -> Poses | None:
 
 
 def mount_of(recording: Recording, sensor: str, base: str) -> tuple[F64, F64] | None:
-    """Rotation (3, 3) and place (3,) of a sensor's frame in the base's, or None if unknown."""
+    """Return rotation (3, 3) and place (3,) of a sensor's frame in the base's; None if unknown."""
     turn, place = np.eye(3), np.zeros(3)
     if plain(sensor) == plain(base):
         return turn, place
@@ -315,7 +315,7 @@ def chain_between(edges: Edges, base: str, fixed: str) -> list[str]:
 
 
 def _planar(columns: TopicColumns) -> tuple[F64, F64, F64]:
-    """x, y and unwrapped yaw of transforms (N,)."""
+    """Return x, y and unwrapped yaw of transforms (N,)."""
     x, y = (np.asarray(columns.fields[axis], np.float64) for axis in AXES[:2])
     yaw = yaw_of(*(np.asarray(columns.fields[part], np.float64) for part in TURN))
     return x, y, np.unwrap(yaw)

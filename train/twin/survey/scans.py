@@ -1,4 +1,4 @@
-"""A recording's lidar scans, each put where the robot was when it was taken.
+"""Lidar scans of a recording, each placed where the robot was when it was taken.
 
 Left out, and counted: scans without a pose within a second on both sides, those taken while the
 robot turned fast (a scan takes up to .2 s, and the pose is known less well), and most of those
@@ -140,7 +140,7 @@ def _topic(recording: Recording, profile: Profile | None) -> tuple[TopicInfo, Ki
 
 
 def _thinned(path: str, fields: Fields) -> dict[str, FieldColumn]:
-    """Ranges of at most BEAMS beams a scan, which beams they are, and of how many."""
+    """Keep at most BEAMS beams per scan; return ranges, beam indices and beam counts."""
     ranges = fields[path]
     rows = [np.asarray(ranges[row], np.float32).ravel() for row in range(len(ranges))]
     kept = [np.arange(0, len(row), max(len(row) // BEAMS, 1)) for row in rows]
@@ -163,7 +163,7 @@ def _mount(
     footprint: Footprint | None,
     notes: list[str],
 ) -> tuple[F64, F64]:
-    """How the lidar sits on the robot: rotation (3, 3) and place (3,)."""
+    """Return the lidar's rotation (3, 3) and place (3,) on the robot."""
     frame = seen.frame
     in_frame, moved = _turn(seen.origin[2]), np.array([*seen.origin[:2], 0.0])
     over = np.diag([1.0, -1.0, -1.0])
@@ -203,7 +203,7 @@ def _turn(yaw_rad: float) -> F64:
 
 
 def _keyframes(pose: F64, known: Bools, log_ns: Ints, topic: str, notes: list[str]) -> Ints:
-    """Which scans are used: placed, not while turning fast, and where it moved or waited."""
+    """Choose the scans to use: placed, not while turning fast, and where it moved or waited."""
     rows = np.flatnonzero(known)
     if len(rows) < len(known):
         notes.append(

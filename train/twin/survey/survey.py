@@ -59,7 +59,7 @@ MIN_ON_WALLS = 0.5
 
 @dataclass(frozen=True)
 class Surveyed:
-    """A floor, what it was made from, and what a person should know of it."""
+    """A surveyed floor, its source, and notes for the user."""
 
     floor: Warehouse
     grid: OccupancyGrid  # as the floor was made of it
@@ -72,7 +72,7 @@ class Surveyed:
     elsewhere: list[str] = field(default_factory=list)  # a store's recordings of other frames
 
     def facts(self) -> dict[str, Any]:
-        """Plain values, for people and JSON."""
+        """Return the survey as plain values, for people and JSON."""
         cells = self.grid.occupancy
         values: dict[str, Any] = {
             "made_by": self.by,
@@ -107,7 +107,7 @@ def survey(
     footprint: Footprint | None = None,
     typestore: str | None = None,
 ) -> Surveyed:
-    """Return the floor that a recording shows, or one of a store.
+    """Build the floor that a recording, or one recording of a store, shows.
 
     Args:
         path: of the recording or store.
@@ -168,7 +168,7 @@ def survey(
 def _grid(
     evidence: Evidence, by: Source | None, body: Footprint | None, where: str, notes: list[str]
 ) -> tuple[Source, OccupancyGrid, str]:
-    """Return what the floor is made from: how, the grid, and where that is from in words."""
+    """Return how the floor is made, the grid, and where that is from in words."""
     poses = evidence.poses
     if by in (None, "map") and evidence.known is not None:
         grid, source = evidence.known
@@ -216,7 +216,7 @@ def _grid(
 
 @dataclass(frozen=True)
 class _Scanned:
-    """A map of scans by one clock."""
+    """A map of scans placed by one clock."""
 
     grid: OccupancyGrid
     agree: float
@@ -225,7 +225,7 @@ class _Scanned:
 
 
 def _scanned(usable: list[PlacedScans], poses: Poses, room_m: float) -> _Scanned:
-    """Return the map of the scans by header stamps; by log time where they agree better so."""
+    """Map the scans by header stamps, or by log time if they agree better so."""
     best: _Scanned | None = None
     for scans in usable:
         said = list(scans.notes)
@@ -248,7 +248,7 @@ def _turn_m(body: Footprint) -> float:
 
 
 def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
-    """Return a robot whose size nothing says is no larger than the gaps that it went through."""
+    """Estimate an unknown robot size: no larger than the gaps that it went through."""
     if poses is None:
         return STAND_IN
     cells, inside = grid.cells_at(poses.places_m)
@@ -263,7 +263,7 @@ def _as_near_as_it_came(grid: OccupancyGrid, poses: Poses | None) -> Footprint:
 
 
 def _apart(grid: OccupancyGrid, poses: Poses) -> str:
-    """How far the middle of the drive is from that of a map's free floor, in words."""
+    """Say how far the drive's centre is from that of a map's free floor."""
     columns, rows = (np.flatnonzero(grid.free.any(axis=axis)) for axis in (1, 0))
     if not len(columns):
         return ""
