@@ -30,7 +30,7 @@ MIN_ARRIVING = 0.5
 
 
 def drive(made: Surveyed, missions: int) -> Counter[str]:
-    """How the missions end: success, bump, or time limit."""
+    """Return how the missions end: success, bump, or time limit."""
     size = made.footprint
     body = Body(length_m=size.length_m, width_m=size.width_m)
     task = msgspec.structs.replace(load_profile("warehouse_amr").task, body=body)

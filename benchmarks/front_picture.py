@@ -79,7 +79,7 @@ def scene(kind: str) -> Image.Image:
 
 
 def ahead(env: WarehouseVectorEnv, kind: str) -> bool:
-    """Whether a person, or the pallets of a blocked aisle, are close ahead of the robot."""
+    """Return whether a person, or the pallets of a blocked aisle, are close ahead of the robot."""
     x, y, yaw = env.simulation.pose()[0]
     places = env.simulation.traffic.position_m[0]
     if kind == "blocked_aisle":

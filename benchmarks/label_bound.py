@@ -86,7 +86,7 @@ def with_known(one: Log) -> Log:
 
 
 def has(one: Log, name: str) -> Bools:
-    """Where a condition is true, (N,)."""
+    """Return where a condition is true, (N,)."""
     texts, which = np.unique(one["truth"], return_inverse=True)
     return np.array([text != UNKNOWN and name in true_names(text) for text in texts])[which]
 

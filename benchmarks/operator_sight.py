@@ -83,7 +83,7 @@ class SeesInSight(Operator):
 
 
 def _behind_racks(env: WarehouseVectorEnv) -> Bools:
-    """Which agents (N, G) a rack hides from the robot's middle."""
+    """Return which agents (N, G) a rack hides from the robot's middle."""
     traffic, pose = env.simulation.traffic, env.simulation.pose()
     hidden = np.zeros(traffic.state.shape, np.bool_)
     along = np.linspace(0.0, 1.0, RAY_POINTS)[:, None, None]

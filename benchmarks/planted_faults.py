@@ -119,7 +119,7 @@ def panel_for(fault: str, out: Path) -> Path:
 
 
 def names_action(found: Diagnosis) -> bool:
-    """Whether the evidence says that the logs lack the planted action."""
+    """Return whether the evidence says that the logs lack the planted action."""
     return any(f"takes {ACTION!r}" in line for line in found.evidence)
 
 

@@ -137,7 +137,7 @@ def mcap_alone(path: Path) -> None:
 
 
 def check_values(path: Path, bag: Path) -> dict[str, int]:
-    """How many columns equal Restock's of the MCAP, by whom; ends where one does not."""
+    """Return how many columns equal Restock's of the MCAP, by whom; ends where one does not."""
     of_mcap = restock_columns(path)
     compared: Counter[str] = Counter()
     of_bag = restock_columns(bag)

@@ -247,7 +247,7 @@ def policy_of(stages: Documents, documents: Documents) -> dict[str, Any]:
 
 
 def contacts_against_labels(kind: Kind, store: Path, definitions: Path | None) -> dict[str, Any]:
-    """How labels made without the bumper fare against it; empty where there is none."""
+    """Return how labels made without the bumper fare against it; empty where there is none."""
     contacts = {}
     for path in kind.paths:
         with open_recording(path, typestore=with_definitions(None, definitions)) as recording:

@@ -94,7 +94,7 @@ def _panel(out: Path, mixture: str) -> Path:
 
 
 def _drives_further(budget: str) -> bool:
-    """Whether policies of a budget drive perturbed missions and unseen floors, too."""
+    """Return whether policies of a budget drive perturbed missions and unseen floors, too."""
     return BUDGETS[budget] >= BUDGETS["ten-minutes"]
 
 

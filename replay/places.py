@@ -105,7 +105,10 @@ def _add_all(
 
 
 def _refuse_of_another_store(store: Store, schema: str, path: str | Path) -> None:
-    """By its recordings, whose ids are of their content: a store may have been moved or copied."""
+    """Raise if a run or panel has only recordings that the store lacks.
+
+    Recordings' ids depend on their content, so the store may have been moved or copied.
+    """
     fed = f"""
         FROM information_schema.tables
         SELECT table_name

@@ -53,7 +53,7 @@ def audit_reward(
     version: Version | None = None,
     memory_limit: str | None = None,
 ) -> RewardAudit:
-    """Whether more success earns more, in a store's logs or a run's evaluations.
+    """Return whether more success earns more, in a store's logs or a run's evaluations.
 
     Args:
         place: a store, or a run.

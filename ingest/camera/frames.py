@@ -220,7 +220,7 @@ def kept_frames(cameras: Mapping[str, CameraFrames], ticks: Ints) -> list[KeptFr
 
 
 def frame_rows(recording: Recording, kept: KeptFrames) -> Iterator[pa.RecordBatch]:
-    """Rows by `frame_schema`, some megabytes of images at a time.
+    """Yield rows of `frame_schema`, some megabytes of images at a time.
 
     A frame is known by its log time and its hash: a message that holds the same at the same moment
     is the same frame.

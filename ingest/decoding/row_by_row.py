@@ -67,11 +67,11 @@ class Parser(Protocol):
         ...
 
     def array(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
-        """Values of one leaf that are one each, (N,)."""
+        """Return the values of a leaf that has one value per message, (N,)."""
         ...
 
     def concatenate(self, values: Sequence[Any], leaf: Leaf) -> NDArray[Any]:
-        """Values of one leaf that are several each, one after the other."""
+        """Concatenate the values of a leaf that has several per message."""
         ...
 
 

@@ -93,7 +93,7 @@ class Edges:
         return cls(edges, frozenset(static), parents, changes)
 
     def only(self, frames: set[str]) -> Edges:
-        """Only the transforms that may lead up from these frames."""
+        """Keep only the transforms that may lead up from these frames."""
         reached = {up for frame in frames for up in upward(plain(frame), self.parents)}
         kept = {name: c for name, c in self.topics.items() if name.split(" ", 1)[1] in reached}
         parents = {frame: up for frame, up in self.parents.items() if frame in reached}

@@ -97,7 +97,7 @@ class Task(Checked, frozen=True):
 
     @property
     def scaled_actions(self) -> NDArray[np.float64]:
-        """The actions (A, 2) in units of the fastest on each axis, as an observation has them."""
+        """Return the actions (A, 2) divided by the fastest on each axis, as in observations."""
         return np.asarray(self.actions, np.float64) / _fastest(self)
 
     @property

@@ -45,7 +45,7 @@ class ImageFeature:
         return {"dtype": "image", "shape": [height, width, 3], "names": names}
 
     def note(self) -> str:
-        """How its pictures went out, in words."""
+        """Describe in words how the camera's pictures were exported."""
         packed = "".join(f"; {count:,} of {what} as PNG" for what, count in self.packed.items())
         return f"{self.name}: {self.as_recorded:,} pictures as they were recorded{packed}"
 

@@ -202,7 +202,7 @@ def _table(columns: dict[str, Any], images: dict[str, pa.Array]) -> pa.Table:
 
 
 def _stats(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
-    """Of one episode's column: one entry per element, (k,) each."""
+    """Compute the statistics of one episode's column, one entry per element, (k,) each."""
     wide = values.reshape(len(values), -1).astype(np.float64)
     stats = {
         "min": wide.min(axis=0),
@@ -216,14 +216,14 @@ def _stats(values: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
 
 
 def _image_stats(images: NDArray[np.uint8]) -> dict[str, NDArray[np.float64]]:
-    """Of pictures (N, H, W, 3), by colour and from 0 to 1: (3, 1, 1) each, as LeRobot has them."""
+    """Compute statistics of pictures (N, H, W, 3) by colour, from 0 to 1, (3, 1, 1) each."""
     stats = _stats(images.reshape(-1, 3) / 255)
     shaped = {name: value.reshape(3, 1, 1) for name, value in stats.items() if name != "count"}
     return shaped | {"count": np.array([len(images)])}
 
 
 def _together(every: list[Stats]) -> Stats:
-    """Of all episodes. Quantiles are means of the episodes' own, as LeRobot aggregates them."""
+    """Merge the episodes' statistics; quantiles are means of theirs, as in LeRobot."""
     whole: Stats = {}
     for name in every[0]:
         parts = {kind: np.stack([stats[name][kind] for stats in every]) for kind in every[0][name]}

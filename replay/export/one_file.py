@@ -32,7 +32,7 @@ D3RLPY_COLUMNS = ("observations", "actions", "rewards", "terminated")
 def write_parquet(
     selection: Selection, trajectories: Iterator[Trajectory], out: Path, counts: Counts
 ) -> list[str]:
-    """One row a transition, in order; provenance in the schema's metadata."""
+    """Write one row per transition, in order, with provenance in the schema's metadata."""
     writer: pq.ParquetWriter | None = None
     waiting: list[pa.Table] = []
     rows = 0

@@ -117,7 +117,7 @@ class _Kind:
     listed: bool = False
 
     def fits(self, kind: str) -> bool:
-        """As DECIMAL(3,1) or FLOAT[97] is."""
+        """Return whether a DuckDB type, for example DECIMAL(3,1) or FLOAT[97], is of this kind."""
         return kind.count("[") == self.listed and re.split(r"[(\[]", kind)[0] in self.names
 
 

@@ -156,7 +156,7 @@ class _Rows:
         self.carried = {name: _plain(table, name) for name in CARRIED if name in table.column_names}
 
     def starts(self) -> Ints:
-        """Where trajectories begin, ascending; the first is 0."""
+        """Return the rows at which trajectories begin, ascending; the first is 0."""
         same = self.episode[1:] == self.episode[:-1]
         if (again := same & (self.step[1:] == self.step[:-1])).any():
             row = int(np.flatnonzero(again)[0])
@@ -247,6 +247,6 @@ def _plain(table: pa.Table, name: str) -> NDArray[Any]:
 
 
 def missing_columns(columns: Sequence[str], *, continuous: bool) -> list[str]:
-    """Which of the needed columns are not there."""
+    """Return the needed columns that are missing."""
     needed = (*REQUIRED, *COMMAND) if continuous else REQUIRED
     return [name for name in needed if name not in columns]

@@ -42,7 +42,7 @@ class Drift:
 
     @property
     def tested(self) -> int:
-        """How many of them had enough data for a test."""
+        """Return how many of them had enough data for a test."""
         return sum(row["p"] is not None for row in self.own)
 
     def without_findings(self) -> str:

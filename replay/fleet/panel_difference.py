@@ -92,7 +92,7 @@ def _header(panel: Panel) -> dict[str, Any]:
 
 
 def _rows(first: Panel, second: Panel) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Rows in and out, by id; of those that both have, what became of stratum and weight."""
+    """Compare rows by id: those added and removed, and changes of stratum and weight."""
     ids = [np.asarray(panel.meta_column("transition_id"), np.int64) for panel in (first, second)]
     both, at_a, at_b = np.intersect1d(ids[0], ids[1], return_indices=True)
     names = [
@@ -121,7 +121,7 @@ def _rows(first: Panel, second: Panel) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _strata(first: Panel, second: Panel) -> Rows:
-    """One line a stratum of either, as a plan has it; null where one has no such stratum."""
+    """Return one row per stratum of either panel, as in a plan; null if a panel lacks it."""
     sides = [{s.name: s for s in panel.strata} for panel in (first, second)]
     lines = []
     for name in dict.fromkeys([*sides[0], *sides[1]]):

@@ -137,7 +137,7 @@ def shopping_list(
 
 
 def _may_fill(supply: Supply, gap: Gap) -> bool:
-    """Whether it is of the zone and the robot that the gap names."""
+    """Return whether it is of the zone and the robot that the gap names."""
     requested = ((gap.cell.get("zone"), supply.zone), (gap.cell.get("robot"), supply.robot))
     return all(wanted is None or wanted in ("", given) for wanted, given in requested)
 

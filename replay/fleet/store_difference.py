@@ -83,7 +83,7 @@ class StoreDifference:
 
     @property
     def different(self) -> bool:
-        """Whether anything but the version is."""
+        """Return whether anything but the version is."""
         return bool(self.definitions or self.recordings or self.labels or self.other_labels)
 
     def document(self) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _definitions(connection: duckdb.DuckDBPyConnection) -> Rows:
 
 
 def _shares(connection: duckdb.DuckDBPyConnection, rng: np.random.Generator) -> Rows:
-    """One row a value of each column: rows and share in either, and the difference."""
+    """Return one row per value of each column: rows and share in both stores, and difference."""
     from scipy.sparse import csr_array
 
     dimensions = _in_both(connection, SHARES_OF)
@@ -322,7 +322,7 @@ def _signals(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, Any], Row
 
 
 def shifted(rows: Rows) -> Rows:
-    """Of a document's signals those whose mean shifted, at a false discovery rate of 5 %."""
+    """Return the signals whose mean shifted, at a false discovery rate of 5 %."""
     return [row for row in rows if row["p_adjusted"] is not None and row["p_adjusted"] < 0.05]
 
 

@@ -32,7 +32,7 @@ class Shift:
 
 
 def shift(first: NDArray[Any], second: NDArray[Any]) -> Shift:
-    """How a figure (n,), one value an episode, differs in a second sample (m,); NaN is unknown.
+    """Compare a figure, one value per episode, in two samples (n,) and (m,); NaN is unknown.
 
     The interval of the standardised difference is the normal one of Hedges and Olkin (1985).
     From fewer than MIN_EPISODES episodes of either there is none, and no p-value.

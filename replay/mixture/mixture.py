@@ -111,7 +111,7 @@ class SourceShares(Checked, frozen=True):
         return {"logs": self.represents, **{store.name: store.represents for store in self.stores}}
 
     def chosen(self, name: str) -> bool:
-        """Whether a source's rows stand for other rates than their own."""
+        """Return whether a source's rows stand for other rates than their own."""
         return self.said[name] not in (None, "natural")
 
     @property
@@ -167,7 +167,7 @@ class EvaluationSplit(Checked, frozen=True):
 
     @property
     def is_empty(self) -> bool:
-        """Whether it keeps nothing out, whatever the rows."""
+        """Return whether it keeps nothing out, whatever the rows."""
         return self.by == "none" or (self.share == 0 and not self.robots)
 
 

@@ -49,7 +49,7 @@ def step_flags(
 
 
 def n_step_horizon(continues: Bools, n_step: int) -> Ints:
-    """How many steps each row's return spans, (N,) in 1..n_step.
+    """Return how many steps each row's return spans, (N,) in 1..n_step.
 
     `continues[i]` (N,) says that row i + 1 is part of what row i may sum over (so it is False where
     the episode ends, where a step is missing, and on the last row).

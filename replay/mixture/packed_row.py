@@ -23,7 +23,7 @@ def row_width(observation_size: int) -> int:
 
 
 def row_columns(observation_size: int) -> dict[str, slice]:
-    """Where each part of a packed row is: `rows[:, columns["reward"]]`."""
+    """Return the columns of each part of a packed row: `rows[:, columns["reward"]]`."""
     size = observation_size
     columns = {"observation": slice(0, size), "next_observation": slice(size, 2 * size)}
     for place, name in enumerate(SCALARS):

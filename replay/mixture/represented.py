@@ -82,7 +82,7 @@ def represented_shares(
 
 
 def stands_for_others(mixture: Mixture, source: str) -> bool:
-    """Whether a source's rows in a panel may stand for other rates than their own."""
+    """Return whether a source's rows in a panel may stand for other rates than their own."""
     rules: list[Mixture | StratumLimits] = [mixture, *mixture.strata]
     if mixture.each_condition is not None:
         rules.append(mixture.each_condition)
@@ -112,7 +112,7 @@ def _told(rates: Mapping[str, float], names: Sequence[str], rows: Ints, source: 
 
 
 def _refuse_unknown(strata: Sequence[Resolved], share: F64, rows: Ints, source: str) -> None:
-    """Rows of a stratum whose natural rate nothing tells cannot be weighed back to it."""
+    """Raise if a stratum has rows but no known natural rate: they cannot be weighted back to it."""
     if all(stratum.correction == "none" for stratum in strata):
         return
     untold = [
@@ -183,7 +183,9 @@ def look_for_archives(
 
 
 def odds_ratio(mine: tuple[int, int], theirs: tuple[int, int]) -> tuple[float, float, float]:
-    """How many times the others' odds, and its 99 % interval: several conditions are compared.
+    """Return the odds as a multiple of the others' odds, with a 99 % interval.
+
+    The interval is wide because several conditions are compared.
 
     `mine` and `theirs` are (episodes that met it, episodes). Half an episode is added to each count
     (Haldane 1956, Anscombe 1956), so that none is 0.

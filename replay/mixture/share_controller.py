@@ -136,7 +136,7 @@ class ShareController(Stateful):
     def fixed(
         cls, names: Sequence[str], rows: Sequence[int], shares: F64, logs_share: float
     ) -> ShareController:
-        """Shares that are simply given, and stay."""
+        """Build a controller whose shares are given and never change."""
         rules = tuple(
             StratumRule(name=name, share=float(share))
             for name, share in zip(names, shares, strict=True)
@@ -182,7 +182,7 @@ class ShareController(Stateful):
 
     @property
     def strata_move(self) -> bool:
-        """Whether `shares` follow the environment steps."""
+        """Return whether `shares` follow the environment steps."""
         portions = [s.rule.share for s in self.strata if not isinstance(s.rule.share, str)]
         parts = list(self.mixture.sources.parts.values())
         return any(map(knots, portions + (parts if len(parts) > 1 else [])))
@@ -228,7 +228,7 @@ class ShareController(Stateful):
         return self._work_out("redistribute")
 
     def _work_out(self, shortfall: Shortfall) -> bool:
-        """Shares for this moment, within what the rows still allow."""
+        """Compute the shares for now, within the draws that the rows still allow."""
         if self.online:
             return self._beside_ring()
         if self.mixture.shortfall == "shrink" and self.fresh is None:
@@ -295,13 +295,13 @@ class ShareController(Stateful):
 
     @property
     def natural(self) -> F64:
-        """How often each stratum occurs in the logs, (S,)."""
+        """Return how often each stratum occurs in the logs, (S,)."""
         rows = np.sum([source.natural for source in self.sources], axis=0, dtype=np.float64)
         return np.asarray(rows / max(rows.sum(), 1e-12))
 
     @property
     def boosted(self) -> Bools:
-        """Whether fresh rows of a stratum (S,) are drawn by quota.
+        """Return whether fresh rows of a stratum (S,) are drawn by quota.
 
         Not those of a stratum whose boost weights are to take away: fresh rows have no weights.
         """
@@ -502,7 +502,7 @@ class ShareController(Stateful):
         self._plan_for(PlannedDraws(**state["planned"]))
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state of other strata."""
+        """Return the error for a saved state with other strata."""
         return MixtureError(
             "the saved shares are of other strata",
             remedy="resume with the panel and the settings the run began with",

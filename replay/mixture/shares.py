@@ -198,7 +198,7 @@ def row_limits(
 
 
 def has_minimum(rules: Sequence[StratumRule], rows: Ints, episodes: Ints) -> Bools:
-    """Whether each stratum has the rows and episodes below which it gets nothing, (S,)."""
+    """Return whether each stratum has the rows and episodes below which it gets nothing, (S,)."""
     enough = (rows >= [rule.min_rows for rule in rules]) & (
         episodes >= [rule.min_episodes for rule in rules]
     )
@@ -213,7 +213,7 @@ def missing_rows(
     wanted: F64,
     draws: float,
 ) -> Ints:
-    """How many rows more each stratum needs, to be drawn as often as it is wanted, (S,).
+    """Return how many rows more each stratum needs, to be drawn as often as it is wanted, (S,).
 
     Rows of `min_episodes` are counted as of the episodes that there are.
     """

@@ -295,7 +295,7 @@ def _enough_memory() -> Iterator[None]:
 
 
 def _address(store: str) -> str:
-    """Where a trace finds a store, whatever folder it begins in."""
+    """Return the absolute address of a store, so that a trace finds it from any folder."""
     place = Location.of(store)
     return str(place if place.folder is None else place.folder.resolve())
 
@@ -349,7 +349,7 @@ def _put(partial: Path, out: Path, force: bool) -> None:
 
 
 def _random_probability(task_json: str) -> float:
-    """How probable each action is to one who chooses blindly; 0 where the task is not known."""
+    """Return each action's probability under uniform random choice; 0 if the task is unknown."""
     if not task_json:
         return 0.0
     return 1.0 / len(msgspec.json.decode(task_json, type=Task).actions)
@@ -366,7 +366,7 @@ def panel_id(source: TransitionSource, plan: PanelPlan, digest: str) -> str:
 
 
 def _labels_version(source: TransitionSource) -> str:
-    """Of the rules, and where people corrected what they say, of all that they said."""
+    """Return the version of the label rules, with a hash of the corrections if there are any."""
     rules = labels_version(source.conditions)
     if not source.corrected:
         return rules

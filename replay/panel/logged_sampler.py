@@ -94,7 +94,7 @@ class LoggedSampler(Stateful):
 
     @property
     def reads_chunks(self) -> bool:
-        """Whether `gather` must be asked for the rows: they are not in memory."""
+        """Return whether `gather` must be asked for the rows: they are not in memory."""
         return isinstance(self.sampler, ChunkedSampler)
 
     def move_to(self, env_steps: int, stock: F64 | None = None) -> bool:
@@ -112,7 +112,7 @@ class LoggedSampler(Stateful):
             self._follow()
 
     def draw(self, count: int | None = None) -> BatchDraw:
-        """Rows of a batch: `count`, or fewer where all others have had all their draws."""
+        """Draw `count` rows for a batch, or fewer if no other row may be drawn again."""
         self.sampler.set_batch_size(self.batch_size if count is None else count)
         quota = self.controller.shares
         rows, strata = self.sampler.draw()
@@ -211,7 +211,7 @@ class LoggedSampler(Stateful):
         return None
 
     def _used_up(self) -> bool:
-        """Whether a stratum that has a share has no row left that may be drawn."""
+        """Return whether a stratum that has a share has no row left that may be drawn."""
         controller, full = self.controller, self.controller.drawn >= self._budget
         return bool(controller.shares[full].any()) and controller.logs_share > 0
 
@@ -324,7 +324,7 @@ def sampler_by_shares(
 
 
 def needs_td(panel: Panel) -> bool:
-    """Whether draws from a panel follow the TD errors of what was drawn."""
+    """Return whether draws from a panel follow the TD errors of what was drawn."""
     return follow_td(stratum.within for stratum in panel.strata)
 
 

@@ -207,7 +207,7 @@ class Packer:
 
 
 def _groups(rows: int, stop: Event) -> Iterator[slice]:
-    """Row groups of a table of so many rows; one of none where it has none."""
+    """Yield the row groups of a table of `rows` rows; an empty table has one empty group."""
     for begin in range(0, max(rows, 1), ROW_GROUP_ROWS):
         if stop.is_set():
             return
@@ -246,12 +246,12 @@ def _compact(column: pa.DictionaryArray) -> pa.DictionaryArray:
 
 
 def _finite(values: NDArray[np.float32], rows: Ints) -> bool:
-    """Whether there is neither NaN nor infinity in these rows (n,) of (m, c)."""
+    """Return whether there is neither NaN nor infinity in these rows (n,) of (m, c)."""
     return bool(np.isfinite(values).all() or np.isfinite(values[rows]).all())
 
 
 def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
-    """Where each of these values (n,) begins and ends in an ascending array."""
+    """Return the begin and end of each of these values (n,) in an ascending array."""
     # Those of one batch mostly lie together: the part of the array that may have them is small.
     low, high = np.searchsorted(ascending, [values.min(), values.max() + 1])
     near = np.asarray(ascending[low:high])
@@ -260,5 +260,5 @@ def _between(ascending: Ints, values: Ints) -> tuple[Ints, Ints]:
 
 
 def _starts(counts: Ints) -> Ints:
-    """Where each of consecutive groups of these sizes begins."""
+    """Return where each of consecutive groups of these sizes begins."""
     return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)

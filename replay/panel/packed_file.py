@@ -71,7 +71,7 @@ class PackedFile:
         return self._leaves.record(self._path)
 
     def put(self, rows: Ints, *values: Values) -> None:
-        """One part of rows (m,): some of their columns.
+        """Write some columns of some rows (m,).
 
         Raises OSError where the file cannot be written.
         """

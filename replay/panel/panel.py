@@ -163,7 +163,7 @@ class Panel:
 
     @property
     def splits(self) -> bool:
-        """Whether anything was kept out of it, to evaluate on."""
+        """Return whether anything was kept out of it, to evaluate on."""
         return (self.header.split_by or self.header.mixture.evaluation_split.by) != "none"
 
     @property

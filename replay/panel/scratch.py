@@ -97,7 +97,7 @@ class SourceSteps:
         return total, whole
 
     def places(self) -> Places:
-        """Where a transition is, by its id."""
+        """Return where a transition is, by its id."""
         return Places(self.ids)
 
 

@@ -87,13 +87,13 @@ class Leaves:
         return blake3(b"".join(self._digests)).hexdigest(DIGEST_BYTES)
 
     def record(self, path: Path) -> FileRecord:
-        """Of a file whose leaves were all added."""
+        """Return the record of a file whose leaves were all added."""
         size, sample = path.stat().st_size, sample_checksum(path)
         return FileRecord(size, self.root(), sample, self._leaf_bytes)
 
 
 def checksum(path: Path, leaf_bytes: int) -> str:
-    """BLAKE3 of a file's content by its leaves of `leaf_bytes`, 32 hex digits."""
+    """Compute the BLAKE3 of a file from its leaves of `leaf_bytes`, 32 hex digits."""
     leaves = Leaves(path.stat().st_size, leaf_bytes)
     descriptor = os.open(path, os.O_RDONLY)
 

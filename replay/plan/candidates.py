@@ -126,7 +126,7 @@ def as_stored(connection: duckdb.DuckDBPyConnection) -> str:
 
 @contextmanager
 def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Rows may come as the threads that read them finish, for as long as the block runs."""
+    """Let rows come in the order in which threads finish, while the block runs."""
     connection.execute("SET preserve_insertion_order = false")
     try:
         yield
@@ -137,7 +137,7 @@ def any_order(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
 def _blame(
     connection: duckdb.DuckDBPyConnection, source: str, predicates: dict[str, tuple[str, str]]
 ) -> None:
-    """Each predicate by itself, over every row, to say which does not run."""
+    """Run each predicate by itself, over every row, to name the one that fails."""
     for place, sql in predicates.values():
         test = f"SELECT transition_id, ({sql}\n)::BOOLEAN AS holds FROM {source}"
         try:
@@ -210,7 +210,7 @@ def uncertain_labels(
 def episodes_met(
     connection: duckdb.DuckDBPyConnection, mixture: Mixture, conditions: Sequence[Condition]
 ) -> dict[str, list[tuple[int, int]]]:
-    """Of each condition and exposure, by store: episodes that met it, of those that could tell.
+    """Count episodes that met each condition or exposure, of those that could tell, by store.
 
     Over a view of several stores, and the rows that the mixture's `where` admits.
     """

@@ -49,7 +49,9 @@ class LeftOut:
 
 
 def leave_out(table: pa.Table, mixture: Mixture, split: EvaluationRows, as_of_ns: int) -> LeftOut:
-    """Rows that no stratum gets. `table` is of `read_candidates`, ages are at `as_of_ns`.
+    """Find the rows that no stratum gets.
+
+    `table` comes from `read_candidates`; ages are as of `as_of_ns`.
 
     Raises:
         MixtureError: every row is too old; rows without a label, where the mixture does not say
@@ -113,7 +115,7 @@ def repeats_installed(connection: duckdb.DuckDBPyConnection, mixture: Mixture) -
 def repeats_of(
     connection: duckdb.DuckDBPyConnection, table: pa.Table, places: Places, evaluation_split: Bools
 ) -> Bools:
-    """Rows (N,) outside the evaluation split that show its steps again, under other ids.
+    """Find rows (N,) outside the evaluation split that repeat its steps under other ids.
 
     A recording and a part of it, or a drive that was recorded again, may both be in the store.
     Where `EPISODE_REPEATS` rows or more of an episode are in the split, all of the episode counts.
@@ -158,7 +160,7 @@ def leave_out_of_strata(
     stratum: NDArray[np.int16],
     out: LeftOut,
 ) -> Bools:
-    """Rows of no stratum, and those beyond a cap on one episode's or recording's rows.
+    """Leave out rows without a stratum, and those beyond the cap per episode or recording.
 
     Returns the latter, (N,): they still count for natural shares.
 
@@ -204,7 +206,7 @@ def beyond_cap(
     gone: Bools,
     seed: int,
 ) -> Bools:
-    """Rows (N,) that are too many of their stratum and episode (or recording).
+    """Find rows (N,) beyond the cap of their stratum and episode (or recording).
 
     Which stay depends on their ids and the seed alone, as `row_number() OVER (PARTITION BY stratum,
     episode ORDER BY hash(transition_id, seed))` would choose.
@@ -222,7 +224,7 @@ def beyond_cap(
 
 
 def versions_behind(table: pa.Table) -> Ints:
-    """How many newer versions of a row's behaviour policy the table has, (N,).
+    """Return how many newer versions of a row's behaviour policy the table has, (N,).
 
     Versions of a policy are in order of when each was first logged. A row without a version is of
     the version "" of its policy.

@@ -54,7 +54,7 @@ def forecast(
     rng: np.random.Generator,
     replicates: int = REPLICATES,
 ) -> Forecast:
-    """From what E episodes yielded (E,), each of so many missions or hours (E,).
+    """Forecast from the yields of E episodes (E,), each of so many missions or hours (E,).
 
     Episodes of no length (of one step, say) count as none, and so do those without a yield (NaN).
     """

@@ -92,7 +92,7 @@ class PanelPlan:
 
     @property
     def panel_rows(self) -> Ints:
-        """Which of the store's rows are in the panel, (n,)."""
+        """Return which of the store's rows are in the panel, (n,)."""
         return np.flatnonzero(self.stratum != NO_STRATUM)
 
 
@@ -199,7 +199,10 @@ def plan_panel(
 def _members(
     table: pa.Table, strata: Sequence[ResolvedStratum], *, of_state: bool = False
 ) -> Bools:
-    """Which rows the strata's predicates are for, (N, S); `of_state`: those of the state alone."""
+    """Return the rows that each stratum's predicate admits, (N, S).
+
+    `of_state` are those by predicates of the state alone.
+    """
     member = np.empty((len(table), len(strata)), np.bool_, order="F")
     episode = codes(table, "episode_id")
     for index, stratum in enumerate(strata):
@@ -272,7 +275,7 @@ def _sources(
 
 
 def _hours(episode: Codes, stamp_ns: Ints, episodes: int) -> F64:
-    """How long each episode (E,) is, by the codes and the stamps of its rows (N,)."""
+    """Compute the length of each episode (E,) from the codes and stamps of its rows (N,)."""
     rows = np.bincount(episode, minlength=episodes)
     first, last = np.full(episodes, np.iinfo(np.int64).max), np.zeros(episodes, np.int64)
     np.minimum.at(first, episode, stamp_ns)
@@ -293,7 +296,7 @@ def _joined(
     as_of_ns: int,
     warnings: tuple[str, ...],
 ) -> PanelPlan:
-    """All sources as one plan: the strata of source k are k * S and on."""
+    """Merge the plans of all sources; source k's strata begin at k * S."""
     size = len(strata)
     code = np.full(len(table), NO_STRATUM, np.int16)
     state = np.full(len(table), NO_STRATUM, np.int16)

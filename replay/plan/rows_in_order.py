@@ -155,7 +155,7 @@ def _in_order(batches: list[_Stretches], rank: Ints) -> list[tuple[int, int, int
 
 
 def _before(one: list[Ints], other: list[Ints]) -> Bools:
-    """Whether the keys of one come before those of the other, or are the same, (n,)."""
+    """Return whether the keys of one come before those of the other, or are the same, (n,)."""
     result = one[-1] <= other[-1]
     for here, there in zip(one[-2::-1], other[-2::-1], strict=True):
         result = (here < there) | ((here == there) & result)

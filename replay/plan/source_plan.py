@@ -70,7 +70,7 @@ class SourcePlan:
 
     @property
     def drawn(self) -> float:
-        """How much of its part the source can fill."""
+        """Return how much of its part the source can fill."""
         return self.shares.scale
 
 
@@ -83,7 +83,7 @@ def plan_source(
     unknown: Mapping[str, str] | None = None,
     taken: Mapping[str, str] | None = None,
 ) -> SourcePlan:
-    """Shares, weights and lines of one source.
+    """Plan the shares, weights and report lines of one source.
 
     `natural` (S,) are the shares that its rows stand for, where that is not their own; `unknown`
     the conditions that none of them tells, and why; `taken` the strata that another one empties.
@@ -172,7 +172,7 @@ def plan_source(
 
 
 def _hours(driving: Forecast | None) -> dict[str, float]:
-    """How much driving a stratum lacks; nothing where none is known to bring any."""
+    """Return the hours of driving that a stratum lacks; empty if none is known to help."""
     if driving is None or not driving.known:
         return {}
     ends = {"missing_hours": 0.5, "missing_hours_low": 0.025, "missing_hours_high": 0.975}
@@ -195,7 +195,7 @@ def _refuse_later_shares(rules: Sequence[StratumRule], natural: Ints | F64) -> N
 
 
 def below_natural(line: Stratum) -> bool:
-    """Whether weights took a stratum's share of the gradient below its share of the rows.
+    """Return whether weights took a stratum's share of the gradient below its share of the rows.
 
     What its quota or the lack of its rows gives it below that already is not the weights' doing:
     then only a correction of its own counts, and what it takes of the share that is drawn. `line`

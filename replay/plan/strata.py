@@ -72,17 +72,17 @@ class ResolvedStratum:
 
     @property
     def left_over(self) -> bool:
-        """Whether it gets the episodes that no other stratum of episodes is for."""
+        """Return whether it gets the episodes that no other stratum of episodes is for."""
         return self.rule.unit == "episode" and self.name == NOMINAL and self.rule.where is None
 
     @property
     def steps_of_episode(self) -> bool:
-        """Whether it is of the episodes in which its predicate holds in `min_steps` rows."""
+        """Return whether it is of the episodes in which its predicate holds in `min_steps` rows."""
         return self.rule.unit == "episode" and not self.left_over
 
     @property
     def dealt(self) -> bool:
-        """Whether `deal_episodes` gives it some: one with a `priority` of its own keeps to it."""
+        """Return whether `deal_episodes` gives it episodes: not if it has its own `priority`."""
         return self.steps_of_episode and self.rule.priority is None
 
 
@@ -165,7 +165,7 @@ def _resolve(rule: StratumRule, known: dict[str, Condition], mixture: Mixture) -
 
 
 def least_steps(rule: StratumRule, steps: Ints) -> int:
-    """In how many rows of an episode a condition must hold, of those of each (E,) it holds in.
+    """Return in how many rows an episode must meet a condition; `steps` (E,) are those it has.
 
     `min_steps`, or the most that an episode has where none has so many: a condition that is there
     has rows of its own.

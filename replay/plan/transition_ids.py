@@ -44,7 +44,7 @@ class Places:
 
     @property
     def twice(self) -> int:
-        """How many ids are there that were there before."""
+        """Count the ids that occurred before."""
         if self._order is None:  # each run rises, and ends before the next begins
             return 0
         return int((self._ids[1:] == self._ids[:-1]).sum())

@@ -83,7 +83,7 @@ class RowWeights:
         self._in_cell = np.bincount(self._cell, minlength=size * (size + 1)).reshape(size, size + 1)
 
     def boost(self, shares: F64) -> F64:
-        """How much more often a stratum is drawn than it occurs, (S,); 1 where it has no rows."""
+        """Return how much more often each stratum is drawn than it occurs, (S,); 1 if empty."""
         ones = np.ones(len(shares))
         drawn = shares * self._occurs.sum()
         return np.asarray(np.divide(drawn, self._occurs, out=ones, where=self._occurs > 0))
@@ -138,7 +138,7 @@ def importance_weights(
 
 
 def stands_for(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
-    """How many rows each row (N,) stands for, of N drawn as strata occur: 1 of a natural sample."""
+    """Return how many rows each row (N,) stands for; 1 in a natural sample."""
     if natural is None:
         return np.ones(len(code))
     rows = np.bincount(code, minlength=size)
@@ -148,7 +148,7 @@ def stands_for(code: NDArray[np.int16], size: int, natural: F64 | None) -> F64:
 
 
 def effective_shares(code: NDArray[np.int16], weights: F32, shares: F64) -> F64:
-    """Shares of the gradient after weights, (S,)."""
+    """Compute each stratum's share of the gradient after weighting, (S,)."""
     rows = np.maximum(np.bincount(code, minlength=len(shares)), 1)
     total = shares * np.bincount(code, weights=weights, minlength=len(shares)) / rows
     return np.asarray(total / max(total.sum(), 1e-12), np.float64)

@@ -342,7 +342,7 @@ class FreshRing(Stateful):
 
     @property
     def stratum_rows(self) -> Ints:
-        """How many rows of each stratum it holds, (S,)."""
+        """Return how many rows of each stratum it holds, (S,)."""
         in_one = self.stratum[: len(self)]
         return np.bincount(in_one[in_one >= 0], minlength=len(self.strata))
 
@@ -391,7 +391,7 @@ class FreshRing(Stateful):
 
     @property
     def _filled(self) -> dict[str, NDArray[Any]]:
-        """What the filled slots hold: rows (n, W), and the rest of _OF_SLOTS and META (n,)."""
+        """Return what the filled slots hold: rows (n, W), and _OF_SLOTS and META (n,)."""
         filled = len(self)
         meta = {name: values[:filled] for name, values in self.meta.items()}
         own = {name: getattr(self, name)[:filled] for name in _OF_SLOTS}
@@ -404,7 +404,7 @@ class FreshRing(Stateful):
             place[: len(values)] = values
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state of another shape, or of other conditions."""
+        """Return the error for a saved state with another shape or other conditions."""
         return MixtureError(
             f"the saved ring has another shape or other conditions: {name} {value},"
             f" not {getattr(self, name)}",
@@ -412,13 +412,13 @@ class FreshRing(Stateful):
         )
 
     def restored(self) -> None:
-        """Where the steps of episodes without labels are."""
+        """Find the steps of episodes that are not labelled yet."""
         self._awaiting_labels = {}
         if self.conditions:
             self._find_slots()
 
     def _find_slots(self) -> None:
-        """Where the steps of episodes without labels are, from the rows themselves."""
+        """Find the steps of episodes that are not labelled yet, from the rows themselves."""
         slots = np.flatnonzero(self.by_condition.stratum[: len(self)] == UNLABELLED)
         keys, steps = self.meta["episode"][slots], self.meta["episode_step"][slots]
         longest = max(256, 2 * int(steps.max(initial=0)), 2 * int(self._episode_step.max()))

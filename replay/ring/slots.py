@@ -165,7 +165,7 @@ class Reserve(Stateful):
         self._victims = candidates[np.argsort(self._serial[candidates])[:some]]
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state in which other rows were reserved."""
+        """Return the error for a saved state that reserved other rows."""
         saved = None if value is None else np.asarray(value).tolist()
         return MixtureError(
             f"the saved ring reserved {saved} rows of its conditions, not {self.rows.tolist()}",

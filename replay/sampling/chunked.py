@@ -192,7 +192,7 @@ class _Buffer(StratumDraws):
         return np.arange(begin, min(begin + self.chunk_rows, len(self._members)))
 
     def mismatch(self, name: str, value: Any) -> MixtureError:
-        """Of a state of another memory, or other chunks."""
+        """Return the error for a saved state with another memory limit or other chunks."""
         return MixtureError(
             f"the saved buffer's {name} was {value}, this one's is {getattr(self, name)}",
             remedy="resume with the memory and the chunks the run began with",

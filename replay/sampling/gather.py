@@ -40,7 +40,7 @@ def gather_rows(rows: Tensor, index: Tensor) -> Tensor:
 
 
 def _has_a_faster_way(rows: Tensor) -> bool:
-    """Whether such a table can be read ahead: float32 in main memory, row by row."""
+    """Return whether such a table can be read ahead: float32 in main memory, row by row."""
     return (
         rows.dtype == torch.float32
         and rows.device.type == "cpu"
@@ -63,7 +63,7 @@ def _sum_of_one_each(rows: Tensor, index: Tensor) -> Tensor:
 
 @cache
 def _prefetching_works() -> bool:
-    """Whether that kernel is there and gives the rows, tried on tables of a few widths."""
+    """Return whether that kernel is there and gives the rows, tried on tables of a few widths."""
     index = torch.tensor([6, 0, 3, 3, 1])
     for width in _TRIED_WIDTHS:
         rows = torch.linspace(-3.0, 7.0, 7 * width).view(7, width)

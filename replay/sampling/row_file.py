@@ -46,7 +46,7 @@ class RowFile:
         _advise(self._fd, 0, 0, "POSIX_FADV_RANDOM")
 
     def read(self, rows: Ints, out: F32) -> None:
-        """Rows (n,), ascending, into `out` (n, W).
+        """Read rows (n,), ascending, into `out` (n, W).
 
         Raises:
             PanelError: the file is shorter than it was.

@@ -80,7 +80,7 @@ class Sampler(Protocol):
         """Batches of another size from the next one on."""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that decides the draws to come: arrays and JSON values."""
+        """Return all state that decides later draws: arrays and JSON values."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Put the draws to come where `state_dict` found them."""
@@ -159,12 +159,12 @@ class Quotas(Stateful):
         self._mean = (self.shares * self.batch_size).tolist()
 
     def next(self) -> Ints:
-        """Rows per stratum of the next batch, (S,); they sum to the batch size."""
+        """Return the rows per stratum of the next batch, (S,); they sum to the batch size."""
         first: Ints = self.take(1)[0]
         return first
 
     def take(self, batches: int) -> Ints:
-        """Rows per stratum of the next batches, (n, S); each sums to the batch size."""
+        """Return the rows per stratum of the next batches, (n, S); each sums to the batch size."""
         if len(self.shares) == 1:
             return np.full((batches, 1), self.batch_size, np.int64)
         # Plain lists: for a handful of strata numpy's calls cost more than the work.

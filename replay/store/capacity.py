@@ -34,7 +34,7 @@ class Capacity:
 
     @property
     def saturated(self) -> bool:
-        """Whether the second half of the rows showed hardly anything new."""
+        """Return whether the second half of the rows showed hardly anything new."""
         return self.half_share >= self.cells_share
 
     @property

@@ -124,11 +124,11 @@ class Definitions:
                 makers.pop(names)()
 
     def make_common(self) -> None:
-        """Those of COMMON."""
+        """Create the common views, COMMON."""
         self._make(_statements(definitions(names=COMMON)))
 
     def make_all(self) -> None:
-        """Every one, and the view `columns` of them."""
+        """Create all views and macros, and the view `columns` that lists theirs."""
         self._make(self._statements)
         for names in list(self.computed):
             self.computed.pop(names)()
@@ -223,12 +223,12 @@ def _held(connection: duckdb.DuckDBPyConnection, made: Definitions) -> list[str]
 
 
 def _rows(connection: duckdb.DuckDBPyConnection) -> int:
-    """How many transitions its files hold."""
+    """Return how many transitions its files hold."""
     return connection.execute('SELECT sum("rows") FROM stored_ingests').fetchall()[0][0] or 0
 
 
 def is_empty(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Whether it is that of a store without transitions."""
+    """Return whether it is that of a store without transitions."""
     return connection in _OF and not _rows(connection)
 
 

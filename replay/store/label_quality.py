@@ -81,7 +81,7 @@ class _Recording:
 
 
 def _read(store: Store, ingest_id: str, names: Sequence[str], period_s: float) -> _Recording | None:
-    """None where no truth is known."""
+    """Read the label scores of a recording; None if no true condition is known."""
     rows = store.connection.sql(
         "SELECT episode_index, step_index, conditions, true_condition, uncertain, exposures,"
         " true_exposure FROM transitions WHERE ingest_id = ?"

@@ -89,7 +89,7 @@ def query(
 
 
 def _reads(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> bool:
-    """Whether a statement leaves files and the store's views as they are."""
+    """Return whether a statement leaves files and the store's views as they are."""
     if statement.type.name != "EXPLAIN":
         return statement.type.name in _ALLOWED or _pivots(statement)
     explained = _EXPLAIN.sub("", statement.query, count=1)
@@ -181,7 +181,7 @@ def fetch(
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """As DuckDB names the columns of a table that is made of them."""
+    """Make column names distinct as DuckDB does for a table of these columns."""
     given: list[str] = []
     for name in names:
         free = (f"{name}_{number}" for number in count(1))

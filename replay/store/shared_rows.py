@@ -100,7 +100,7 @@ class MetTwice:
 
 
 def occurs_again(values: Ints) -> Bools:
-    """Which of these (N,) are not the only one of their value, (N,)."""
+    """Return which of these values (N,) occur more than once, (N,)."""
     in_order = np.sort(values)
     several = np.unique(in_order[1:][in_order[1:] == in_order[:-1]])
     if not len(several):

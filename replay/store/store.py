@@ -153,7 +153,7 @@ class Store:
     @property
     @interrupts_raised
     def connection(self) -> duckdb.DuckDBPyConnection:
-        """With the common views; macros, and views of fewer uses, `install_named` makes."""
+        """Return a connection with the common views; `install_named` adds the other ones."""
         self._definitions.make_common()
         return self.bare
 
@@ -169,7 +169,7 @@ class Store:
             raise damaged_error(self.path, damaged)
 
     def unverified(self) -> int:
-        """How many of those files `verify` would read."""
+        """Return how many of those files `verify` would read."""
         return unverified_files(self.path, self._paths())
 
     def close(self) -> None:
@@ -429,7 +429,10 @@ def corrected_versions(connection: duckdb.DuckDBPyConnection) -> tuple[str, ...]
 
 
 def is_store(path: str | Path | Location) -> bool:
-    """Whether there is a store at `path`. Raises StoreError where the place cannot be reached."""
+    """Return whether there is a store at `path`.
+
+    Raises StoreError if the place cannot be reached.
+    """
     place = Location.of(path)
     return all(place.has_table(name) for name in (TRANSITIONS, RECORDINGS))
 

@@ -66,7 +66,7 @@ class StoredTable:
             register(connection, self.view, self._dataset(), schema=schema)
 
     def read(self) -> pa.Table:
-        """All of its rows, in memory; what a file has not is null.
+        """Read all rows into memory; columns that a file lacks are null.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.

@@ -131,7 +131,7 @@ def _of_transforms(aligned: AlignedInputs, stamp_ns: int) -> Iterator[_Message]:
 
 
 def _value(column: FieldColumn, row: int) -> Any:
-    """One message's value as plain numbers, texts and lists."""
+    """Convert one message's value to plain numbers, texts and lists."""
     value: Any = column[row]
     if isinstance(value, Ragged):
         return [_value(value, index) for index in range(len(value))]

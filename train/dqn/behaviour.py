@@ -38,7 +38,7 @@ class Labelled:
 
 
 def plausible_actions(logits: Tensor, ratio: Tensor) -> Tensor:
-    """Which actions (B, A) bool have G(a|s) >= ratio * max G(.|s); at least one of each row.
+    """Return which actions (B, A) bool have G(a|s) >= ratio * max G(.|s); at least one of each row.
 
     Args:
         logits: (B, A), of which G is the softmax.
@@ -172,7 +172,7 @@ class Behaviour(Stateful):
 
     @torch.no_grad()
     def plausible(self, observation: Tensor) -> Tensor:
-        """Which actions (B, A) bool are plausible in observations (B, D)."""
+        """Return which actions (B, A) bool are plausible in observations (B, D)."""
         return plausible_actions(self._logits(observation), self.ratio)
 
 

@@ -120,12 +120,12 @@ class TeacherConfig(Checked, frozen=True):
 
     @property
     def filters(self) -> bool:
-        """Whether there is a behaviour network."""
+        """Return whether there is a behaviour network."""
         return self.source not in (None, "none")
 
     @property
     def asks(self) -> bool:
-        """Whether somebody is asked in the twin."""
+        """Return whether somebody is asked in the twin."""
         return self.source not in (None, "none", "logs")
 
     def check(self) -> None:

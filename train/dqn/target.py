@@ -29,7 +29,7 @@ class Hard(Checked, frozen=True, tag_field="rule", tag="hard"):
         return self.every / 2
 
     def syncs_at(self, gradient_step: int) -> bool:
-        """Whether the target is copied after update number `gradient_step` (from 1)."""
+        """Return whether the target is copied after update number `gradient_step` (from 1)."""
         return gradient_step % self.every == 0
 
     def __str__(self) -> str:

@@ -139,7 +139,7 @@ class _Drive(BaseCallback):
         return True
 
     def end(self) -> tuple[int, int]:
-        """How many environment steps and updates were made, the last of them evaluated."""
+        """Return how many environment steps and updates were made, the last of them evaluated."""
         if self.evaluations.at != self.num_timesteps:
             self._evaluate()
         return self.num_timesteps, self.updates()

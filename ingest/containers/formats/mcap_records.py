@@ -221,7 +221,7 @@ FIELDS: dict[Op, tuple[tuple[str, str], ...]] = {
 
 
 def walk(buffer: Buffer, start: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Each record's opcode and the (start, stop) of its content, from `start` to `stop`.
+    """Yield each record's opcode and the (start, stop) of its content, from `start` to `stop`.
 
     Raises:
         Malformed: a record has opcode 0, or ends beyond `stop`; whatever came before it was whole.

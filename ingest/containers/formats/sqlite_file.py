@@ -264,7 +264,7 @@ class SqliteFile:
         yield from ((channel, some.batch()) for channel, some in pending.items())
 
     def _rows(self, cursor: sqlite3.Cursor) -> Iterator[list[_Row]]:
-        """Rows in their order, some at a time; a large one alone."""
+        """Yield rows in order, some at a time; a large one alone."""
         row_bytes = BYTES_PER_BATCH // 16
         while rows := self._fetch(cursor, row_bytes):
             row_bytes = sum(row[3] or 0 for row in rows) // len(rows) + 64
@@ -384,7 +384,7 @@ def guard(connection: sqlite3.Connection, size: int) -> None:
 
 
 def refuse_programs(connection: sqlite3.Connection, tables: tuple[str, ...]) -> None:
-    """Only plain tables are read.
+    """Refuse a database that has anything but plain tables.
 
     Raises:
         sqlite3.DatabaseError: one of these is a view, a virtual table, or has computed columns.
