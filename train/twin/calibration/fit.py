@@ -1,4 +1,4 @@
-"""Calibration: the effective parameters under which the twin does what a log's robot did.
+"""Calibration: fit the parameters under which the twin does what a log's robot did.
 
 Commands of the log are driven open loop and the motion is compared
 (`restock.train.twin.calibration.open_loop`, `restock.train.twin.calibration.fit_solver`). The
@@ -73,7 +73,7 @@ HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
 
 
 class FitConfig(Checked, frozen=True):
-    """How a twin is fitted. The same values give the same result.
+    """Settings of a fit. The same values give the same result.
 
     `base` holds what is not fitted, and is what "before" means.
     """
@@ -93,7 +93,7 @@ class FitConfig(Checked, frozen=True):
     name: str = "fitted"
 
     def check(self) -> None:
-        """Raise ValueError where a parameter cannot be fitted."""
+        """Raise ValueError if a parameter cannot be fitted."""
         if not self.parameters:
             raise ValueError(f"no parameter is given: choose from {', '.join(PARAMETERS)}")
         for name in self.parameters:
@@ -102,13 +102,13 @@ class FitConfig(Checked, frozen=True):
 
     @property
     def step_s(self) -> float:
-        """The physics timestep of the fit."""
+        """Return the physics timestep of the fit, in seconds."""
         return self.base.timestep_s if self.timestep_s is None else self.timestep_s
 
 
 @dataclass(frozen=True)
 class _FitData:
-    """The log of a fit: the segments to fit, and the rest to measure on."""
+    """The data of a fit: the segments to fit, and the held-out ones to measure on."""
 
     steps: LoggedSteps
     recordings: tuple[str, ...]  # that any segment is of
@@ -174,7 +174,7 @@ def fit(
 
 
 def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _FitData:
-    """Segments of ordinary driving to fit, at most `max_segments`, and what is held out."""
+    """Cut at most `max_segments` segments of ordinary driving to fit, and the held-out ones."""
     steps = logged_steps(store, config.task_hash, config.recordings, config.robot)
     segments = log_segments(steps, whole_periods_s(steps.task, config.horizon_s))
     if not len(segments):
@@ -208,7 +208,7 @@ def _fit_data(store: Store, config: FitConfig, rng: np.random.Generator) -> _Fit
 def _search(
     residuals: ReplayResiduals, coordinates: Coordinates, config: FitConfig, report: Report
 ) -> F64:
-    """Return the best point (n,) of a search over the whole ranges, on few segments."""
+    """Search the whole ranges on few segments; return the best point (n,)."""
     report(f"searching {config.search_points} points on {len(residuals.segments)} segments")
     scale = {name: CHANNELS[name][1] for name in residuals.channels}
     problem = FitProblem(residuals, coordinates, scale)
@@ -221,7 +221,7 @@ def _identify(
     residuals: ReplayResiduals, coordinates: Coordinates, start: F64, config: FitConfig,
     store: Store, report: Report,
 ) -> tuple[FitSolution, Uncertainty, list[ParameterEstimate]]:  # fmt: skip
-    """Least squares, again without each parameter that turns out not to be identified."""
+    """Fit by least squares, again without each parameter that proves unidentified."""
     dropped: list[ParameterEstimate] = []
     while True:
         solution = _least_squares(residuals, coordinates, start, report)
@@ -244,7 +244,7 @@ def _identify(
 def _least_squares(
     residuals: ReplayResiduals, coordinates: Coordinates, z: F64, report: Report
 ) -> FitSolution:
-    """Least squares on all segments: twice, for the noise is known only after the first."""
+    """Fit all segments twice, since the noise is known only after the first fit."""
     for iterations in (10, 15):
         scale = channel_noise(residuals.of([coordinates.perturbation(z)]))
         problem = FitProblem(residuals, coordinates, scale)
@@ -264,7 +264,7 @@ def _least_squares(
 def _held_out_gaps(
     data: _FitData, scope: FitScope, config: FitConfig, fitted: Perturbation, report: Report
 ) -> tuple[HeldOutGap, ...]:
-    """Return the gap of position on what the fit has not seen, at 1, 3 and 6 s."""
+    """Return the position gap on held-out segments, at 1, 3 and 6 s."""
     if "position" not in scope.channels or not config.held_out:
         return ()
     report("driving the held-out segments again")
@@ -290,7 +290,7 @@ def _held_out_gaps(
 def _deviations(
     residuals: ReplayResiduals, base: Perturbation, fitted: Perturbation
 ) -> dict[str, dict[str, Any]]:
-    """Median deviations of each channel before and after."""
+    """Return the median deviations of each channel before and after the fit."""
     return {
         name: {
             "unit": CHANNELS[name][0],

@@ -1,4 +1,4 @@
-"""What can be fitted: parameters and their ranges, and which of them a log can identify."""
+"""The parameters that can be fitted, their ranges, and which of them a log can identify."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _POSE_TYPES = (
 
 @dataclass(frozen=True)
 class Parameter:
-    """One field of a `Perturbation` that a log can say something about."""
+    """A field of a `Perturbation` that a log can identify."""
 
     name: str
     unit: str
@@ -67,7 +67,7 @@ DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 
 
 class Coordinates:
-    """Between perturbations and points z of the unit cube, one axis a parameter that is fitted.
+    """The map between perturbations and points z of the unit cube, an axis per fitted parameter.
 
     What is not fitted is as in `base`.
     """
@@ -88,21 +88,21 @@ class Coordinates:
 
     @property
     def steps(self) -> F64:
-        """Of difference quotients, (n,) in z."""
+        """Return the step sizes of difference quotients, (n,) in z."""
         return np.array([item.step for item in self.parameters]) / self._span
 
     @property
     def useful(self) -> F64:
-        """Half widths of intervals beyond which they say too little, (n,) in z."""
+        """Return the half widths (n,) in z above which an interval says too little to be of use."""
         return np.array([item.useful for item in self.parameters]) / self._span
 
     def values(self, z: F64) -> F64:
-        """Parameters (..., n) at points (..., n)."""
+        """Return the parameters (..., n) at points (..., n)."""
         inner = self._low + np.asarray(z) * self._span
         return np.where(self._ratio, np.exp(np.where(self._ratio, inner, 0.0)), inner)
 
     def point(self, perturbation: Perturbation) -> F64:
-        """Where a perturbation is, (n,), moved into the cube."""
+        """Return the point (n,) of a perturbation, clipped to the cube."""
         values = np.array([getattr(perturbation, name) for name in self.names], np.float64)
         inner = np.where(self._ratio, np.log(np.where(self._ratio, values, 1.0)), values)
         return np.clip((inner - self._low) / self._span, 0.0, 1.0)
@@ -114,7 +114,7 @@ class Coordinates:
         return msgspec.structs.replace(self.base, **values)
 
     def drivable(self, z: F64, timestep_s: float) -> F64:
-        """Return the point (n,) with the nearest latency that is some physics steps."""
+        """Return the point (n,) with its latency rounded to whole physics steps."""
         moved = z.copy()
         if "latency_s" in self.names:
             at = self.names.index("latency_s")
@@ -123,13 +123,13 @@ class Coordinates:
         return moved
 
     def without(self, name: str) -> Coordinates:
-        """Return the same with one parameter fewer; it stays as in `base`."""
+        """Return these coordinates without one parameter, which stays as in `base`."""
         return Coordinates([other for other in self.names if other != name], self.base, self.task)
 
 
 @dataclass(frozen=True)
 class FitScope:
-    """Parameters and channels that a log says something about, and why not the others."""
+    """Parameters and channels that a log can identify, and the reasons why not the others."""
 
     names: tuple[str, ...]
     channels: tuple[str, ...]
@@ -144,7 +144,7 @@ def fit_scope(
     recordings: Sequence[str],
     robot: Robot | None = None,
 ) -> FitScope:
-    """Return what of `names` the recordings (all, if none is named) can identify at all.
+    """Return which of `names` these recordings (all by default) can identify at all.
 
     `robot` is the profile's own; None: the twin's stand-in stands for the log's.
 
@@ -223,7 +223,7 @@ def _recording_filter(recordings: Sequence[str]) -> str:
 
 
 def _pose_is_odometry(store: Store, wanted: str) -> bool:
-    """Whether, in all recordings, odometry was read and no topic that a localiser publishes."""
+    """Return whether all recordings were read with odometry but without a localiser's topic."""
     rows = store.sql(
         "SELECT recording_id, coalesce(list(DISTINCT type) FILTER (decoded > 0), [])"
         f" FROM recordings LEFT JOIN topics USING (recording_id) {wanted} GROUP BY recording_id"

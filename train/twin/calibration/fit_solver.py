@@ -63,7 +63,7 @@ class ReplayResiduals:
         self._known: dict[Perturbation, dict[str, F64]] = {}
 
     def of(self, perturbations: Sequence[Perturbation]) -> dict[str, F64]:
-        """Residuals by channel, (P, S, R) each: R is K + 1, for a position twice that."""
+        """Return residuals by channel, (P, S, R) each: R is K + 1, or 2 (K + 1) for a position."""
         parts = [self._between(perturbation) for perturbation in perturbations]
         self._drive([twin for pair in parts for twin, weight in pair if weight])
         residuals = {
@@ -81,7 +81,7 @@ class ReplayResiduals:
         return residuals
 
     def _between(self, perturbation: Perturbation) -> list[tuple[Perturbation, float]]:
-        """Return the replays that make up a perturbation, and their weights."""
+        """Return the replays whose weighted mean stands for a perturbation, with their weights."""
         ticks = perturbation.latency_s / self.timestep_s
         low = int(np.floor(ticks + 1e-6))
         above = max(ticks - low, 0.0)
@@ -107,7 +107,7 @@ class ReplayResiduals:
 
 
 def channel_residuals(segments: LoggedSegments, replayed: OpenLoopResult) -> dict[str, F64]:
-    """Every channel's residuals, (P, S, R) each; 0 where the log says nothing."""
+    """Return every channel's residuals, (P, S, R) each; 0 if the log has no value."""
     predicted, logged = replayed.signals, segments.signals
     residuals = {
         "wheel speed": predicted["wheel_speed_mps"] - logged["wheel_speed_mps"],
@@ -144,28 +144,28 @@ class SoftL1(minimize.Norm):  # type: ignore[misc]  # mujoco has no types
     """SOFT^2 (sqrt(1 + (r / SOFT)^2) - 1): r^2 / 2 for small residuals, SOFT |r| for large."""
 
     def value(self, r: F64) -> np.float64:
-        """Of residuals (R, 1)."""
+        """Return the cost of residuals (R, 1)."""
         return np.float64(cost(r[:, 0]))
 
     def grad_hess(self, r: F64, proj: F64) -> tuple[F64, F64]:
-        """Gradient (n, 1) and Gauss-Newton Hessian (n, n) under a projection (R, n)."""
+        """Return the gradient (n, 1) and Gauss-Newton Hessian (n, n) for a Jacobian (R, n)."""
         weight = weights(r)
         return proj.T @ (weight * r), proj.T @ (weight * proj)
 
 
 def cost(r: F64) -> F64:
-    """Soft L1 of residuals (R, ...), summed over the first axis."""
+    """Return the soft L1 cost of residuals (R, ...), summed over the first axis."""
     return np.asarray(SOFT**2 * (np.sqrt(1 + (r / SOFT) ** 2) - 1).sum(axis=0))
 
 
 def weights(r: F64) -> F64:
-    """Of each residual: the derivative of the norm is weight times residual."""
+    """Return each residual's weight: the norm's derivative is weight times residual."""
     return np.asarray(1 / np.sqrt(1 + (r / SOFT) ** 2))
 
 
 @dataclass(frozen=True)
 class FitSolution:
-    """Where the search ended, with what uncertainty and warnings are made of."""
+    """The end point of a search, with what its uncertainty and warnings are computed from."""
 
     coordinates: Coordinates
     z: F64  # (n,)
@@ -185,20 +185,20 @@ class FitProblem:
         self.residuals, self.coordinates, self.scale = residuals, coordinates, dict(scale)
 
     def residual(self, z: F64) -> F64:
-        """Residuals (R, k) in units of noise, at points (n, k)."""
+        """Return the residuals (R, k) in units of noise, at points (n, k)."""
         residuals = self.residuals.of([self.coordinates.perturbation(point) for point in z.T])
         parts = [residuals[name] / self.scale[name] for name in self.residuals.channels]
         return np.concatenate([part.reshape(z.shape[1], -1) for part in parts], axis=1).T
 
     @property
     def segment(self) -> NDArray[np.int64]:
-        """The segment (R,) of each residual."""
+        """Return the segment (R,) of each residual."""
         steps, num = self.residuals.segments.horizon_steps + 1, len(self.residuals.segments)
         widths = [2 * steps if name == "position" else steps for name in self.residuals.channels]
         return np.concatenate([np.repeat(np.arange(num), width) for width in widths])
 
     def jacobian(self, z: F64, residual: F64) -> F64:
-        """Difference quotients (R, n) at z (n, 1), at the nearest latency that can be driven.
+        """Return difference quotients (R, n) at z (n, 1), with latency in whole physics steps.
 
         A wheel that breaks loose does so at a physics step, so wheel speeds jump as friction or
         payload change. A jump is no slope: of these two, quotients are taken to both sides, and the
@@ -274,11 +274,11 @@ def solve(problem: FitProblem, start: F64, iterations: int) -> tuple[F64, float,
 
 
 class _GoodEnough(Exception):
-    """A step gained less than what a log can tell: the one way out of the solver."""
+    """Stops the solver if a step gained less than a log can resolve."""
 
 
 def channel_noise(residuals: Mapping[str, F64], position_parts: int = 2) -> dict[str, float]:
-    """Each channel's noise from residuals (1, S, R) at a solution.
+    """Return each channel's noise, from residuals (1, S, R) at a solution.
 
     The median deviation, times what the correlation of neighbouring steps takes away: n residuals
     with correlation c say as much as n (1 - c) / (1 + c) without.

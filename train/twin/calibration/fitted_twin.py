@@ -1,4 +1,4 @@
-"""What a fit gives: parameters, how well a log identifies each, and the TOML that training reads.
+"""The result of a fit: parameters, how well a log identifies them, and TOML for training.
 
 Intervals come from a bootstrap over episodes and from profiles of the cost. Of each parameter its
 value is reported with its interval, or why it stays as in the base. One fit makes a perturbation;
@@ -48,7 +48,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class HeldOutGap:
-    """Of held-out segments: how far replayed and logged position end apart, in metres."""
+    """The distance in metres between replayed and logged end positions of held-out segments."""
 
     horizon_s: float
     segments: int
@@ -60,7 +60,7 @@ class HeldOutGap:
 
 @dataclass(frozen=True)
 class FittedTwin:
-    """The twin as a log's robot, as far as the log identifies it."""
+    """The twin with the parameters of a log's robot, as far as the log identifies them."""
 
     perturbation: Perturbation
     base: Perturbation
@@ -78,7 +78,7 @@ class FittedTwin:
     work_s: float = 0.0
 
     def describe(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the fit as plain values for JSON."""
         return {
             **vars(self),
             "perturbation": msgspec.to_builtins(self.perturbation),
@@ -88,7 +88,7 @@ class FittedTwin:
         }
 
     def toml(self) -> str:
-        """Return the perturbation as TOML that training reads, with what is known of each value."""
+        """Return the perturbation as TOML for training, with each value's uncertainty."""
         estimates = {item.name: item for item in self.estimates}
         lines = [
             f"# Effective parameters, fitted to {', '.join(self.recordings)}",
@@ -125,7 +125,7 @@ def fleet_schedule(fits: Sequence[FittedTwin]) -> Schedule:
 
 
 def write_fit(path: Path | str, fits: Sequence[FittedTwin]) -> None:
-    """Write the perturbation of one fit, or the schedule of several, whole or not at all.
+    """Write the perturbation of one fit, or the schedule of several, atomically.
 
     Raises:
         ConfigError: there is something at `path`.
@@ -172,7 +172,7 @@ ILL_CONDITIONED = 1e6  # condition number of the information
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of n parameters, in the coordinates of the unit cube."""
+    """Uncertainty of n parameters, in coordinates of the unit cube."""
 
     half: F64  # (n,) of the 95 % intervals; inf where the log says nothing
     correlation: F64  # (n, n) of the estimates
@@ -181,7 +181,7 @@ class Uncertainty:
 
 
 def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: int) -> Uncertainty:
-    """Intervals from a bootstrap over episodes (S,), linearised at the solution.
+    """Compute intervals by a bootstrap over episodes (S,), linearised at the solution.
 
     Steps of a segment and segments of an episode err together (localisation drifts), so whole
     episodes are drawn; with fewer than 8 of them, segments. Each draw moves the parameters by one
@@ -232,7 +232,7 @@ def measure_uncertainty(solution: FitSolution, episode: NDArray[np.str_], seed: 
 
 
 def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tuple[float, float]:
-    """Between which z a parameter explains the log as well, within 95 %: (low, high).
+    """Return the range of z (low, high) in which a parameter explains the log within 95 %.
 
     The parameter is put to values over its whole range; at each the others make one Gauss-Newton
     step, and twice the rise of the cost is compared with chi-square.
@@ -256,7 +256,7 @@ def cost_profile(problem: FitProblem, solution: FitSolution, index: int) -> tupl
 
 
 def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
-    """Where the rise passes chi-square between a point that fits and the next that does not."""
+    """Return where the cost passes chi-square between a point that fits and one that does not."""
     outer = inner + way
     if not 0 <= outer < len(grid):
         return float(grid[inner])
@@ -267,7 +267,7 @@ def _crossing(grid: F64, rise: F64, inner: int, way: int) -> float:
 def unidentified(
     residuals: ReplayResiduals, solution: FitSolution, uncertainty: Uncertainty
 ) -> ParameterEstimate | None:
-    """Return the parameter that is known least of those that stay as in the base, if there is one.
+    """Return the least identified parameter among those to keep at base; None if there is none.
 
     One stays that is known too little, and whose value in the base explains the log as well.
     """
@@ -316,7 +316,7 @@ def _kept_as_in_base(
 
 
 def _confounded_with(correlation: F64, index: int) -> int | None:
-    """Which other parameter this one is confounded with most, if with any."""
+    """Return the parameter that this one is most confounded with, or None."""
     others = np.abs(correlation[index]).copy()
     others[index] = 0.0
     at = int(np.argmax(others)) if len(others) > 1 else index
@@ -332,7 +332,7 @@ def as_in_base(
 
 
 def estimates(solution: FitSolution, uncertainty: Uncertainty) -> list[ParameterEstimate]:
-    """Of every parameter that was fitted."""
+    """Return the estimates of all fitted parameters."""
     made = []
     for index, parameter in enumerate(solution.coordinates.parameters):
         z, half = solution.z[index], uncertainty.half[index]

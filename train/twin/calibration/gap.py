@@ -82,7 +82,7 @@ ROUTE = (
 
 @dataclass(frozen=True)
 class StepResult:
-    """What followed n steps, in the log or in a twin."""
+    """Signals after n steps, in the log or in a twin."""
 
     observation: F32  # (n, D) at t + 1
     reward: F64  # (n,)
@@ -91,7 +91,7 @@ class StepResult:
 
 @dataclass(frozen=True)
 class OneStep:
-    """n steps of a log and of P twins."""
+    """n steps, as logged and as P twins drove them."""
 
     rows: Ints  # (n,) of the logged steps
     now: F32  # (n, D) the logged observation at t
@@ -111,7 +111,7 @@ def one_step(
     warehouse: Warehouse | None,
     config: GapConfig,
 ) -> OneStep:
-    """Compare `rows` (n,), which must be followed by a known step.
+    """Compare `rows` (n,), each of which must have a known next step.
 
     `warehouse` is the floor of the log; without one the floor is empty, and what the lidar sees is
     not compared.
@@ -167,7 +167,7 @@ def one_step(
 
 
 def _sensed(driven: OpenLoopResult, twin: int) -> Signals:
-    """Return what one twin senses at the end, by the names of the signals."""
+    """Return the signals that one twin senses at the end, by name."""
     sensed = {name: values[twin, :, -1] for name, values in driven.signals.items()}
     sensed["sector_clearance_m"] = driven.sector_clearance_m[twin]
     return sensed | {"bumped": driven.bumped[twin]}
@@ -189,7 +189,7 @@ def _localise(period_s: float, now: Signals, after: Signals, twin: Signals) -> N
 
 
 def agreement(steps: LoggedSteps, store: Store, rows: Ints, warehouse: Warehouse) -> float:
-    """How far what the lidar logged at `rows` (n,) is from what it sees on this floor, in [0, 1].
+    """Return how far the lidar at `rows` (n,) differs from what it would see on this floor, 0 to 1.
 
     The median over the rows of the mean difference of the observation's clearance entries, which
     run from 0 (touching) to 1 (nothing within range). Below `AGREES` the floor is the log's.
@@ -218,7 +218,7 @@ class PlanMemory:
     error_m: float  # of what remains, seen on the rebuilt plans from the logged poses, median
 
     def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> dict[str, F64]:
-        """Return the route's signals at t + 1 from other poses (n,), for `rows` (n,).
+        """Return the route's signals at t + 1 as seen from other poses (n,), for `rows` (n,).
 
         The logged ones, and what the rebuilt plan says of the difference between the two poses:
         where that is small, so is what was not rebuilt exactly.
@@ -229,7 +229,7 @@ class PlanMemory:
         return {name: after[name] + moved[name] - logged[name] for name in ROUTE}
 
     def progress_m(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> F64:
-        """How much shorter the plan in force at t would have become, had it ended at `pose`."""
+        """Return the progress along the plan of time t if the step had ended at `pose`."""
         plan = self.routing.plan[rows]
         now, after = rows_of(steps.now, rows), rows_of(steps.after, rows)
         moved = self.routing.progress_m(self.task, plan, now, pose)
@@ -244,7 +244,7 @@ class PlanMemory:
 
 
 def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
-    """Return the plans of all rows; none where the task has no route."""
+    """Rebuild the plans of all rows; None if the task has no route."""
     count = len(steps)
     if steps.task.goal != "route":
         nowhere = np.full(count, -1, np.int64)
@@ -265,7 +265,7 @@ def rebuild_plans(steps: LoggedSteps) -> PlanMemory:
 
 
 def _rebuild(steps: LoggedSteps, begin: int, end: int) -> F64:
-    """Return the polyline (P, 2) of rows [begin, end) that saw one plan."""
+    """Rebuild the polyline (P, 2) of rows [begin, end) that saw one plan."""
     rows = slice(begin, end)
     x, y = steps.now["pose_x_m"][rows], steps.now["pose_y_m"][rows]
     yaw, remaining = steps.now["pose_yaw_rad"][rows], steps.now["route_remaining_m"][rows]
@@ -308,7 +308,7 @@ def measure_gap(
     notes: tuple[str, ...] = (),
     on_progress: Callable[[str], None] | None = None,
 ) -> TwinGap:
-    """Measure the gap of the nominal twin, and of a calibrated one beside it.
+    """Measure the gap of the nominal twin and, if given, of a calibrated one.
 
     `warehouse` is the floor that the log may have been driven on (default: the twin's own); what
     the lidar sees is compared only where the two agree. `robot` is whose logs they are (default:
@@ -385,7 +385,7 @@ def _floor_difference(
 def _steps_to_compare(
     steps: LoggedSteps, most: int, rng: np.random.Generator
 ) -> tuple[Ints, dict[str, Bools]]:
-    """Rows, and condition -> which of them count for it: at most `most` each, drawn evenly."""
+    """Draw at most `most` rows of each condition; return rows, and which count for which."""
     masks = {}
     for name, holds in steps.conditions.items():
         mask, members = np.zeros(len(steps), np.bool_), np.flatnonzero(holds & steps.followed)
@@ -396,7 +396,7 @@ def _steps_to_compare(
 
 
 def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """Median and 90th percentile of every quantity, by condition, horizon and source."""
+    """Return the median and 90th percentile of each quantity, by condition, horizon and source."""
     for path in paths:
         for condition, mask in path.holds.items():
             for (source, quantity), values in path.gaps.items():
@@ -419,7 +419,7 @@ def _path_rows(paths: list[PathGap], rng: np.random.Generator) -> Iterator[dict[
 def _observation_rows(
     steps: LoggedSteps, stepped: OneStep, chosen: Mapping[str, Bools], rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """Mean absolute gap of every component that the twin could get wrong."""
+    """Return the mean absolute gap of each observation component that depends on the twin."""
     sources = {name: result.observation for name, result in stepped.twins.items()}
     sources |= {PERSISTENCE: stepped.now}
     # The action that was applied, and what the log's own navigation proposed.
@@ -489,7 +489,7 @@ def _mean(
 
 
 def _columns(name: str, interval: ConfidenceInterval) -> dict[str, float | None]:
-    """Return an interval as values of a row; NaN as None."""
+    """Return an interval as the values of a row, with None for NaN."""
     values = {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return {key: None if np.isnan(value) else value for key, value in values.items()}
 

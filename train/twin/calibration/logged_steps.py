@@ -1,4 +1,4 @@
-"""A store's steps for comparing them with the twin: each row, and the step that came after it.
+"""A store's steps for comparison with the twin: each row, and the step after it.
 
 The store is the interface: one row a step, sensed as training senses it, so what is compared with
 a twin (and a latency that is fitted) counts from the observation at a tick, as in training. A row
@@ -39,7 +39,7 @@ SIGNALS = tuple(column.name for column in SIGNAL_COLUMNS)
 
 @dataclass(frozen=True)
 class LoggedSteps:
-    """N rows of one task, by recording, episode and step."""
+    """N rows of one task, sorted by recording, episode and step."""
 
     task: Task
     now: Signals  # the stored signals at t, (N,) each
@@ -63,14 +63,14 @@ class LoggedSteps:
 
     @cached_property
     def followed(self) -> Bools:
-        """Whether the step at t + 1 is known, (N,)."""
+        """Return whether the step at t + 1 is known, (N,)."""
         followed = np.append(~self.begins[1:], False)
         followed[self.ending] = True
         return followed
 
     @cached_property
     def after(self) -> Signals:
-        """The signals at t + 1, (N,) each; of no meaning where not `followed`."""
+        """Return the signals at t + 1, (N,) each; meaningless if not `followed`."""
         after = {name: np.append(column[1:], column[:1]) for name, column in self.now.items()}
         for name, column in self.ends.items():
             after[name][self.ending] = column
@@ -78,12 +78,12 @@ class LoggedSteps:
 
     @cached_property
     def first(self) -> Ints:
-        """The row (N,) with which each row's stretch of consecutive steps begins."""
+        """Return the first row (N,) of each row's stretch of consecutive steps."""
         first: Ints = np.maximum.accumulate(np.where(self.begins, np.arange(len(self)), 0))
         return first
 
     def commands(self, rows: Ints, before: int, count: int) -> F64:
-        """Speeds (m/s) and yaw rates (rad/s) commanded from `before` steps before `rows` (n,) on.
+        """Return commands (m/s, rad/s) from `before` steps before `rows` (n,) on.
 
         (n, before + count, 2). Before a stretch begins: stop.
         """
@@ -99,7 +99,7 @@ def logged_steps(
     recordings: Sequence[str] = (),
     robot: Robot | None = None,
 ) -> LoggedSteps:
-    """Return the rows of a task of a store, of these recordings (all, if none is named).
+    """Read the rows of a task from these recordings of a store (all by default).
 
     `robot` is whose they are; None: that of the profile that the store keeps.
 
@@ -153,7 +153,7 @@ def logged_steps(
 
 
 def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) -> list[str]:
-    """Return the ids of the store's recordings of a task, or those of them that are wanted.
+    """Return the ids of a store's recordings of a task, or those among the requested ones.
 
     Raises:
         ConfigError: one that is wanted is not there.
@@ -177,7 +177,7 @@ def recordings_of(store: Store, wanted: Sequence[str], task_hash: str | None) ->
 
 
 def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32]:
-    """Observation and next observation of these rows, (n, D) each, in this order."""
+    """Return the observations and next observations of these rows, (n, D) each, in order."""
     wanted = pa.table({"transition_id": transition_id, "place": np.arange(len(transition_id))})
     with passed_in(store.connection, wanted=wanted):
         table = store.connection.sql(
@@ -189,7 +189,7 @@ def observations(store: Store, transition_id: Ints, size: int) -> tuple[F32, F32
 
 
 def sector_clearance(task: Task, observation: F32) -> F64:
-    """Return the sector clearances (n, sectors) in metres that an observation (n, D) was made of.
+    """Invert observations (n, D) to sector clearances (n, sectors) in metres.
 
     Those beyond the task's range read as its range: an observation does not tell them apart.
     """
@@ -225,7 +225,7 @@ def _conditions(held: Sequence[Sequence[str] | None]) -> dict[str, Bools]:
 def _ends(
     store: Store, recordings: Sequence[str], episode: Strings, step: Ints, last: Bools
 ) -> tuple[Ints, Signals]:
-    """Of the `last` rows (N,) of stretches those that an episode's end follows, and these ends."""
+    """Return which `last` rows (N,) of stretches an episode end follows, and those ends."""
     row_of = {(str(episode[row]), int(step[row])): row for row in np.flatnonzero(last).tolist()}
     rows, parts = [], []
     for recording, ends in store.episode_ends(recordings):
@@ -241,13 +241,13 @@ def _ends(
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any]:
-    """float32 as float64: what is computed from it is computed as ingest does."""
+    """Convert float32 to float64, so that results are computed as in ingest."""
     values: NDArray[Any] = column.combine_chunks().to_numpy(zero_copy_only=False)
     return values.astype(np.float64) if values.dtype == np.float32 else values.copy()
 
 
 def _text(column: pa.ChunkedArray) -> Strings:
-    """Text; empty where null."""
+    """Convert to text, with "" for null."""
     return np.asarray(column.fill_null("").to_numpy(zero_copy_only=False)).astype(np.str_)
 
 

@@ -1,4 +1,4 @@
-"""Open loop: logged commands driven again in the twin, without any other information from the log.
+"""Open loop: replay logged commands in the twin, without other information from the log.
 
 `drive_open_loop` puts robots into logged states and drives logged commands from there, one control
 period or many. `replay_segments` drives segments of a log with it: the W steps before a segment
@@ -54,7 +54,7 @@ LOGGED = ("stamp_ns", "pose_stamp_ns", *POSE, *MOTION, *COMMAND, "bumped", "clea
 
 @dataclass(frozen=True)
 class LoggedSegments:
-    """S segments of K steps as they were logged, with the W steps before each.
+    """S logged segments of K steps, with the W steps before each.
 
     `signals` are the stored signals by name, (S, K + 1): at the K ticks and at the end of the
     last. `left_out` counts the steps that begin no segment although they are of the store, by
@@ -83,11 +83,11 @@ class LoggedSegments:
 
     @property
     def pose(self) -> F64:
-        """Logged x, y and heading, (S, K + 1, 3)."""
+        """Return the logged x, y and heading, (S, K + 1, 3)."""
         return np.stack([self.signals[name] for name in POSE], axis=-1)
 
     def take(self, which: NDArray[Any]) -> LoggedSegments:
-        """Return the segments of an index or mask (S,), `left_out` as it was."""
+        """Return the segments at an index or mask (S,), with `left_out` unchanged."""
         arrays = {
             name: value[which]
             for name, value in vars(self).items()
@@ -180,7 +180,7 @@ def _evenly(stamp_ns: Ints, horizon: int, period_ns: int) -> NDArray[np.bool_]:
 
 
 def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
-    """Why no segment begins at these ticks (N,)."""
+    """Count the reasons why no segment begins at these ticks (N,)."""
     return Counter(
         {
             "ticks not a control period apart": int((~even).sum()),
@@ -190,7 +190,7 @@ def _passed_over(even: NDArray[np.bool_]) -> Counter[str]:
 
 
 def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str, int]]:
-    """Segments that ordinary driving explains, and how many were left out, by reason."""
+    """Return the segments that ordinary driving explains, and counts of the others by reason."""
     touched = segments.signals["bumped"].astype(bool).any(axis=1)
     near = ~touched & (segments.signals["clearance_m"] < TOUCHING_M).any(axis=1)
     # A label is about what the wheels did, also on a floor that is slippery all over.
@@ -212,7 +212,7 @@ def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str
 
 
 def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str, int]:
-    """From which stamp on each recording is held out, in ns.
+    """Return the stamp (ns) from which each recording is held out.
 
     Of four recordings or more, whole ones; else the last part of each.
     """
@@ -236,14 +236,14 @@ def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str
 def split_at(
     segments: LoggedSegments, stamps: Mapping[str, int]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which segments (S,) lie wholly before their recording's stamp, and which wholly after it."""
+    """Return which segments (S,) end before their recording's stamp, and which begin after it."""
     at = np.array([stamps[str(name)] for name in segments.recording_id], np.int64)
     ticks = segments.signals["stamp_ns"]
     return ticks[:, -1] <= at, ticks[:, 0] >= at
 
 
 def _fresh(steps: LoggedSteps, period_ns: int) -> NDArray[np.bool_]:
-    """Which rows' poses are as old as their recording's usually are."""
+    """Return which rows' poses are about as old as is usual in their recording."""
     age = steps.now["stamp_ns"] - steps.now["pose_stamp_ns"]
     fresh = np.zeros(len(age), np.bool_)
     for recording in np.unique(steps.recording_id):
@@ -278,7 +278,7 @@ SENSED = ("wheel_speed_mps", "wheel_yaw_rate_radps", "gyro_yaw_rate_radps", "acc
 
 @dataclass(frozen=True)
 class OpenLoopStart:
-    """The states in which S robots begin, and the commands that they are given from there.
+    """The initial states of S robots, and the commands that they are given from there.
 
     `motion` are the logged wheel speed and yaw rate, gyroscope, localised speed and lateral speed,
     (S,) each. Without `past` the base controllers begin as if always commanded what their wheels
@@ -299,7 +299,7 @@ class OpenLoopStart:
 
 @dataclass(frozen=True)
 class OpenLoopResult:
-    """What P twins did from S starts, without sensor noise: at the start and after each period."""
+    """The noise-free signals of P twins from S starts: at the start and after each period."""
 
     signals: dict[str, F64]  # of pose, wheels, gyroscope and accelerometer, (P, S, K + 1) each
     sliding_mps: F64  # (P, S, K + 1) of the faster sliding wheel over the floor, along the robot
@@ -309,7 +309,7 @@ class OpenLoopResult:
 
     @property
     def pose(self) -> F64:
-        """x, y and heading, (P, S, K + 1, 3)."""
+        """Return x, y and heading, (P, S, K + 1, 3)."""
         return np.stack([self.signals[name] for name in POSE], axis=-1)
 
 
@@ -398,7 +398,7 @@ def _place(
     *,
     endless: bool,
 ) -> F64:
-    """Put every robot where its log was, moving as it did; returns map less simulation (N, 2).
+    """Put every robot at its logged pose and motion; return map minus simulation (N, 2).
 
     On an `endless` floor robots start in its middle.
     """
@@ -440,7 +440,7 @@ def _place(
 
 
 def _recentre(simulation: Simulation) -> F64:
-    """Put robots near the wall of an empty floor back in its middle; returns how far (N, 2)."""
+    """Move robots near the wall of an empty floor to its middle; return how far (N, 2)."""
     from_middle = simulation.qpos[:, :2] - EMPTY_M / 2
     away = np.where(np.abs(from_middle) > EMPTY_M / 4, from_middle, 0.0)
     simulation.qpos[:, :2] -= away
@@ -448,7 +448,7 @@ def _recentre(simulation: Simulation) -> F64:
 
 
 def _sliding(simulation: Simulation, yaw_rad: F64) -> F64:
-    """How fast the rims on a side move over the floor, (N,) m/s, the larger of the two sides."""
+    """Return the sliding speed (N,) of the wheels' rims in m/s, the larger of both sides."""
     velocity = simulation.qvel
     forward = np.cos(yaw_rad) * velocity[:, 0] + np.sin(yaw_rad) * velocity[:, 1]
     turn = velocity[:, 5] * (simulation.robot.track_m / 2)
@@ -494,7 +494,7 @@ def replay_segments(
 
 
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
-    """Speeds from poses (..., W + K + 1, 3) a period apart, as ingest has them; (..., K + 1) each.
+    """Return speeds (..., K + 1) from poses (..., W + K + 1, 3), computed as in ingest.
 
     Without a warm-up no pose is before the first, and the wheels say its speed.
     """
@@ -507,7 +507,7 @@ def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
 
 
 def lay_onto(pose: F64, onto: F64) -> F64:
-    """Poses (..., S, K + 1, 3) moved as one so that each first is `onto` (S, 3)."""
+    """Move poses (..., S, K + 1, 3) rigidly so that each first pose is `onto` (S, 3)."""
     turn = onto[:, 2] - pose[..., 0, 2]
     cos, sin = np.cos(turn)[..., None], np.sin(turn)[..., None]
     x, y = pose[..., 0] - pose[..., :1, 0], pose[..., 1] - pose[..., :1, 1]

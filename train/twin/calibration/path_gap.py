@@ -1,4 +1,4 @@
-"""How far open-loop replays are from their log: pose and signals at the end of each horizon.
+"""The gap between open-loop replays and their log: pose and signals at each horizon's end.
 
 Beside the twins stand two yardsticks. `odometry` is the logged wheel odometry, dead-reckoned from
 the same first pose: a twin that is no better predicts no better than the wheels already tell.
@@ -43,7 +43,7 @@ _AT_ONCE = 4096  # segments replayed at a time: bounds memory
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What a log's sensors add, standard deviations."""
+    """Standard deviations of the noise that a log's sensors add."""
 
     position_m: float  # white, of each axis, as measured in the log
     heading_rad: float  # white, as measured in the log
@@ -97,7 +97,7 @@ def path_gap(
 def overlapping_segments(
     steps: LoggedSteps, horizon_s: float, config: GapConfig
 ) -> tuple[LoggedSegments, dict[str, Bools]]:
-    """Segments of `horizon_s` that overlap by half, and which (S,) count for each condition.
+    """Cut half-overlapping segments of `horizon_s`; also return which (S,) count per condition.
 
     A segment counts for every condition that holds at any of its steps; for `nominal` where none
     does. At most `max_segments` are drawn of each.
@@ -144,14 +144,14 @@ def measured_noise(steps: LoggedSteps, twin: Perturbation) -> SensorNoise:
 
 
 def _spread(values: F64) -> float:
-    """Return a standard deviation that a few outliers do not move."""
+    """Return a robust standard deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def _choose(
     steps: LoggedSteps, cut: LoggedSegments, most: int, rng: np.random.Generator
 ) -> dict[str, Bools]:
-    """At most `most` segments (S,) of each condition, drawn evenly."""
+    """Draw at most `most` segments (S,) of each condition."""
     rows = cut.row[:, None] + np.arange(cut.horizon_steps)
     chosen = {}
     for name, holds in steps.conditions.items():
@@ -170,7 +170,7 @@ def _gaps(
     rng: np.random.Generator,
     config: GapConfig,
 ) -> dict[tuple[str, str], F64]:
-    """(source, quantity) -> (S,) of these segments."""
+    """Return (source, quantity) -> gaps (S,) of these segments."""
     replayed = replay_segments(
         part, list(twins.values()), timestep_s=config.timestep_s, nthread=config.nthread
     )
@@ -207,7 +207,7 @@ def _gap(
 
 
 def _dead_reckon(part: LoggedSegments) -> F64:
-    """Poses (S, K + 1, 3) from the logged wheel odometry and the first logged pose."""
+    """Integrate the wheel odometry from the first logged pose: poses (S, K + 1, 3)."""
     period = part.task.control_period_s
     speed, rate = part.signals["wheel_speed_mps"], part.signals["wheel_yaw_rate_radps"]
     turn = (rate[:, 1:] + rate[:, :-1]) / 2 * period
@@ -226,7 +226,7 @@ def _dead_reckon(part: LoggedSegments) -> F64:
 def _pose_noise(
     shape: tuple[int, ...], noise: SensorNoise, period_s: float, rng: np.random.Generator
 ) -> F64:
-    """Localisation errors (S, K + 1, 3): white, and a drift that wanders."""
+    """Draw localisation errors (S, K + 1, 3): white noise and a wandering drift."""
     white = np.array([noise.position_m, noise.position_m, noise.heading_rad])
     error = rng.standard_normal(shape) * white
     keep = float(np.exp(-period_s / DRIFT_TIME_S))
@@ -246,7 +246,7 @@ def _sense(
     period_s: float,
     rng: np.random.Generator,
 ) -> dict[str, F64]:
-    """Return the signals that sensors would make of true ones."""
+    """Add sensor noise to true signals."""
     shape = path.shape[:2]
     wheels = rng.standard_normal((2, *shape)) * noise.encoder_radps
     speed, rate = robot.body_velocity(wheels[0], wheels[1])

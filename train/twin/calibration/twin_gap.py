@@ -1,4 +1,4 @@
-"""A gap: how it is measured, its rows, a verdict on each condition, and the folder of them.
+"""A measured gap: settings, rows, a verdict on each condition, and the folder it is kept in.
 
 The folder is `gap.json`, and the rows as Parquet for any tool that reads it.
 
@@ -56,7 +56,7 @@ TABLES: dict[str, pa.Schema] = {
 
 
 class TrustLimits(Checked, frozen=True):
-    """What a twin must keep to be trusted in a condition."""
+    """Limits that a twin must keep to be trusted in a condition."""
 
     horizon_s: Annotated[float, Meta(gt=0)] = 3.0
     position_m: Annotated[float, Meta(ge=0)] = 0.2  # nine in ten segments of that horizon end here
@@ -66,7 +66,7 @@ class TrustLimits(Checked, frozen=True):
 
 
 class GapConfig(Checked, frozen=True):
-    """How the gap is measured."""
+    """Settings of a gap measurement."""
 
     horizons_s: tuple[Annotated[float, Meta(gt=0)], ...] = (1.0, 3.0, 6.0)
     max_segments: Annotated[int, Meta(ge=1)] = 400  # a condition and horizon; steps: 5 times that
@@ -76,7 +76,7 @@ class GapConfig(Checked, frozen=True):
     nthread: Annotated[int, Meta(ge=1)] = 1
 
     def check(self) -> None:
-        """Raise ValueError where trust is judged at a horizon that is not driven."""
+        """Raise ValueError if trust is judged at a horizon that is not driven."""
         if self.limits.horizon_s not in self.horizons_s:
             raise ValueError(
                 f"the horizon of the verdict, {self.limits.horizon_s:g} s, is not driven: add it "
@@ -86,7 +86,7 @@ class GapConfig(Checked, frozen=True):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the twin can be trusted in one condition, and why."""
+    """A verdict on whether the twin can be trusted in one condition, and why."""
 
     condition: str
     verdict: str
@@ -149,7 +149,7 @@ def trust_verdict(
 
 @dataclass(frozen=True)
 class TwinGap:
-    """What was measured. Rows are plain values; statistics carry 95 % intervals over episodes."""
+    """A measured gap. Rows are plain values; statistics carry 95 % intervals over episodes."""
 
     about: dict[str, Any]  # store, version, task, twins, noise, counts
     paths: Rows  # condition, horizon_s, quantity, unit, source, segments, episodes, median, p90 …
@@ -160,11 +160,11 @@ class TwinGap:
 
     @property
     def untrusted(self) -> list[str]:
-        """The conditions in which the twin should not be trusted."""
+        """Return the conditions in which the twin should not be trusted."""
         return [item.condition for item in self.verdicts if item.verdict == UNTRUSTED]
 
     def document(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the gap as plain values for JSON."""
         return {
             "about": self.about,
             "untrusted": self.untrusted,
@@ -175,7 +175,7 @@ class TwinGap:
 
 
 def check_place(folder: Path) -> None:
-    """Raise RunError where `folder` is something else than a gap measured before."""
+    """Raise RunError if `folder` holds anything but an earlier gap."""
     if folder.exists() and not (folder.is_dir() and (folder / DOCUMENT).is_file()):
         if folder.is_dir() and not any(folder.iterdir()):
             return
@@ -183,7 +183,7 @@ def check_place(folder: Path) -> None:
 
 
 def write_gap(gap: TwinGap, folder: Path | str) -> None:
-    """Write a gap; one measured before is replaced.
+    """Write a gap, replacing an earlier one.
 
     Raises:
         RunError: there is something else at `folder`.
@@ -234,7 +234,7 @@ _INTERVALS = ("position_p90", "reward_ratio")
 
 
 def _verdict_document(verdict: Verdict) -> dict[str, Any]:
-    """As JSON has it: NaN, which it does not know, as null."""
+    """Return a verdict for JSON, with null for NaN."""
     values = asdict(verdict)
     for name in _INTERVALS:
         values[name] = {k: None if math.isnan(v) else v for k, v in values[name].items()}

@@ -1,1 +1,1 @@
-"""Who drives in the twin: planner, operator, random actions, and who takes over from whom."""
+"""The twin's drivers: planner, operator, random actions, and handover between them."""

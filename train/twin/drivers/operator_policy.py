@@ -1,4 +1,4 @@
-"""The operator: someone who stands by and sees pallets, people and wet floor as they are.
+"""The operator: a privileged driver that knows where pallets, people and wet floor are.
 
 At every step each action is simulated for the next 1.2 s: where the robot would be, how near to
 racks, pallets and people that comes (who are assumed to keep walking as they do), and how far
@@ -59,7 +59,7 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
 
 
 def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
-    """Clearance (n, A, T) to racks, walls and pallets, and to people where they will be.
+    """Return clearances (n, A, T) to racks, walls and pallets, and to people's future places.
 
     It is exact below `ROOMY_M`: what is farther away than that counts alike.
     """
@@ -107,18 +107,18 @@ def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
 
 
 def steps_of(env: WarehouseVectorEnv, seconds: float) -> int:
-    """So long in control periods: one or more."""
+    """Convert seconds to control periods, at least one."""
     return max(round(seconds / env.task.control_period_s), 1)
 
 
 def margins_of(env: WarehouseVectorEnv) -> tuple[float, float]:
-    """`TOUCH_M` and `ROOMY_M` of this robot."""
+    """Return `TOUCH_M` and `ROOMY_M` scaled to this robot."""
     smaller = min(env.task.body.width_m / WIDTH_M, 1.0)
     return TOUCH_M * smaller, ROOMY_M * smaller
 
 
 def outline_of(env: WarehouseVectorEnv, points: int) -> F64:
-    """Points on the body's outline, (K, 2), about its axle."""
+    """Return points on the body's outline, (K, 2), relative to its axle."""
     body = env.task.body
     return rectangle(body.length_m, body.width_m, env.simulation.robot.axle_x_m, points)
 
@@ -140,7 +140,7 @@ PAIR_S, FIRST_S, NEXT_S, BETTER_S = 1.6, 0.6, 0.4, 0.1
 
 
 def harsh_actions(table: F64) -> Bools:
-    """Which actions (A, 2), in m/s and rad/s, are none for slippery floor: the faster ones.
+    """Return which actions (A, 2), in m/s and rad/s, are too fast for slippery floor.
 
     The slowest ahead and the slowest turn of a fast robot are taken all the same: who drives no
     other would never come over it.
@@ -153,7 +153,7 @@ def harsh_actions(table: F64) -> Bools:
 
 
 class Operator(SoftPolicy, Stateful):
-    """Privileged: reads the simulation's state. Keeps a way of its own for each robot."""
+    """A privileged driver that reads the simulation's state and plans its own way per robot."""
 
     name = "operator"
     # 1 had no lattice, 2 backed off from who had just let it pass, 3 looked ahead and kept clear by
@@ -181,7 +181,7 @@ class Operator(SoftPolicy, Stateful):
         self._lattices: dict[int, tuple[int, StateLattice | None]] = {}  # by robot: of an episode
 
     def restored(self) -> None:
-        """Lattices follow from the episodes."""
+        """Drop the lattices after a state was restored: they follow from the episodes."""
         self._lattices = {}
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
@@ -306,7 +306,7 @@ class Operator(SoftPolicy, Stateful):
         return lattice
 
     def _note_stuck(self, env: WarehouseVectorEnv, pose: F64, ids: Ints) -> None:
-        """From now on a lattice guides robots (n,) where they are stuck."""
+        """Let a lattice guide robots (n,) from now on around where they are stuck."""
         for index in ids.tolist():
             lattice = self._lattice(env, index)
             if lattice is None or not lattice.window.covers(*pose[index, :2]):
@@ -315,11 +315,11 @@ class Operator(SoftPolicy, Stateful):
                 self._ways[index] = self._way(env, index, pose[index])
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """No mistakes right beside people."""
+        """Return where (N,) it does not explore: right beside people."""
         return _somebody_near(env, env.simulation.pose())
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
-        """Where (N,) pallets, people or slippery floor are still about."""
+        """Return where (N,) pallets, people or slippery floor are still near."""
         pose = env.simulation.pose()
         plans = env.navigation.plans_m
         view = view_route(plans, pose[:, 0], pose[:, 1], np.zeros(len(pose)), _LOOK_M)
@@ -334,13 +334,13 @@ class Operator(SoftPolicy, Stateful):
         return np.asarray(near | self._icy(env, pose), np.bool_)
 
     def _arrived(self, env: WarehouseVectorEnv, ids: Ints, ends: F64) -> Bools:
-        """From which step on (n, A, T) the robot has been at its goal."""
+        """Return from which step on (n, A, T) the robot has been at its goal."""
         gap = ends[..., :2] - env.navigation.goals_m[ids][:, None, None]
         at_goal = np.hypot(gap[..., 0], gap[..., 1]) < env.task.goal_radius_m - 0.05
         return np.asarray(np.logical_or.accumulate(at_goal, axis=2), np.bool_)
 
     def _standing(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
-        """Who has not moved for a second, and for a few steps after; not who waits for somebody."""
+        """Return who backs off, stuck for a second and not waiting for people, for a few steps."""
         near = _somebody_near(env, pose)
         let_pass = self._waiting & ~near
         self._waiting = near
@@ -385,7 +385,7 @@ class Operator(SoftPolicy, Stateful):
         return planner.plan(x, y, (goal_x, goal_y)) if way is None else way
 
     def _icy(self, env: WarehouseVectorEnv, pose: F64) -> Bools:
-        """Whether slippery floor lies under the robot or within .9 m of its middle, (N,)."""
+        """Return whether (N,) slippery floor is under the robot or within .9 m of its centre."""
         patches = env.simulation.patches
         gap = np.abs(pose[:, None, :2] - patches[:, :, :2]) - patches[:, :, 2:4]
         distance = np.hypot(np.maximum(gap[..., 0], 0), np.maximum(gap[..., 1], 0))
@@ -393,13 +393,13 @@ class Operator(SoftPolicy, Stateful):
 
 
 def _pallets(env: WarehouseVectorEnv, index: int) -> F64:
-    """Those (K, 3) on a robot's floor."""
+    """Return the pallets (K, 3) on a robot's floor."""
     pallets = env.simulation.pallets[index]
     return np.asarray(pallets[pallets[:, 0] > 0])
 
 
 def _somebody_near(env: WarehouseVectorEnv, pose: F64) -> Bools:
-    """Who (N,) has somebody's middle within `CAREFUL_M`."""
+    """Return which robots (N,) have a person or forklift centre within `CAREFUL_M`."""
     people = env.simulation.traffic.position_m - pose[:, None, :2]
     near = np.hypot(people[..., 0], people[..., 1]) < CAREFUL_M
     return np.asarray(near.any(axis=1), np.bool_)
@@ -417,7 +417,7 @@ def _moved(env: WarehouseVectorEnv) -> F64:
 
 
 def _motion(env: WarehouseVectorEnv) -> Motion | None:
-    """Return what a lattice must know of the robot; None of one that does not turn on the spot."""
+    """Return a robot's motion for a lattice; None if it does not turn on the spot."""
     table = np.asarray(env.task.actions, np.float64)
     turn = float(np.abs(table[table[:, 0] == 0.0, 1]).max(initial=0.0))
     ahead, back = float(table[:, 0].max()), float(-table[:, 0].min())

@@ -1,4 +1,4 @@
-"""Who drives: scripted behaviour policies, each with a name and a version that go into the log.
+"""Scripted behaviour policies, each with a name and a version that go into the log.
 
 A policy's `act(env, observation)` gives the actions (N,) and the probability (N,) that it gives
 to each: a small share of its actions is random, so that the log covers more than its habits.
@@ -25,17 +25,17 @@ MIN_STEPS_BETWEEN_HANDOVERS = 15
 
 
 class BehaviourPolicy(Policy, Protocol):
-    """A policy that says who chose each of its last actions."""
+    """A policy that reports who chose each of its last actions."""
 
     acting: NDArray[np.str_]  # (N,) names
     acting_version: NDArray[np.str_]  # (N,)
 
 
 class Overseer(BehaviourPolicy, Protocol):
-    """A policy that can be called in, and knows when it is no longer needed."""
+    """A policy that can take over, and knows when it is no longer needed."""
 
     def sees_trouble(self, env: WarehouseVectorEnv) -> Bools:
-        """Where (N,) it would not hand back yet."""
+        """Return where (N,) it would not hand back yet."""
         ...
 
 
@@ -52,15 +52,15 @@ class SoftPolicy:
         self.acting_version = np.array([], "U16")
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """Return the action (N,) it would take without exploration."""
+        """Return the actions (N,) it would take without exploration."""
         raise NotImplementedError
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Where (N,) it does not explore; nowhere, unless a policy says so."""
+        """Return where (N,) it does not explore: nowhere by default."""
         return np.zeros(env.num_envs, np.bool_)
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """Actions (N,) and the probabilities (N,) they had."""
+        """Return the actions of each robot's current driver, and their probabilities."""
         chosen = self.choose(env)
         count = len(env.task.actions)
         epsilon = np.where(self.certain(env), 0.0, self.epsilon)
@@ -73,7 +73,7 @@ class SoftPolicy:
 
 
 class RandomPolicy(SoftPolicy):
-    """Every action with the same probability."""
+    """A policy that takes every action with the same probability."""
 
     name = "random"
 
@@ -81,12 +81,12 @@ class RandomPolicy(SoftPolicy):
         super().__init__(epsilon=1.0, seed=seed)
 
     def choose(self, env: WarehouseVectorEnv) -> Ints:
-        """Nothing in particular."""
+        """Return action 0 everywhere; exploration makes the choice."""
         return np.zeros(env.num_envs, np.int64)
 
 
 class PlannerFollower(SoftPolicy):
-    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
+    """A driver that follows the plan, slows for turns and obstacles, and stops before them.
 
     It does what the navigation stack proposes (the signals `nav_*`) but for its random actions.
     """
@@ -103,7 +103,7 @@ class PlannerFollower(SoftPolicy):
         return self._follower(env).choose(env.signals)
 
     def certain(self, env: WarehouseVectorEnv) -> Bools:
-        """Its safety stop leaves nothing to chance, nor does it where anything is near."""
+        """Return where (N,) it does not explore: near anything, where it may have to stop."""
         return self._follower(env).near(env.signals)
 
     def _follower(self, env: WarehouseVectorEnv) -> PathFollower:
@@ -112,7 +112,7 @@ class PlannerFollower(SoftPolicy):
 
 @dataclass(frozen=True)
 class HandoverEvent:
-    """Control passed from one policy to another."""
+    """A change of control from one policy to another."""
 
     env: int
     episode_seed: int
@@ -122,7 +122,7 @@ class HandoverEvent:
 
 
 class Handover:
-    """The planner drives; the operator takes over in trouble and hands back when it is past.
+    """A pair of drivers: the operator takes over from the planner in trouble, then hands back.
 
     Trouble is what the robot itself notices: no way made for 3 s, the bumper, or wheels that
     disagree with the localisation. `events` keeps every handover, oldest first.
@@ -146,7 +146,7 @@ class Handover:
         self._anchor = np.zeros((count, 3))
 
     def act(self, env: WarehouseVectorEnv, observation: F32) -> tuple[Ints, F64]:
-        """Return the actions of whoever drives each robot, and their probabilities."""
+        """Return the actions of each robot's current driver, and their probabilities."""
         if len(self._by_operator) != env.num_envs:
             self._prepare(env.num_envs)
         self._watch(env)
@@ -162,7 +162,7 @@ class Handover:
         return action, probability
 
     def _watch(self, env: WarehouseVectorEnv) -> None:
-        """Decide whose turn it is, everywhere."""
+        """Decide for each robot who drives."""
         signals = env.signals
         begun = env.steps == 0
         self._by_operator[begun] = False

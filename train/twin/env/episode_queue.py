@@ -1,4 +1,4 @@
-"""Which episode each of N environments begins next, and on which floor.
+"""The queue of episodes: which one each of N environments begins next, and on which floor.
 
 Fixed episodes come in their order, then drawn ones. These may be of ordered missions (a kind, a
 floor and a zone), or of arms, the kinds of missions that practice chooses among: a kind of episode,
@@ -34,7 +34,7 @@ WAY_POINTS = 24  # along each leg of a plan at which zones are looked up
 
 @dataclass(frozen=True)
 class _Floor:
-    """A floor that an order can be driven on, and the zone there."""
+    """A floor that an order can be driven on, and the order's zone there."""
 
     place: int  # among the floors
     zone: str | None
@@ -138,7 +138,7 @@ class MissionOrders:
 
 
 def _zone_on(floor: Warehouse, zone: str) -> str | None:
-    """Return a zone's name on a floor; rows of other floors than the default say `FLOOR/ZONE`."""
+    """Return a floor's own name of a zone, also if it is given as `FLOOR/ZONE`; else None."""
     bare = zone.removeprefix(f"{floor.name}/")
     return bare if bare in floor.zones else None
 
@@ -155,7 +155,7 @@ _PROBES = 24  # seeds that show which blocks a floor has room for
 
 @dataclass(frozen=True)
 class MissionArm:
-    """A kind of missions; "" and () where the seed decides."""
+    """A group of missions that can be chosen; "" and () leave a choice to the seed."""
 
     name: str
     kind: str
@@ -166,7 +166,7 @@ class MissionArm:
     order: int = -1  # of the ordered missions
 
     def holds(self, kind: str, block: str, layout: str, values: Mapping[str, float]) -> bool:
-        """Whether an episode is of this arm; `values` are those of its perturbation."""
+        """Return whether an episode is of this arm; `values` are those of its perturbation."""
         return (
             self.order < 0
             and kind == self.kind
@@ -177,7 +177,7 @@ class MissionArm:
 
 
 class MissionArms:
-    """The arms of a twin's floors, shares of kinds, orders and schedule, split `by` what is asked.
+    """The arms of a twin: its floors, kinds, orders and schedule, split `by` what is requested.
 
     `by` holds "block", "layout" and fields of the schedule's ranges, each split in two halves.
 
@@ -316,7 +316,7 @@ def _by_range(arm: MissionArm, field: str, ends: tuple[float, float]) -> list[Mi
 
 
 def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
-    """Return an episode with what a schedule draws by its seed; as it is without a schedule."""
+    """Return an episode with a perturbation drawn by its seed; unchanged without a schedule."""
     if schedule is None:
         return spec
     rng = np.random.default_rng([spec.seed, 1])
@@ -324,7 +324,7 @@ def perturbed(spec: EpisodeSpec, schedule: Schedule | None) -> EpisodeSpec:
 
 
 def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
-    """Which floor an episode is on, among those named: by name, or by its seed.
+    """Return the index of an episode's floor: by its name, or drawn by its seed.
 
     Raises:
         ConfigError: there is no floor of that name.
@@ -344,7 +344,7 @@ def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
 
 
 class EpisodeQueue(Stateful):
-    """An environment's n-th drawn episode is the same whatever the others do.
+    """A queue whose n-th episode of an environment does not depend on the other environments.
 
     `conditions` are shares per kind of episode; a schedule draws each a perturbation. Where
     missions were ordered, a share of the drawn episodes is of those.
@@ -378,7 +378,7 @@ class EpisodeQueue(Stateful):
         self.set_conditions(conditions)
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
-        """Shares per kind of episode, for episodes that begin from now on."""
+        """Set the shares per kind of episode, for episodes that begin from now on."""
         shares = conditions.values() if isinstance(conditions, Mapping) else ()
         numbers = all(isinstance(share, int | float | np.number) for share in shares)
         if (
@@ -397,11 +397,11 @@ class EpisodeQueue(Stateful):
         self._cumulative = np.cumsum(parts) / sum(shares)
 
     def follow(self, orders: MissionOrders, share: float) -> None:
-        """From now on this share of the drawn episodes is of these orders, each at its part."""
+        """Draw this share of the episodes from these orders from now on, by the orders' shares."""
         self._orders, self._orders_share = orders, share
 
     def practise(self, shares: Sequence[float]) -> None:
-        """From now on the drawn episodes are of the last `arms`, in these shares.
+        """Draw episodes of the last `arms` from now on, in these shares.
 
         Raises:
             ConfigError: they are not one share an arm, numbers of at least 0 and not all 0.
@@ -463,11 +463,11 @@ class EpisodeQueue(Stateful):
         return perturbed(spec, self.schedule), -1, -1
 
     def floor_of(self, spec: EpisodeSpec) -> int:
-        """Which floor an episode is on. Raises ConfigError where there is none of its name."""
+        """Return the index of an episode's floor. Raises ConfigError for an unknown name."""
         return floor_place(spec, self._floors)
 
 
 def _drawn(cumulative: F64, draw: np.integer[Any]) -> int:
-    """Return the place among cumulative shares that 32 random bits fall into."""
+    """Return the index in cumulative shares that 32 random bits fall into."""
     place = int(np.searchsorted(cumulative, draw / 2**32, side="right"))
     return min(place, len(cumulative) - 1)  # their sum may fall short of 1 by rounding

@@ -1,4 +1,4 @@
-"""What a floor is and which episodes fit on it, before anything is trained there."""
+"""Checks of a floor before training: what it is and which episodes fit on it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
 
 
 def describe_floor(floor: Warehouse) -> dict[str, Any]:
-    """Plain values: sizes in metres, counts, unreachable goals, and the kinds of episodes that fit.
+    """Return sizes in metres, counts, unreachable goals, and the kinds of episodes that fit.
 
     A goal is unreachable where no robot gets there from the largest part of the floor, by its
     one-way rules. `hash` names the floor whatever it is called.
@@ -44,7 +44,7 @@ def describe_floor(floor: Warehouse) -> dict[str, Any]:
 
 
 def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
-    """Raise ConfigError for a kind of episode that is none, or that a floor has no room for."""
+    """Raise ConfigError for an unknown kind of episode, or one that does not fit on a floor."""
     kinds = tuple(kinds)
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise ConfigError(
@@ -64,7 +64,7 @@ def refuse_unfit(floors: Iterable[Warehouse], kinds: Iterable[str]) -> None:
 
 
 def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
-    """Raise ConfigError where a robot is wider than an aisle, with `AISLE_ROOM_M` to spare."""
+    """Raise ConfigError if a robot, with `AISLE_ROOM_M` to spare, is wider than an aisle."""
     for floor in floors:
         narrowest = min(floor.segments, key=lambda segment: segment.width_m, default=None)
         if narrowest is not None and body.width_m + AISLE_ROOM_M > narrowest.width_m:
@@ -78,12 +78,12 @@ def refuse_too_large(floors: Iterable[Warehouse], body: Body) -> None:
 
 
 def names_and_hashes(floors: Iterable[Warehouse]) -> list[list[str]]:
-    """Return what a saved state holds of the floors that it is of."""
+    """Return the names and hashes by which a saved state identifies its floors."""
     return [[floor.name, floor.hash] for floor in floors]
 
 
 def refuse_other_floors(saved: Sequence[Sequence[str]], floors: Iterable[Warehouse]) -> None:
-    """Raise RunError where a saved state, by its `names_and_hashes`, is not of these floors."""
+    """Raise RunError if a saved state's `names_and_hashes` are not those of these floors."""
     here = names_and_hashes(floors)
     if saved != here:
         changed = [floor[0] for floor in saved if floor not in here]
@@ -106,7 +106,7 @@ def unfit_kinds(floors: Iterable[Warehouse]) -> dict[str, list[str]]:
 
 
 def sealed(floors: Iterable[Warehouse]) -> list[str]:
-    """Return a line a floor that has goals which no robot reaches: its episodes never go there."""
+    """Return a line for each floor with unreachable goals, which its episodes never go to."""
     return [
         f"{floor.name}: {count} of {len(floor.goals)} goals cannot be reached from the others"
         for floor in floors
@@ -115,7 +115,7 @@ def sealed(floors: Iterable[Warehouse]) -> list[str]:
 
 
 def unreachable_goals(floor: Warehouse) -> int:
-    """How many goals a robot cannot reach from the part with the most of them, and come back."""
+    """Count goals that a robot cannot reach, and return from, from the part with most of them."""
     planner = Planner(floor)
     cells = np.array([planner.cell(x, y) for x, y in floor.goals])
     return len(cells) - int(np.bincount(planner.parts()[cells]).max())

@@ -1,4 +1,4 @@
-"""What an environment and a policy know of each other, and how a policy explores.
+"""The interface between environments and policies, and exploration.
 
 `Twin` is what training and evaluation need of an environment, `Policy` is what drives in one:
 a trained network, an ONNX file, a script, one of your own.
@@ -34,7 +34,7 @@ Step = tuple[F32, F32, Bools, Bools, Info]
 
 
 class Twin(Protocol):
-    """What training and evaluation need of a vectorised environment (`WarehouseVectorEnv`)."""
+    """The vectorised environment that training and evaluation need (`WarehouseVectorEnv`)."""
 
     num_envs: int
 
@@ -60,31 +60,31 @@ class ArmedTwin(Protocol):
 
 @runtime_checkable
 class KindsTwin(Protocol):
-    """A twin that takes shares per kind of episode alone."""
+    """A twin that takes only shares per kind of episode."""
 
     def set_conditions(self, conditions: Mapping[str, float], /) -> None: ...
 
 
 class Policy(Protocol):
-    """What drives in a twin. Its name and version tag what it did in the logs."""
+    """A driver in a twin. Its name and version tag its actions in the logs."""
 
     name: str
     version: str
 
     def act(self, env: Any, observation: F32) -> tuple[Ints, NDArray[Any]]:
-        """Actions (N,) for observations (N, D), and the probabilities (N,) they had."""
+        """Return actions (N,) for observations (N, D), and the probabilities (N,) they had."""
         ...
 
 
 class LinearEpsilon(Checked, frozen=True):
-    """The probability of a uniformly random action: from `start` to `end` over `steps`."""
+    """A probability of random actions that goes linearly from `start` to `end` over `steps`."""
 
     start: Probability | None = None  # None: 1 without logs, AFTER_LOGS with them
     end: Probability = 0.05
     steps: Annotated[int, Meta(ge=1)] = 20_000  # environment steps, counted from the first
 
     def at(self, env_steps: int) -> float:
-        """Epsilon after `env_steps` environment steps."""
+        """Return epsilon after `env_steps` environment steps."""
         start = 1.0 if self.start is None else self.start
         return start + min(env_steps / self.steps, 1.0) * (self.end - start)
 
@@ -92,7 +92,7 @@ class LinearEpsilon(Checked, frozen=True):
 def epsilon_greedy(
     greedy: NDArray[Any], actions: int, epsilon: float, rng: np.random.Generator
 ) -> tuple[Ints, F32]:
-    """Greedy actions (N,) to the actions to take (N,) and the probability of each (N,)."""
+    """Explore: return actions (N,) drawn around greedy ones (N,), with their probabilities (N,)."""
     explores = rng.random(len(greedy)) < epsilon
     uniform = rng.integers(actions, size=len(greedy))
     action = np.where(explores, uniform, greedy).astype(np.int64)
@@ -101,22 +101,22 @@ def epsilon_greedy(
 
 
 class MadeAgain:
-    """Pickled and copied by what it was made of, as Gymnasium's EzPickle: a fresh one comes back.
+    """An object pickled by its constructor's arguments, as Gymnasium's EzPickle does.
 
-    It has the same settings and stands before its first reset; where the other stood is not copied.
+    The copy has the same settings and is not reset yet; the state of the original is not copied.
     """
 
     spec: Any  # of Gymnasium, where `gymnasium.make` made it
     _made_of: tuple[tuple[Any, ...], dict[str, Any]]
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
-        """Keep what it is made of."""
+        """Keep the constructor's arguments."""
         made = super().__new__(cls)
         made._made_of = given, named
         return made
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """As pickle and copy ask."""
+        """Return the class and its arguments for pickle and copy."""
         return _make_again, (type(self), *self._made_of), {"spec": self.spec}
 
 
@@ -127,7 +127,7 @@ def _make_again(kind: type[Any], given: tuple[Any, ...], named: dict[str, Any]) 
 def refuse_other_type(
     name: str, given: object, kind: type | tuple[type, ...], such_as: str
 ) -> None:
-    """Raise ConfigError for an environment's argument that is neither None nor of its type."""
+    """Raise ConfigError if an environment's argument is neither None nor of its type."""
     if given is not None and not isinstance(given, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Navigation of N robots: whose plan is in force, when it is made again, and how it is followed.
+"""Navigation of N robots: their plans, when these are made again, and how they are followed.
 
 A plan is made again when the robot strays from it, or when its lidar shows an aisle to be wholly
 blocked, which is remembered for the rest of the episode.
@@ -35,7 +35,7 @@ from restock.train.twin.physics.sensing import Sensing, add_route
 
 @dataclass
 class BlockFinder(Stateful):
-    """Finds wholly blocked aisles from the lidar, over time. State for N robots.
+    """A detector of wholly blocked aisles, from lidar scans over time. State for N robots.
 
     Within the aisle segment ahead, lidar returns that are neither rack nor wall are gathered up
     to `reach_m` away. If no free gap across the aisle is as wide as `passable_m`, and that is so
@@ -195,7 +195,7 @@ class Navigation(Stateful):
         return add_route(self.task, signals, self.plans_m[ids], self.goals_m[ids])
 
     def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> None:
-        """Look at the new signals, and show the new plan of those whose plan is made again.
+        """Read the new signals, and replan where it is due; the new plan goes into the signals.
 
         It counts from this step on: a new plan never makes progress jump.
         """
@@ -217,7 +217,7 @@ class Navigation(Stateful):
                 signals[name][ids] = column
 
     def propose(self, signals: Signals) -> None:
-        """Add what it would do next, whoever drives: by the plan in force and this step's scan."""
+        """Add navigation's next command to the signals, by the current plan and scan."""
         if self._follower is not None:
             command = self._follower.table[self._follower.choose(signals)]
             signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = command.T.copy()
@@ -226,7 +226,7 @@ class Navigation(Stateful):
             signals["nav_speed_mps"], signals["nav_yaw_rate_radps"] = unknown, unknown.copy()
 
     def _find_blocks(self, signals: Signals, sensing: Sensing) -> set[int]:
-        """Look for blocked aisles where something is near ahead; returns whose map changed."""
+        """Look for blocked aisles if something is near ahead; return whose map changed."""
         yaw = signals["pose_yaw_rad"]
         toward_x = (
             np.cos(yaw) * signals["waypoint_near_x_m"] - np.sin(yaw) * signals["waypoint_near_y_m"]
@@ -269,7 +269,7 @@ class Navigation(Stateful):
 
 
 class PathFollower:
-    """Follows the plan, slows for turns and obstacles, stops when something is close ahead.
+    """A driver that follows the plan, slows for turns and obstacles, and stops before them.
 
     It sees what the robot sees: waypoints and lidar clearances. It never leaves its plan, so a
     pallet that blocks part of the aisle stops it for good. A robot without a lidar follows the plan
@@ -301,7 +301,7 @@ class PathFollower:
         self._back = np.array([0, self._index(-0.4, 0.6), self._index(-0.4, -0.6)])
 
     def choose(self, signals: Signals) -> Ints:
-        """Return the action (N,) whose velocity is nearest to what the plan asks for."""
+        """Return the actions (N,) whose velocity is nearest to what the plan requires."""
         near = np.arctan2(signals["waypoint_near_y_m"], signals["waypoint_near_x_m"])
         far = np.arctan2(signals["waypoint_far_y_m"], signals["waypoint_far_x_m"])
         front, bend = self.front(signals), np.abs(near)
@@ -343,17 +343,17 @@ class PathFollower:
         return nearest
 
     def near(self, signals: Signals) -> Bools:
-        """Where (N,) anything is near."""
+        """Return where (N,) anything is near."""
         return np.asarray(
             (signals["clearance_m"] < self.stop_m) | (self.front(signals) < 2 * self.stop_m)
         )
 
     def _index(self, speed_mps: float, yaw_rate_radps: float) -> int:
-        """Return the action nearest to a velocity of the stand-in's, at this robot's pace."""
+        """Return the action nearest to the stand-in's velocity, scaled to this robot's pace."""
         wanted = self._pace * (speed_mps, yaw_rate_radps)
         return int(np.abs(self.table - wanted).sum(axis=1).argmin())
 
 
 def _corner_m(body: Body) -> float:
-    """How far an outline's corners stand out beyond its nearer sides, for who turns on the spot."""
+    """Return how far the corners stand out beyond the nearer sides, if it turns on the spot."""
     return math.hypot(body.length_m, body.width_m) / 2 - min(body.length_m, body.width_m) / 2

@@ -53,7 +53,7 @@ FLOOR_PIXELS_PER_M, MAP_PIXELS_PER_M = 24, 40
 
 
 def draw_floor(floor: Warehouse) -> NDArray[np.uint8]:
-    """Racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, a wall around."""
+    """Draw racks, aisles, docks, goals and one-way rules, (H, W, 3) uint8, north up, with walls."""
     canvas = _Canvas(floor, FLOOR_PIXELS_PER_M)
     for color, areas in (
         (AISLE, [segment.area for segment in floor.segments]),
@@ -69,7 +69,7 @@ def draw_floor(floor: Warehouse) -> NDArray[np.uint8]:
 
 
 def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
-    """One environment now, (H, W, 3) uint8, north up."""
+    """Draw one environment as it is now, (H, W, 3) uint8, north up."""
     floor = env.floor_of(index)
     canvas = _Canvas(floor, MAP_PIXELS_PER_M)
     sim = env.simulation
@@ -99,7 +99,7 @@ def draw_map(env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
 
 
 class _Canvas:
-    """A floor's pixels, rows from the south."""
+    """The pixels of a floor, with rows from the south."""
 
     def __init__(self, floor: Warehouse, pixels_per_m: int) -> None:
         height, width = round(floor.depth_m * pixels_per_m), round(floor.width_m * pixels_per_m)
@@ -140,7 +140,7 @@ class _Canvas:
         return (rows, columns), self._x[None, columns] - x, self._y[rows, None] - y
 
     def pixels(self, wall: int = 0) -> NDArray[np.uint8]:
-        """(H, W, 3), the first row in the north, with so many pixels of wall around."""
+        """Return the pixels (H, W, 3), north first, with this many pixels of wall around."""
         height, width, _ = self._image.shape
         framed = np.empty((height + 2 * wall, width + 2 * wall, 3), np.uint8)
         framed[:] = MAP_WALL
@@ -149,13 +149,13 @@ class _Canvas:
 
 
 def _dense(plan_m: F64) -> F64:
-    """Return a polyline with three points more in every segment."""
+    """Return a polyline with three more points in every segment."""
     share = np.arange(4)[None, :, None] / 4
     return (plan_m[:-1, None] * (1 - share) + plan_m[1:, None] * share).reshape(-1, 2)
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write pixels (H, W, 3). Raises ConfigError where they cannot be written."""
+    """Write pixels (H, W, 3). Raises ConfigError if they cannot be written."""
     height, width = image.shape[:2]
     rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)
 
@@ -229,7 +229,7 @@ STAGE = """
 
 
 class Renderer:
-    """Frames of environments: by a camera, which is made when first needed, or as drawn maps.
+    """A source of frames: drawn maps, or those of a camera that is made on first use.
 
     Raises:
         ConfigError: an unknown camera.
@@ -246,21 +246,21 @@ class Renderer:
         self._camera: Camera | None = None
 
     def frames(self, env: WarehouseVectorEnv) -> tuple[NDArray[np.uint8], ...]:
-        """One of each environment now, (H, W, 3) uint8."""
+        """Return a frame of each environment as it is now, (H, W, 3) uint8."""
         if self._view is not None and self._camera is None:
             self._camera = Camera(self._view)
         frame = draw_map if self._camera is None else self._camera.frame
         return tuple(frame(env, index) for index in range(env.num_envs))
 
     def close(self) -> None:
-        """Give the camera's context back."""
+        """Release the camera's GL context."""
         if self._camera is not None:
             self._camera.close()
             self._camera = None
 
 
 class Camera:
-    """One camera and the GL context behind it; frames of any floor and environment.
+    """A camera and its GL context, which renders any floor and environment.
 
     Raises:
         ConfigError: EGL is unavailable.
@@ -274,7 +274,7 @@ class Camera:
         self._renderer: Any = None
 
     def frame(self, env: WarehouseVectorEnv, index: int) -> NDArray[np.uint8]:
-        """Return what it sees of one environment now, (H, W, 3) uint8."""
+        """Return the camera's picture of one environment now, (H, W, 3) uint8."""
         self._context.make_current()
         floor = env.floor_of(index)
         if floor is not self._floor:
@@ -306,7 +306,7 @@ class Camera:
         return np.ascontiguousarray(pixels[::-1])
 
     def close(self) -> None:
-        """Give the context back."""
+        """Release the GL context."""
         if self._floor is not None:
             self._context.make_current()
             self._renderer.free()
@@ -368,7 +368,7 @@ def _egl_context(width: int, height: int) -> Any:
 
 
 def _parts(env: WarehouseVectorEnv, index: int, floor: Warehouse) -> Iterator[Part]:
-    """Everything on the floor as parts; what is seen through comes last."""
+    """Yield everything on the floor as parts, transparent ones last."""
     sim = env.simulation
     x, y, yaw = sim.pose()[index]
     yield from _robot(x, y, yaw, sim.robot, sim.lidar_x_m)
@@ -395,7 +395,7 @@ def _parts(env: WarehouseVectorEnv, index: int, floor: Warehouse) -> Iterator[Pa
 
 
 def _frame(x: float, y: float, yaw: float) -> Callable[[float, float, float], Place]:
-    """Places ahead, left and up of a body to places on the floor."""
+    """Convert places ahead, left and up of a body to places on the floor."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     return lambda ahead, left, up: (x + cos * ahead - sin * left, y + sin * ahead + cos * left, up)
 

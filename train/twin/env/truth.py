@@ -1,4 +1,4 @@
-"""The true conditions of every step, from simulator truth: kept apart from labels, to score them.
+"""The true conditions of every step, from the simulator: kept apart from labels to score them.
 
 A step's conditions are what was physically so over [t, t + 1), by the contract's names:
 
@@ -70,7 +70,7 @@ EXPOSURES = ("closing_traffic", "plan_blocked", "slippery_floor")
 
 
 def _texts(names: tuple[str, ...]) -> NDArray[np.str_]:
-    """Return the text of every set of names: bit i of its place is names[i]."""
+    """Return the text of every set of names: bit i of a set's index is names[i]."""
     sets = range(1 << len(names))
     return np.array([truth_text(n for bit, n in enumerate(names) if s >> bit & 1) for s in sets])
 
@@ -85,7 +85,7 @@ MARGIN = 0.4  # of the body's width: how far beside the plan a pallet is still i
 
 
 class Truth(Stateful):
-    """Keeps what the true condition needs to remember, for N environments."""
+    """State that true conditions depend on, for N environments."""
 
     STATE = ("aftermath_s", "blocked", "traffic_gap_m", "exposed")
 
@@ -105,7 +105,7 @@ class Truth(Stateful):
         self.exposed[ids] = False
 
     def note_situation(self, simulation: Simulation, plans_m: F64) -> None:
-        """Note what everyone is exposed to, at the start of a step."""
+        """Note what every robot is exposed to at the start of a step."""
         pose, pallets = simulation.pose(), simulation.pallets
         ahead = np.zeros((len(pose), len(VIEW_M)), np.bool_)
         gap = np.abs(pallets[:, :, :2] - pose[:, None, :2]).max(axis=-1).min(axis=1)
@@ -125,13 +125,13 @@ class Truth(Stateful):
         self.traffic_gap_m = gaps_m
 
     def exposure(self) -> NDArray[np.str_]:
-        """All exposures (N,) of the step under way, as one text each."""
+        """Return all exposures (N,) of the current step, as one text each."""
         which = (self.exposed << np.arange(len(EXPOSURES))).sum(axis=1)
         texts: NDArray[np.str_] = _EXPOSED[which]
         return texts
 
     def condition(self, slipped: Bools, bumped: Bools, clearance_m: F64) -> NDArray[np.str_]:
-        """All conditions (N,) of the step that ends now, as one text each."""
+        """Return all conditions (N,) of the step that ends now, as one text each."""
         near = bumped | (clearance_m < self._near_m)
         now = Situation(self.blocked, near, slipped, clearance_m, self.traffic_gap_m)
         missions = [is_true(now) for is_true in SCORED.values()]
@@ -145,7 +145,7 @@ class Truth(Stateful):
 
 
 def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
-    """Whether a pallet lies within the robot's breadth of the plan at VIEW_M, (n, VIEW_M)."""
+    """Return whether a pallet is within the robot's breadth of the plan at VIEW_M, (n, VIEW_M)."""
     view = view_route(plans_m, pose[:, 0], pose[:, 1], np.zeros(len(pose)), VIEW_M)
     points = view.look_ahead_m + pose[:, None, :2]  # heading 0: offsets in the map frame
     gap = np.abs(points[:, :, None] - pallets[:, None, :, :2])
@@ -154,7 +154,7 @@ def _blocked(pose: F64, plans_m: F64, pallets: F64, margin_m: float) -> Bools:
 
 
 def info_now(env: WarehouseVectorEnv) -> Info:
-    """Return what runs in each environment, and the signals that are there."""
+    """Return the episodes now running and the current signals."""
     return {
         "signals": {name: column.copy() for name, column in env.signals.items()},
         "episode_condition": env.episode_condition.copy(),
@@ -179,7 +179,7 @@ def info_after(
     condition: NDArray[np.str_],
     ended: Bools,
 ) -> Info:
-    """Of a step that led to the signals `after`; `condition` (N,) is what was so over it."""
+    """Return the info of a step that led to the signals `after` under true `condition` (N,)."""
     sim = env.simulation
     return info_now(env) | {
         "signals": after,

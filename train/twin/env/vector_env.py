@@ -67,7 +67,7 @@ Chosen = tuple[Ints, F64, dict[str, NDArray[Any]]]
 
 
 class DiscreteActions:
-    """`actions` (N,) index the task's actions."""
+    """An action space of indices (N,) into the task's actions."""
 
     def __init__(self, task: Task, num_envs: int) -> None:
         self._num_envs = num_envs
@@ -75,7 +75,7 @@ class DiscreteActions:
         self.space = gymnasium.spaces.Discrete(len(task.actions))
 
     def read(self, actions: NDArray[Any]) -> Chosen:
-        """Read what these actions (N,) are. Raises ConfigError for one that is not in the table."""
+        """Convert action indices (N,). Raises ConfigError for one outside the table."""
         given = _shaped(actions, (self._num_envs,))
         with np.errstate(invalid="ignore"):
             action = given.astype(np.int64)
@@ -91,7 +91,7 @@ class DiscreteActions:
 
 
 class ContinuousActions:
-    """`actions` (N, 2): forward speed in m/s and yaw rate in rad/s, clipped to the space.
+    """An action space of speeds in m/s and yaw rates in rad/s, (N, 2), clipped to its range.
 
     The space is what the table's actions span. `info["action"]` (N,) is the nearest of them, and
     `info["action_residual"]` (N,) how far away it was, as the store's column of that name.
@@ -103,7 +103,7 @@ class ContinuousActions:
         self.space = gymnasium.spaces.Box(table.min(axis=0), table.max(axis=0), dtype=np.float32)
 
     def read(self, actions: NDArray[Any]) -> Chosen:
-        """As for discrete ones. Raises ConfigError for an action that is not finite."""
+        """Convert commands (N, 2). Raises ConfigError for one that is not finite."""
         requested = _shaped(actions, (self._num_envs, 2)).astype(np.float64)
         if not np.isfinite(requested).all():
             row = int(np.flatnonzero(~np.isfinite(requested).all(axis=1))[0])
@@ -118,7 +118,7 @@ class ContinuousActions:
 
 
 def _shaped(actions: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Numbers in this shape. Raises ConfigError for another number of them, or none at all."""
+    """Return numbers in this shape. Raises ConfigError for any other actions."""
     given = np.asarray(actions)
     if given.size != np.prod(shape) or given.dtype.kind not in "biuf":
         raise ConfigError(
@@ -300,7 +300,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
 
     @property
     def warehouse(self) -> Warehouse:
-        """The floor, where there is one; the first of several."""
+        """Return the floor, or the first of several."""
         return self.floors[0]
 
     def floor_of(self, env: int) -> Warehouse:
@@ -310,7 +310,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     # -- episodes -------------------------------------------------------------------------------
 
     def set_conditions(self, conditions: Mapping[str, float]) -> None:
-        """Shares per kind of episode, for episodes that begin from now on."""
+        """Set the shares per kind of episode, for episodes that begin from now on."""
         self.queue.set_conditions(conditions)
 
     def mission_arms(self, by: Sequence[str]) -> list[MissionArm]:
@@ -324,7 +324,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.queue.arms(by, self.navigation.planners)
 
     def set_mission_shares(self, shares: Sequence[float]) -> None:
-        """Shares of the last `mission_arms`, for episodes that begin from now on.
+        """Set the shares of the last `mission_arms`, for episodes that begin from now on.
 
         Raises:
             ConfigError: they are not one share an arm.
@@ -387,7 +387,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[F32, Info]:
-        """Begin an episode everywhere, or where `options["reset_mask"]` (N,) says."""
+        """Begin an episode everywhere, or only in `options["reset_mask"]` (N,)."""
         super().reset(seed=seed)
         ids = np.arange(self.num_envs)
         mask = (options or {}).get("reset_mask")
@@ -409,7 +409,7 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
         return self.observation.copy(), info_now(self)
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """One control period everywhere. `actions` (N,) index the task's actions, or are (N, 2)."""
+        """Step one control period. `actions` (N,) index the task's actions, or are (N, 2)."""
         if not self.signals:
             raise gymnasium.error.ResetNeeded("call env.reset() before env.step()")
         now, sim, task = self.signals, self.simulation, self.task
@@ -478,12 +478,12 @@ class WarehouseVectorEnv(VectorEnv[F32, NDArray[Any], NDArray[Any]], Stateful, M
     # -- state ----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a bit-exact continuation needs, and what it must be continued on."""
+        """Return all that a bit-exact continuation needs, and what it must be continued on."""
         floors = names_and_hashes(self.floors)
         return {"task_hash": self.task.hash, "floors": floors, **super().state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state of an environment that was made with the same arguments.
+        """Continue from the state of an environment with the same arguments.
 
         Raises:
             RunError: it was of another number of environments, another task, or other floors, or is
@@ -542,7 +542,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
         return observation[0], _first(info)
 
     def step(self, action: Any) -> tuple[F32, float, bool, bool, dict[str, Any]]:
-        """One control period. `info["signals_before"]` are the signals that `action` answered."""
+        """Step one control period. `info["signals_before"]` is what `action` was chosen by."""
         before = self.vector.signals
         observation, reward, terminated, truncated, info = self.vector.step(np.array([action]))
         info["signals_before"] = before
@@ -557,7 +557,7 @@ class WarehouseEnv(gymnasium.Env[F32, Any], MadeAgain):
         return frames[0] if frames else None
 
     def close(self) -> None:
-        """Release what `render` holds."""
+        """Release the resources of `render`."""
         self.vector.close()
 
 
