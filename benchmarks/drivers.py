@@ -128,7 +128,7 @@ def drive(
     perturbation: Perturbation | None = None,
     driven: Driven | None = None,
 ) -> list[EpisodeResult]:
-    """How each of these episodes went, with the twin's own robot or the one that is driven."""
+    """Drive each of these episodes with the twin's own robot or the given one."""
     count = min(len(specs), 64)
     own = {} if driven is None else {"task": driven.task, "robot": driven.robot}
     env = WarehouseVectorEnv(count, nthread=0, perturbation=perturbation, **own)
@@ -142,7 +142,7 @@ def drive(
 
 
 def cells(results: Sequence[EpisodeResult]) -> dict[str, list[EpisodeResult]]:
-    """By condition and kind of block."""
+    """Group results by condition and kind of block."""
     by_cell: dict[str, list[EpisodeResult]] = {}
     for one in results:
         name = one.condition if one.block == "none" else f"{one.condition} {one.block}"

@@ -187,7 +187,7 @@ def _make_stores(store: Path, logs: Logs, hours: int, workers: int, small: bool)
 
 
 def _make_store(store: Path, requested: list[tuple[Path, list[str], str]], workers: int) -> None:
-    """Of recordings: their paths, flags and conditions."""
+    """Make a store of recordings, given their paths, flags and conditions."""
 
     def make() -> None:
         with ThreadPoolExecutor(workers) as pool:

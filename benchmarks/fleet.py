@@ -94,7 +94,10 @@ def drives() -> Iterator[FleetDrive]:
 
 
 def power(store: Store, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """How often wear is found in week four, by wear and drives a week, from robots without any."""
+    """Measure how often wear is found in week four, by wear and drives a week.
+
+    The drives are those of robots without wear.
+    """
     drawn = store.sql(
         "SELECT robot, recording_id, list(value) AS episodes FROM episode_signals"
         f" WHERE signal = 'odometry_scale' AND robot <> '{WORN}' GROUP BY ALL ORDER BY ALL"

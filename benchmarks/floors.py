@@ -49,7 +49,7 @@ def drive(made: Surveyed, missions: int) -> Counter[str]:
 
 
 def measure(path: Path, missions: int) -> dict[str, Any]:
-    """One recording's floor: plain values."""
+    """Measure the floor of one recording, as plain values."""
     try:
         made = survey(path)
         ends = drive(made, missions)

@@ -95,7 +95,7 @@ def ahead(env: WarehouseVectorEnv, kind: str) -> bool:
 
 
 def shelves() -> Image.Image:
-    """Shares of each condition in the sample logs, and in a batch."""
+    """Draw the share of each condition in the sample logs and in a batch."""
     with tempfile.TemporaryDirectory() as folder:
         store = f"{folder}/store"
         run_restock(["ingest", str(REPOSITORY / "sample_logs"), "--store", store])

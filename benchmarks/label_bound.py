@@ -59,7 +59,7 @@ def bounds(
 
 
 def logs_of(store: Path) -> Iterator[Log]:
-    """Of each recording every step's signals, in order."""
+    """Yield the signals of each recording's steps, in order."""
     task = load_profile("warehouse_amr").task
     writer = StoreWriter(store)
     for row in writer.live().to_pylist():

@@ -114,7 +114,7 @@ def stored(cache: Path, floors: str, seeds: Sequence[int], minutes: float) -> Pa
 
 
 def table(found: Sequence[LabelQuality], bound: Mapping[str, LabelScore]) -> str:
-    """As the docs have it."""
+    """Return the table as the docs have it."""
     header = ["condition", "true steps", "precision", "recall", "true events", "event precision",
               "event recall", "uncertain", "bound: steps", "bound: events"]  # fmt: skip
     rows = []

@@ -127,7 +127,7 @@ def _train(plan: StudyPlan, job: StudyJob, panel: Path) -> None:
 
 
 def _restock(arguments: Sequence[str], plan: StudyPlan, job: StudyJob) -> float:
-    """One verb in a process of its own, its words in a log; its CPU seconds."""
+    """Run one verb in a process of its own, logging its output; return its CPU seconds."""
     print(f"{job.path.name}: {arguments[0]}", file=sys.stderr, flush=True)
     log = plan.out / "logs" / f"{job.path.name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)

@@ -124,7 +124,7 @@ def names_action(found: Diagnosis) -> bool:
 
 
 def run_for(fault: str, seed: int, out: Path) -> Run:
-    """One run with the fault, trained where it is missing."""
+    """Return a run with the fault; train it if it is missing."""
     panel = panel_for(fault if fault.startswith(LOGGED) else "healthy", out)
     settings = [f"{key}={value}" for key, value in SETTINGS.items()] + FAULTS[fault][1]
     path = out / "runs" / f"{fault.replace(' ', '_')}-{seed}"

@@ -83,7 +83,7 @@ def scale(*names: str, by: float, share: float = 1.0) -> Signalled:
 
 
 def in_recordings(share: float, plant: Signalled) -> Signalled:
-    """In a share of the recordings, as by one robot of a fleet."""
+    """Return a fault planted in a share of the recordings, as from one robot of a fleet."""
 
     def planted(filling: Filling, rng: np.random.Generator) -> None:
         if rng.random() < share:
@@ -376,7 +376,7 @@ def unchanged(out: Path) -> list[Path]:
 
 
 def by_mission(rows: FedRows, how: str) -> FedRows:
-    """Each mission as a recording."""
+    """Split rows into recordings, one per mission."""
     pairs = zip(rows.recording.tolist(), rows.episode.tolist(), strict=True)
     missions = np.array([f"{recording}-{episode:04d}" for recording, episode in pairs])
     robot = rows.recording if how == "tagged" else np.full(len(rows), "")

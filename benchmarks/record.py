@@ -29,7 +29,7 @@ MAX_GROWTH_MIB = 64
 
 
 def measure(file_format: str, minutes: float) -> dict[str, Any]:
-    """One recording at the default rates, in this process."""
+    """Measure one recording at the default rates, in this process."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / ("log.mcap" if file_format == "mcap" else "log")
         plan = RecordingPlan(

@@ -99,7 +99,7 @@ def in_memory(count: int, width: int) -> torch.Tensor:
 
 
 def strata(count: int) -> list[np.ndarray]:
-    """Row numbers of eight strata of natural sizes, scattered."""
+    """Return the row numbers of eight strata of natural sizes, scattered."""
     code = np.random.default_rng(1).choice(len(NATURAL), count, p=NATURAL)
     return [np.flatnonzero(code == index) for index in range(len(NATURAL))]
 

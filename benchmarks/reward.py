@@ -122,7 +122,7 @@ def missions(per_cell: int) -> list[EpisodeSpec]:
 
 
 def misleading(driven: Mapping[str, Driven], judge: Judge) -> list[dict[str, Any]]:
-    """Each cell and pair in which the driver that surely succeeds more surely earns less."""
+    """Return cells and pairs where the driver that surely succeeds more surely earns less."""
     found = []
     returns = {name: one.returns(judge) for name, one in driven.items()}
     cells = np.array(next(iter(driven.values())).cell)

@@ -53,7 +53,7 @@ def main() -> int:
 
 
 def scores(profile: Profile, seed: int, steps: int) -> Iterator[dict[str, Any]]:
-    """Of each condition and exposure: precision, recall, and how many steps it is true of."""
+    """Yield precision, recall and the number of true steps of each condition and exposure."""
     table, truth = driven(profile, seed, steps)
     known = shipped(profile.constants) | shipped(profile.constants, "exposure")
     for name, reported in label(table, list(known.values())).items():

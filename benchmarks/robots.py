@@ -173,7 +173,7 @@ def measured(
 
 
 def rows_of(documents: Documents) -> dict[str, Any]:
-    """Rows, time, conditions, and what stood in for what was missing."""
+    """Return rows, time, conditions and stand-ins for what was missing."""
     recordings = documents.get("ingest", {}).get("recordings", [])
     good = [one for one in recordings if one["status"] != "failed"]
     coverage = documents.get("coverage", [])

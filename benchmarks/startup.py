@@ -25,7 +25,7 @@ TARGETS = {"--help": 0.05, "sql": 0.3, "ingest": 0.4, "audit": 0.5}  # CPU secon
 
 
 def cpu_seconds(arguments: Sequence[str]) -> float:
-    """Of one process of Restock, its threads together."""
+    """Return the CPU seconds of one process of Restock, over all its threads."""
     environment = {name: v for name, v in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(

@@ -139,7 +139,7 @@ def requested(store: Path, question: str, limit_s: float) -> dict[str, float]:
 
 
 def measure(name: str, folder: Path, *, rounds: int, compact: bool) -> dict[str, Any]:
-    """One fleet: written, then every question to it; the median of some rounds."""
+    """Measure one fleet: writing it, then every query; the median of some rounds."""
     size, store = SIZES[name], folder / name.replace(" ", "_").replace(",", "")
     figures: dict[str, Any] = {"files": size.files, "rows": size.files * size.rows}
     print(f"{name}: {size.files:,} files of {size.rows:,} rows", file=sys.stderr)

@@ -153,7 +153,7 @@ def _row(
     parts: list[NDArray[np.intp]],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """One cell, or the mean of several conditions, each counting the same."""
+    """Return one cell, or the mean of several conditions with equal weights."""
     ids = np.concatenate(parts)
     weights = np.concatenate([np.full(len(p), len(ids) / len(parts) / len(p)) for p in parts])
     row: dict[str, Any] = {"setting": setting, "cell": cell, "episodes": len(ids)}

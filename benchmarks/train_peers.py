@@ -82,7 +82,7 @@ def cleanrl(batch: int, arrays: Arrays, *, equal: bool = False) -> Updates:
 def stable_baselines3(
     batch: int, arrays: Arrays, *, equal: bool = False, device: str = "cpu"
 ) -> Updates | None:
-    """Its target is copied every 10,000 steps by default: never, within a benchmark."""
+    """Build its DQN's update; by default the target is copied too rarely to matter here."""
     try:
         import gymnasium
         from stable_baselines3 import DQN
@@ -210,7 +210,7 @@ def torchrl(batch: int, arrays: Arrays) -> Updates | None:
 
 
 def d3rlpy(batch: int, arrays: Arrays, python: Path) -> Updates | None:
-    """In a Python of its own (it needs an older Gymnasium), which runs `d3rlpy_child`."""
+    """Start `d3rlpy_child` in its own Python, because d3rlpy needs an older Gymnasium."""
     if not python.exists():
         return None
     child = subprocess.Popen(  # ends when its stdin does

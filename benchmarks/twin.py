@@ -154,7 +154,7 @@ def physics(count: int) -> Contestant:
 
 
 def c_floor() -> Contestant:
-    """One call of `mj_step` in C for a whole control period: no Python, no batch."""
+    """Return a contestant: one C call of `mj_step` per control period."""
     env = WarehouseVectorEnv(1, seed=1)
     env.reset(seed=1)
     sim = env.simulation
@@ -176,7 +176,7 @@ def gymnasiums(mode: str) -> tuple[Contestant, gymnasium.vector.VectorEnv]:
 
 
 def one() -> Contestant:
-    """One environment in a Python loop."""
+    """Return a contestant: one environment in a Python loop."""
     env = gymnasium.make("restock/Warehouse-v0")
     env.reset(seed=1)
     rng = np.random.default_rng(0)

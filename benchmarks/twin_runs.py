@@ -28,7 +28,7 @@ def trained(path: Path, settings: Sequence[str], panel: Path | None = None) -> R
 def drive_missions(
     policy: Policy, kinds: Sequence[str], episodes: int, first_seed: int
 ) -> list[EpisodeResult]:
-    """How so many fixed missions of each kind go, with the stand-in on the twin's own floor."""
+    """Drive so many fixed missions of each kind with the stand-in on the twin's own floor."""
     profile = load_profile("warehouse_amr")
     env = WarehouseVectorEnv(
         32, task=profile.task, seed=0, nav_command=profile.inputs.nav_command is not None

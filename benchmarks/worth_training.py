@@ -187,7 +187,7 @@ def main() -> int:
 
 
 def table(values: dict[str, NDArray[np.float64]], cells: list[str]) -> list[dict[str, Any]]:
-    """One row a driver and cell, of `values` (runs, episodes, 3)."""
+    """Return one row per driver and cell of `values` (runs, episodes, 3)."""
     rng = np.random.default_rng(0)
     rows = []
     parts = list(groups(cells))

@@ -144,7 +144,10 @@ def _matched(match: Path) -> list[Path]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    """Its recordings, and what cannot be looked at: opening that says why, and costs it alone."""
+    """Return a folder's recordings, and items that cannot be looked at.
+
+    Opening such an item raises an error for it alone.
+    """
     if is_bag(folder):
         return [folder]
     recordings = []

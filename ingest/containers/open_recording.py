@@ -101,7 +101,7 @@ class _Opening:
             raise
 
     def files(self) -> list[Path]:
-        """Its storage files."""
+        """Return the recording's storage files."""
         return self._files()[0]
 
     def _files(self) -> tuple[list[Path], BagMetadata]:

@@ -68,7 +68,7 @@ class _Stream:
     channel: Channel
 
     def payloads(self) -> Iterator[bytes]:
-        """Its messages as they are in the file, in file order."""
+        """Yield the messages as they are in the file, in file order."""
         for _, batch in self.storage.batches([self.channel.id]):
             for plain, _ in decompressed(batch):
                 yield from plain.payloads()

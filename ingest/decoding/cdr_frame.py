@@ -190,7 +190,7 @@ def texts(frame: Frame, at: Ints, lengths: Position) -> FieldColumn:
 
 
 def _decode(pieces: list[bytes], frame: Frame, known: dict[bytes, str]) -> list[str]:
-    """Each distinct text is decoded, and made, once."""
+    """Decode each distinct text once."""
     decoded = []
     for row, piece in enumerate(pieces):
         text = known.get(piece)

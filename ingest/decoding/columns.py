@@ -60,7 +60,7 @@ def offsets_of(lengths: NDArray[Any]) -> Ints:
 
 
 def cut(column: FieldColumn, start: int, stop: int) -> FieldColumn:
-    """Rows `start` to `stop` of a column."""
+    """Return rows `start` to `stop` of a column."""
     if isinstance(column, Ragged):
         low, high = int(column.offsets[start]), int(column.offsets[stop])
         return Ragged(cut(column.values, low, high), column.offsets[start : stop + 1] - low)

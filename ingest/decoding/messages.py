@@ -72,7 +72,7 @@ class MessageBatch:
         return int((self.stop - self.start).sum())
 
     def payloads(self) -> list[bytes]:
-        """Each message's bytes."""
+        """Return the bytes of each message."""
         view = self.buffer.data
         bounds = zip(self.start.tolist(), self.stop.tolist(), strict=True)
         return [bytes(view[start:stop]) for start, stop in bounds]

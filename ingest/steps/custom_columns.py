@@ -154,7 +154,7 @@ def _key(name: str) -> str:
 def _numbers(
     values: NDArray[Any], mapping: Mapping[str, float] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Values (V,) as numbers, NaN where they are none; and which of them say no number."""
+    """Convert values (V,) to numbers, NaN if not one; also return which are not numbers."""
     texts = _texts(values)
     found: dict[str, float | None] = {}  # text -> its number; None: it is none
     numbers = (
@@ -171,7 +171,10 @@ def _numbers(
 
 
 def _texts(values: NDArray[Any]) -> list[str]:
-    """Values (V,) as texts. Not as NumPy's, each of which takes the memory of the longest."""
+    """Convert values (V,) to a list of texts.
+
+    A NumPy array would give each the memory of the longest.
+    """
     return [str(value) for value in (values if values.dtype.kind == "O" else values.astype(str))]
 
 

@@ -192,7 +192,7 @@ def _constant(part: dict[str, Any] | None) -> bool:
 
 @cache
 def _outside() -> frozenset[str]:
-    """Names of functions whose result does not follow from their arguments alone.
+    """Return the names of functions whose result depends on more than their arguments.
 
     `+` and `date_trunc` of a time with a zone follow the zone that is set, which is fixed here:
     by those a name is not one of them.
@@ -210,7 +210,7 @@ def _outside() -> frozenset[str]:
 
 @cache
 def _changing() -> frozenset[str]:
-    """Names of functions that may answer otherwise when they are asked again."""
+    """Return the names of functions that may return something else when called again."""
     with sandbox().cursor() as connection:
         rows = connection.sql(
             "SELECT DISTINCT function_name, stability, parameter_types::VARCHAR[]"

@@ -196,7 +196,7 @@ def reported(
 
 
 def labels_version(conditions: Sequence[Condition]) -> str:
-    """Names a set of conditions by what they say: 12 hex digits."""
+    """Return a hash of a set of conditions, 12 hex digits."""
     said = [
         (c.name, c.timing, c.sql, c.priority)
         # Nothing more where there is nothing more: so that the version of a plain rule stays.

@@ -39,7 +39,7 @@ class ImageFeature:
         return f"observation.images.{self.camera}"
 
     def describe(self) -> dict[str, Any]:
-        """As info.json has it."""
+        """Return the feature's entry in info.json."""
         height, width = self.shape or (0, 0)
         names = ["height", "width", "channels"]
         return {"dtype": "image", "shape": [height, width, 3], "names": names}

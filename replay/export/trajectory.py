@@ -77,7 +77,7 @@ class Counts:
     left_out: Counter[str] = field(default_factory=Counter)  # rows, by reason
 
     def describe(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the result as plain values for JSON."""
         names = ("rows", "transitions", "trajectories", "episodes", "terminated", "truncated")
         return {name: getattr(self, name) for name in names} | {
             "cut": self.cut,

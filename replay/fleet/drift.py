@@ -70,7 +70,7 @@ class Drift:
         )
 
     def document(self) -> dict[str, Any]:
-        """As `restock coverage drift --json` prints it."""
+        """Return the plain values that `restock coverage drift --json` prints."""
         return {
             "store": self.store,
             "version": self.version,

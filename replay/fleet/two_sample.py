@@ -118,7 +118,7 @@ def share_differences(
 
 
 def _shares(rows: Any, groups: Sequence[slice]) -> F64:
-    """Rows (R, V) as shares of their groups; NaN of a sample without rows."""
+    """Divide rows (R, V) by the totals of their groups; NaN for a sample without rows."""
     rows = np.asarray(rows, np.float64)
     shares: F64 = np.full(rows.shape, np.nan)
     for group in groups:

@@ -309,7 +309,7 @@ class Mixture(Checked, frozen=True):
 
 
 def shipped_mixtures() -> list[str]:
-    """Names of the mixtures that come with Restock."""
+    """Return the names of the mixtures that come with Restock."""
     names = (entry.name for entry in _SHIPPED.iterdir())
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 

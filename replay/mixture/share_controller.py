@@ -256,7 +256,7 @@ class ShareController(Stateful):
         return source.wanted
 
     def _beside_ring(self) -> bool:
-        """Shares of an online batch, of logged rows and of fresh ones. True if they changed."""
+        """Compute the shares of logged and fresh rows in an online batch; tell if they moved."""
         logs, fresh, wanted = self._split(self.stock, self._limits())
         self.wanted = wanted
         fresh_shares = np.append(fresh, max(1.0 - logs.sum() - fresh.sum(), 0.0))

@@ -35,7 +35,7 @@ def plan_shares(
     unknown: Mapping[str, str] | None = None,
     lacking: Mapping[str, str] | None = None,
 ) -> SharePlan:
-    """Shares from the mixture's rules and how many rows (S,) and episodes (S,) there are.
+    """Plan shares from the mixture's rules and the number of rows (S,) and episodes (S,).
 
     `draws` is how many rows will be drawn in all, `env_steps` when, for shares with a schedule,
     `natural` (S,) the shares that the rows stand for, where that is not their own. `unknown` are
@@ -155,7 +155,7 @@ def _flexible_parts(shares: Sequence[Share], flexible: Bools, rows: Ints | F64) 
 
 
 def rest_within(base: F64, low: F64, high: F64, total: float) -> F64:
-    """Shares proportional to `base`, each within [low, high], that sum to `total`."""
+    """Return shares proportional to `base`, each within [low, high], that sum to `total`."""
     if total <= 0:
         return np.zeros(len(base))
     return total * scaled_within(base / max(base.sum(), 1e-12), low / total, high / total)

@@ -81,7 +81,7 @@ class PanelDataset(IterableDataset[dict[str, Tensor]]):
         self._check()
 
     def set_epoch(self, epoch: int) -> None:
-        """Which pass comes next; call it before iterating, on the loader's own dataset."""
+        """Set the pass that comes next; call it before iterating, on the loader's own dataset."""
         self.epoch = epoch
         self._next[0] = epoch
 

@@ -83,7 +83,7 @@ class Packer:
             yield begin, end, np.flatnonzero(self.plan.stratum[begin:end] != NO_STRATUM)
 
     def digest(self) -> str:
-        """Names the rows: ids, strata, horizons, weights."""
+        """Return a hash of the rows: ids, strata, horizons, weights."""
         digests = [hashlib.blake2b(digest_size=8) for _ in range(4)]
         at = 0
         for begin, _, rows in self._stretches():

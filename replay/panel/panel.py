@@ -199,7 +199,7 @@ class Panel:
         return self._meta
 
     def meta_column(self, name: str) -> NDArray[Any]:
-        """One column of `meta` (n,), without reading the others.
+        """Read one column of `meta` (n,), without the others.
 
         Raises:
             PanelError: it has no such column.

@@ -42,7 +42,7 @@ class RowsInOrder:
         self._stretches: list[_Stretches] = []  # of each batch
 
     def add(self, batch: pa.RecordBatch) -> None:
-        """One batch; nothing of its memory is kept."""
+        """Add one batch; nothing of its memory is kept."""
         if not len(batch):
             return
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
@@ -58,7 +58,7 @@ class RowsInOrder:
         self._stretches.append(_Stretches.of(recording, keys))
 
     def table(self) -> pa.Table:
-        """All rows in order; the batches are freed on the way."""
+        """Return all rows in order, and free the batches on the way."""
         rank = self._ranks()
         stretches = _in_order(self._stretches, rank)
         order = self._sorted_rows(rank) if stretches is None else None

@@ -91,7 +91,7 @@ class PendingSteps(Stateful):
         reward: NDArray[Any],
         meta: Mapping[str, Any],
     ) -> None:
-        """One step of every environment: `observation` (N, D), `action` and `reward` (N,)."""
+        """Add one step of every environment: `observation` (N, D), `action` and `reward` (N,)."""
         at = self._envs, (self._first + self.waiting) % self.n_step
         self._observation[at] = observation
         self._action[at] = action

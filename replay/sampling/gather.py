@@ -21,7 +21,7 @@ _TRIED_WIDTHS = (1, 16, 189)  # floats: below, at and above what a vector regist
 
 
 def gather_rows(rows: Tensor, index: Tensor) -> Tensor:
-    """Rows `index` (B,) int64 of `rows` (n, W), as a new tensor (B, W) on their device.
+    """Gather rows `index` (B,) int64 of `rows` (n, W) into a new tensor (B, W) on their device.
 
     Values equal those of `rows.index_select(0, index)`, NaN and infinities included; without the
     compiled gather the sign of a negative zero may be lost.
@@ -51,12 +51,15 @@ def _has_a_faster_way(rows: Tensor) -> bool:
 
 
 def _is_plain(index: Tensor) -> bool:
-    """Whether they are row numbers as samplers give them: int64 in main memory, in one piece."""
+    """Return whether these are row numbers as samplers give them.
+
+    Those are int64, in main memory and contiguous.
+    """
     return index.dtype == torch.int64 and index.device.type == "cpu" and index.is_contiguous()
 
 
 def _sum_of_one_each(rows: Tensor, index: Tensor) -> Tensor:
-    """By `torch.embedding_bag`'s forward kernel, bag i being row `index[i]` alone."""
+    """Gather rows with `torch.embedding_bag`'s kernel; bag i is row `index[i]` alone."""
     summed: Tensor = torch._embedding_bag_forward_only(rows, index, _counted(len(index)))[0]
     return summed
 

@@ -68,13 +68,13 @@ class Sampler(Protocol):
         """Importance weights (B,) that the batch last drawn needs; None for ones."""
 
     def draw(self) -> tuple[Ints, Ints]:
-        """Row numbers (B,) and the stratum of each (B,)."""
+        """Draw row numbers (B,) and the stratum of each (B,)."""
 
     def update(self, rows: Ints, td_abs: NDArray[Any]) -> None:
         """|TD error| (n,) of rows (n,) that were just learnt from."""
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Other shares from the next batch on."""
+        """Set the shares from the next batch on."""
 
     def set_batch_size(self, batch_size: int) -> None:
         """Batches of another size from the next one on."""
@@ -122,7 +122,7 @@ class Quotas(Stateful):
         self._carry = np.asarray(owed, np.float64).tolist()
 
     def checked(self, shares: Sequence[float] | F64) -> F64:
-        """Shares (S,) as `set_shares` would take them, summing to 1."""
+        """Return shares (S,) as `set_shares` would take them, summing to 1."""
         given = np.asarray(shares, np.float64)
         if given.ndim != 1 or not len(given) or not np.isfinite(given).all() or (given < 0).any():
             raise MixtureError(f"shares must be finite and not negative, got {shares!r}")
@@ -140,7 +140,7 @@ class Quotas(Stateful):
         return given if abs(total - 1.0) < 1e-12 else np.asarray(given / total)
 
     def set_shares(self, shares: Sequence[float] | F64) -> None:
-        """Other shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
+        """Set the shares (S,) from the next batch on; a stratum of share 0 is owed nothing."""
         self.shares = self.checked(shares)
         self._mean = (self.shares * self.batch_size).tolist()
         drawn = self.shares > 0

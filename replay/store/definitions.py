@@ -273,7 +273,7 @@ def made_by(name: str) -> list[str]:
 
 @cache
 def _statements(text: str) -> Mapping[str, str]:
-    """Each view and macro that a text makes, by its name."""
+    """Return each view and macro that a script creates, by name."""
     begins = [*_BEGINS.finditer(text)]
     ends = [*(one.start() for one in begins[1:]), len(text)]
     parts = ((one[1], text[one.start() : end]) for one, end in zip(begins, ends, strict=True))

@@ -42,7 +42,7 @@ class CameraFrame:
     layout: ImageLayout
 
     def image(self) -> NDArray[np.generic]:
-        """Its pixels, (H, W) or (H, W, C): red, green, blue (and alpha); uint8, uint16 or float32.
+        """Decode the pixels, (H, W) or (H, W, C): RGB or RGBA; uint8, uint16 or float32.
 
         Raises:
             StoreError: its bytes are not those that were recorded, or are no image.

@@ -118,7 +118,7 @@ def _moving_rows(connection: duckdb.DuckDBPyConnection) -> MovingRows:
 
 
 def _joined(parts: list[NDArray[N]], kind: type[N]) -> NDArray[N]:
-    """All of them as one array; the parts are forgotten."""
+    """Concatenate the parts and free them."""
     whole = np.concatenate([np.empty(0, kind), *parts])
     parts.clear()
     return whole

@@ -85,7 +85,7 @@ class StoredTable:
             ) from error
 
     def row_groups(self, columns: Sequence[str]) -> Iterator[pa.Table]:
-        """Its rows, some at a time: of these columns, as `Location.row_groups` names them.
+        """Yield the rows in parts: of these columns, as `Location.row_groups` names them.
 
         Raises:
             StoreError: a file is missing or damaged, or the place cannot be reached.

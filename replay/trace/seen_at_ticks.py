@@ -54,7 +54,10 @@ def seen_between(recording: Recording, profile: Profile, low_ns: int, high_ns: i
 
 
 def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
-    """As recorded; of lidars that are not where the body has its own, as seen from there."""
+    """Return the scan at each stamp, as recorded or as seen from the body's own lidar.
+
+    The latter if the lidars are mounted elsewhere.
+    """
     scans = aligned.profile.inputs.scans
     if not scans or not scans.keys() <= aligned.inputs.by_name.keys():
         return [None] * len(stamps)
@@ -68,7 +71,7 @@ def _scans(aligned: AlignedInputs, stamps: Ints) -> list[SeenScan | None]:
 def _from_the_middle(
     body: Body, sources: Sequence[Input], scans: Sequence[SeenScan | None]
 ) -> SeenScan | None:
-    """One scan of what several lidars saw at a tick, the nearest in each of BINS bearings."""
+    """Merge the scans of several lidars at a tick: the nearest in each of BINS bearings."""
     nearest, stamp_ns = np.full(BINS, np.inf), [scan.stamp_ns for scan in scans if scan is not None]
     for source, scan in zip(sources, scans, strict=True):
         if scan is None:

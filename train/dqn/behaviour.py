@@ -152,7 +152,7 @@ class Behaviour(Stateful):
         self.optimizer.move(self._slow, rate)
 
     def averaging_rate(self, update: int) -> float:
-        """Of the average, at update number `update` (from 1)."""
+        """Return the rate of the average at update number `update` (from 1)."""
         return averaging_rate(self._averaging, update)
 
     def count(self, updates: int) -> None:

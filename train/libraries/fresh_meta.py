@@ -65,7 +65,7 @@ class FreshMeta:
         env_step: int,
         gradient_step: int,
     ) -> Ints:
-        """One step of `envs` (n,) went to `slots` (n,); returns their episodes' keys (n,)."""
+        """Write one step of `envs` (n,) to `slots` (n,); return their episodes' keys (n,)."""
         self.by_condition.move(slots, NONE)
         keys = self.episode_key[envs].copy()
         now = {

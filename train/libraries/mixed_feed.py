@@ -146,7 +146,7 @@ class MixedFeed:
             )
 
     def take(self, envs: Ints, keys: Ints, ended: NDArray[Any], infos: Sequence[Any]) -> None:
-        """One step of `envs` (n,), of the episodes `keys` (n,): labels those that ended."""
+        """Take one step of `envs` (n,) in episodes `keys` (n,), and label those that ended."""
         self.env_steps += len(envs)
         for env, key, over, info in zip(
             envs.tolist(), keys.tolist(), np.asarray(ended).tolist(), infos, strict=True

@@ -165,7 +165,7 @@ class MixtureReplayBuffer(ReplayBuffer):
         done: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        """One step of every environment; `next_obs` is the last one where an episode ended."""
+        """Add one step of every environment; `next_obs` is the last one if an episode ended."""
         ring = self.ring
         done = np.asarray(done, np.bool_)
         cut = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos]) & done

@@ -120,7 +120,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
     def add(
         self, batch: Any, buffer_ids: NDArray[Any] | list[int] | None = None
     ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-        """One step of some environments; what `info` says is used for labels, and not kept."""
+        """Add one step of some environments; `info` is used for labels only, and not kept."""
         envs = np.arange(self.fresh.num_envs) if buffer_ids is None else np.asarray(buffer_ids)
         names = ("obs", "act", "rew", "terminated", "truncated", "obs_next")
         step = Batch({name: batch[name] for name in names})
@@ -142,7 +142,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
         return placed
 
     def sample_indices(self, batch_size: int | None) -> NDArray[Any]:
-        """Rows by the mixture, logs first; all of them in order for 0 or None."""
+        """Draw rows by the mixture, logs first; return all in order for 0 or None."""
         if not batch_size or batch_size < 0:
             return super().sample_indices(batch_size)
         drawing = self.feed.draw_logs(batch_size)
@@ -202,7 +202,7 @@ class MixtureVectorReplayBuffer(ReplayBufferManager):
 
 
 def _one(info: Any, place: int) -> dict[str, Any]:
-    """One environment's info, of a Batch of them."""
+    """Return one environment's info out of a Batch of infos."""
     one: dict[str, Any] = {}
     for name in info.get_keys():
         value = info[name]

@@ -201,7 +201,7 @@ class Bag(Reader):
         )
 
     def packed(self) -> list[Packed]:
-        """Its chunks, by how they are compressed."""
+        """Return the chunks by their compression."""
         by: dict[str, list[int]] = {}
         for position, (compression, _) in self._chunks.items():
             by.setdefault("" if compression == "none" else compression, []).append(position)

@@ -297,7 +297,7 @@ class SalvagedSqliteFile:
         self.span_ns = (int(stamps.min()), int(stamps.max())) if len(stamps) else None
 
     def _survey(self) -> Ints:
-        """Row number, topic, stamp, page and place in it of every message, by one pass."""
+        """Scan once for row number, topic, stamp, page and offset in the page of every message."""
         pieces, rows = [np.zeros((0, 5), np.int64)], list[tuple[int, int, int, int, int]]()
         leaves, interiors = list[tuple[int, int]](), list[list[tuple[int, int]]]()
         for number, kind, page in self._pages.tables():

@@ -105,7 +105,7 @@ def custom_data(text: str, source: str, kept: Collection[Metadata] = ()) -> tupl
 
 
 def _custom_data(text: str) -> tuple[dict[str, str], int]:
-    """Its entries, and how many of them are no text.
+    """Return the entries, and how many of them are not text.
 
     Only those lines are parsed, and their values stay as they are written: `007` is no number.
     """
