@@ -75,7 +75,7 @@ HELD_OUT_HORIZONS_S = (1.0, 3.0, 6.0)
 class FitConfig(Checked, frozen=True):
     """Settings of a fit. The same values give the same result.
 
-    `base` holds what is not fitted, and is what "before" means.
+    `base` holds the parameters that are not fitted, and is the twin "before" the fit.
     """
 
     parameters: tuple[str, ...] = DEFAULT

@@ -69,7 +69,7 @@ DEFAULT = tuple(item.name for item in PARAMETERS.values() if item.default)
 class Coordinates:
     """The map between perturbations and points z of the unit cube, an axis per fitted parameter.
 
-    What is not fitted is as in `base`.
+    Parameters that are not fitted stay as in `base`.
     """
 
     def __init__(self, names: Sequence[str], base: Perturbation, task: Task) -> None:

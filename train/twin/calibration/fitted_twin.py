@@ -269,7 +269,7 @@ def unidentified(
 ) -> ParameterEstimate | None:
     """Return the least identified parameter among those to keep at base; None if there is none.
 
-    One stays that is known too little, and whose value in the base explains the log as well.
+    A parameter stays at base if it is poorly identified and its base value fits the log as well.
     """
     width = uncertainty.half / solution.coordinates.useful
     for index in np.argsort(-width):

@@ -220,8 +220,8 @@ class PlanMemory:
     def seen_after(self, steps: LoggedSteps, rows: Ints, pose: Signals) -> dict[str, F64]:
         """Return the route's signals at t + 1 as seen from other poses (n,), for `rows` (n,).
 
-        The logged ones, and what the rebuilt plan says of the difference between the two poses:
-        where that is small, so is what was not rebuilt exactly.
+        They are the logged ones plus the difference that the rebuilt plan gives between the two
+        poses. If the poses are close, so are the errors of the rebuilt plan.
         """
         after = rows_of(steps.after, rows)
         moved = self._view(self.next_plan[rows], pose)

@@ -214,7 +214,7 @@ def ordinary_driving(segments: LoggedSegments) -> tuple[LoggedSegments, dict[str
 def held_out_from(segments: LoggedSegments, share: float, seed: int) -> dict[str, int]:
     """Return the stamp (ns) from which each recording is held out.
 
-    Of four recordings or more, whole ones; else the last part of each.
+    With four recordings or more, whole ones are held out; else the last part of each.
     """
     names = np.unique(segments.recording_id)
     never, always = np.iinfo(np.int64).max, np.iinfo(np.int64).min
@@ -496,7 +496,7 @@ def replay_segments(
 def _localised(pose: F64, period_s: float, wheel_speed: F64) -> tuple[F64, F64]:
     """Return speeds (..., K + 1) from poses (..., W + K + 1, 3), computed as in ingest.
 
-    Without a warm-up no pose is before the first, and the wheels say its speed.
+    Without a warm-up there is no pose before the first, so its speed is the wheels'.
     """
     stamp = np.broadcast_to(np.arange(pose.shape[-2]) * round(period_s * 1e9), pose.shape[:-1])
     columns = {name: pose[..., i] for i, name in enumerate(POSE)} | {"pose_stamp_ns": stamp}

@@ -61,7 +61,7 @@ def simulated(env: WarehouseVectorEnv, ids: Ints, pose: F64, commands: F64) -> t
 def room_of(env: WarehouseVectorEnv, ids: Ints, ends: F64) -> tuple[F64, F64]:
     """Return clearances (n, A, T) to racks, walls and pallets, and to people's future places.
 
-    It is exact below `ROOMY_M`: what is farther away than that counts alike.
+    Clearances are exact below `ROOMY_M`; larger ones all count the same.
     """
     outline = outline_of(env, points=3)
     cos, sin = np.cos(ends[..., 2, None]), np.sin(ends[..., 2, None])
@@ -142,8 +142,8 @@ PAIR_S, FIRST_S, NEXT_S, BETTER_S = 1.6, 0.6, 0.4, 0.1
 def harsh_actions(table: F64) -> Bools:
     """Return which actions (A, 2), in m/s and rad/s, are too fast for slippery floor.
 
-    The slowest ahead and the slowest turn of a fast robot are taken all the same: who drives no
-    other would never come over it.
+    A fast robot's slowest drive ahead and slowest turn are allowed all the same: without them it
+    would never get across.
     """
     speed, turn = np.abs(table).T
     ahead = table[:, 0][table[:, 0] > 0]

@@ -88,7 +88,7 @@ class RandomPolicy(SoftPolicy):
 class PlannerFollower(SoftPolicy):
     """A driver that follows the plan, slows for turns and obstacles, and stops before them.
 
-    It does what the navigation stack proposes (the signals `nav_*`) but for its random actions.
+    Apart from random actions it does what the navigation stack proposes (the signals `nav_*`).
     """
 
     name = "planner"

@@ -43,7 +43,7 @@ class _Floor:
 class MissionOrders:
     """Orders that the given floors can hold.
 
-    `shares` (K,) are their parts of all missions.
+    `shares` (K,) are the orders' shares of all missions.
 
     Raises:
         ConfigError: a kind, floor or zone that is not there, a floor without room for a kind, or
@@ -346,8 +346,8 @@ def floor_place(spec: EpisodeSpec, places: Mapping[str, int]) -> int:
 class EpisodeQueue(Stateful):
     """A queue whose n-th episode of an environment does not depend on the other environments.
 
-    `conditions` are shares per kind of episode; a schedule draws each a perturbation. Where
-    missions were ordered, a share of the drawn episodes is of those.
+    `conditions` are shares per kind of episode; a schedule draws a perturbation for each episode.
+    If missions were ordered, a share of the drawn episodes is of those.
 
     Raises:
         ConfigError: an unknown condition, or shares that are not numbers of at least 0.

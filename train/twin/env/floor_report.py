@@ -21,8 +21,8 @@ AISLE_ROOM_M = 0.1  # beside a robot in an aisle: a cell of the planner's
 def describe_floor(floor: Warehouse) -> dict[str, Any]:
     """Return sizes in metres, counts, unreachable goals, and the kinds of episodes that fit.
 
-    A goal is unreachable where no robot gets there from the largest part of the floor, by its
-    one-way rules. `hash` names the floor whatever it is called.
+    A goal is unreachable if no robot gets there from the largest part of the floor under its
+    one-way rules. `hash` identifies the floor independently of its name.
     """
     widths = [segment.width_m for segment in floor.segments]
     return {

@@ -51,7 +51,7 @@ class Twin(Protocol):
 class ArmedTwin(Protocol):
     """A twin whose missions can be chosen by arm, as `[practice]` does.
 
-    `info["mission_arm"]` (N,) of a step says the arm of each episode, -1 where none was chosen.
+    `info["mission_arm"]` (N,) of a step is the arm of each episode, -1 if none was chosen.
     """
 
     def mission_arms(self, by: Sequence[str], /) -> Sequence[MissionArm]: ...

@@ -123,8 +123,8 @@ class BlockFinder(Stateful):
     ) -> tuple[Ints, F64]:
         """Return the aisle segment (n,) each robot is in, or the one just ahead of it; -1 for none.
 
-        With its edges (n, 4), x and y exchanged for robots that are `turned`. Only segments that
-        run the robot's way count.
+        Also returns the segments' edges (n, 4), x and y exchanged for robots that are `turned`.
+        Only segments along the robot's direction count.
         """
         segment = np.full(len(ids), -1, np.int64)
         edges = np.zeros((len(ids), 4))
@@ -158,7 +158,7 @@ STANDING_SHARE = 0.2  # of the distances at which a robot stops and slows, howev
 class Navigation(Stateful):
     """Plans and goals of N robots, each on one of `floors`.
 
-    `proposes`: where there is a route, the stack's next command is known beside it.
+    With `proposes`, the stack's next command is among the signals if the task has a route.
     """
 
     STATE = ("plans_m", "plan_number", "closures", "finder")
@@ -197,7 +197,7 @@ class Navigation(Stateful):
     def update(self, signals: Signals, offset_m: F64, sensing: Sensing) -> None:
         """Read the new signals, and replan where it is due; the new plan goes into the signals.
 
-        It counts from this step on: a new plan never makes progress jump.
+        A new plan counts from this step on, so that it never makes progress jump.
         """
         again = set(np.flatnonzero(offset_m > STRAYED_M).tolist())
         again |= self._find_blocks(signals, sensing)

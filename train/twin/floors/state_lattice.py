@@ -188,8 +188,8 @@ def lattice_around(
 ) -> StateLattice:
     """Build a lattice over a window of a floor with boxes (K, 2), half sizes (K, 2), on it.
 
-    `graph` joins the floor's cells past the boxes, in metres, against the robot's way
-    (`Planner.graph_around`): outside the window it goes on with that.
+    `graph` connects the floor's cells past the boxes, in metres, against the robot's direction
+    (`Planner.graph_around`). It is used outside the window.
     """
     room = _room(floor, boxes, half_m, window, motion.outline_m)
     free = room > TOUCH_M

@@ -35,7 +35,7 @@ NO_MASK = _mask(0, 0)
 class FloorFriction:
     """Friction under the wheels of N robots: the floor's, less on patches, and under worn tyres.
 
-    It is looked up by where the wheels stand, and written into the batch's geoms.
+    Friction is looked up at the wheels' places and written into the batch's geoms.
     """
 
     def __init__(self, geom_friction: F64, wheel_geoms: Sequence[int], wheels_m: F64) -> None:

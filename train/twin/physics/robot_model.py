@@ -136,7 +136,7 @@ class RobotModel:
     def steering_for(self, motion: F64, held_rad: F64) -> F64:
         """Return steering angles (...) for speeds and yaw rates (..., 2); `held_rad` at a stop.
 
-        Turned on the spot, which it cannot, it steers as far as it can.
+        For a turn on the spot, which it cannot drive, it steers as far as it can.
         """
         speed, turn = motion[..., 0], motion[..., 1]
         rolls = np.abs(speed) > 1e-6

@@ -175,7 +175,7 @@ class Traffic(Stateful):
     def note_closest(self, place_m: F64, yaw_of: Callable[[Ints], F64]) -> None:
         """Note the agents' current distance to robots' outlines; (N, 2) are robots' centres.
 
-        `yaw_of` is asked where somebody may be nearer than ever in the episode.
+        `yaw_of` is called only for robots that somebody may be nearer to than ever in the episode.
         """
         ids = np.flatnonzero(self.active & ~np.isnan(self.closest_m))
         if not len(ids):

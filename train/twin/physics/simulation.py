@@ -41,7 +41,7 @@ _HISTORY = 5  # commands kept, or as many more as the longest latency takes
 class BaseController(Stateful):
     """The controllers of N robots. A command reaches its controller `latency_s` late.
 
-    Those of robots that steer are `SteeringController`s; `base_controller` makes the right one.
+    Robots that steer have a `SteeringController`; `base_controller` builds the right one.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ("commands", "set_point")

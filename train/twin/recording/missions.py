@@ -73,8 +73,8 @@ def schedule(
 class OrderedMissions:
     """The missions of a file, in rounds until the ordered number met their kind.
 
-    Who plans pallets in an aisle cannot know that the robot comes past them. Each round drives
-    what is still owed, mixed, and never more than MAX_DRIVEN times what was ordered.
+    A mission with pallets in an aisle may never pass them. So each round drives what is still
+    owed, shuffled, and at most MAX_DRIVEN times what was ordered.
     """
 
     def __init__(

@@ -344,7 +344,7 @@ def parse_start(text: str) -> int:
     """Parse the start, an ISO date or time (UTC by default), to nanoseconds.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is not a date or time.
     """
     try:
         moment = datetime.fromisoformat(text)

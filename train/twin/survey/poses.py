@@ -133,8 +133,8 @@ def interpolated(known_ns: Ints, values: F64, asked_ns: Ints) -> tuple[F64, Bool
 def candidate_poses(recording: Recording, profile: Profile | None = None) -> list[Poses]:
     """Return the pose sources of a recording, best first; empty if there are none.
 
-    Only what the profile says, where there is one. Else transforms that lead to a map, pose topics,
-    localised ones first, and other transforms.
+    With a profile, only its pose counts. Without, the order is: transforms that lead to a map, pose
+    topics (localised ones first), and other transforms.
     """
     if profile is not None:
         at, (x_m, y_m) = _by_profile(recording, profile), profile.origin_m or (0.0, 0.0)
