@@ -105,7 +105,7 @@ def ingest_all(
     engine: Engine = "processes",
     watch: Watch | None = None,
 ) -> Iterator[Result]:
-    """Each recording's outcome or error, in the order of `paths`, after its commit.
+    """Yield each recording's outcome or error, in the order of `paths`, after its commit.
 
     Each recording is read, and its files are written, by one worker; this process commits them,
     those of some seconds together, so the store is the same as after one worker. With Ray,

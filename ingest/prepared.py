@@ -2,7 +2,7 @@
 
 Nothing of a recording shows before its commit, so a process that is killed loses what waited and no
 more: the same command reads those again. The first one is committed when it is there; after that
-those of GROUP_S seconds together, or as soon as MOST wait.
+those of GROUP_S seconds together, or as soon as MAX_WAITING wait.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from restock.ingest.task.tags import in_words
 from restock.words import counted, quoted
 
 GROUP_S = 5.0
-MOST = 64
+MAX_WAITING = 64
 Status = Literal["written", "tagged", "unchanged", "dry run"]
 OnRepeat = Literal["keep", "refuse", "replace"]
 
@@ -238,7 +238,7 @@ class CommitGroup:
         """Return the seconds until waiting recordings must be committed; None if none waits."""
         if not self.waiting:
             return None
-        if self._last_s is None or len(self.waiting) >= MOST:
+        if self._last_s is None or len(self.waiting) >= MAX_WAITING:
             return 0.0
         return max(0.0, self._last_s + GROUP_S - self.clock())
 

@@ -132,7 +132,7 @@ class CameraFrames:
 
     @property
     def problems(self) -> Counter[str]:
-        """Messages without an image that can be kept, by why."""
+        """Count messages without an image that can be kept, by reason."""
         words = np.asarray(self.columns.fields[PROBLEM], object)
         off = (words == "") & (self.stamp_ns < 0)
         counted = Counter([word for word in words if word])

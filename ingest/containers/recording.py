@@ -129,7 +129,7 @@ class Recording:
 
     @cached_property
     def topics(self) -> dict[str, TopicInfo]:
-        """Every topic by name, in alphabetical order."""
+        """Return every topic by name, in alphabetical order."""
         return {name: self._info(name) for name in sorted(self._streams)}
 
     def _info(self, name: str) -> TopicInfo:
@@ -201,7 +201,7 @@ class Recording:
 
     @property
     def packed(self) -> list[Packed]:
-        """The chunks of all its files, by how they are compressed; none where files have none."""
+        """Return the chunks of all its files by their compression; none if files have none."""
         found: dict[str, Packed] = {}
         for one in (one for storage in self._storages for one in storage.packed):
             had = found.get(one.compression, Packed(one.compression, 0, 0, 0))
@@ -270,11 +270,11 @@ class Recording:
         return lost
 
     def leaves(self, topic: str) -> list[str]:
-        """Every field path of a topic's messages; empty where it cannot be decoded."""
+        """Return every field path of a topic's messages; none if it cannot be decoded."""
         return [leaf.path for leaf in self.fields(topic)]
 
     def fields(self, topic: str) -> list[Leaf]:
-        """Every field of a topic's messages, with its type; empty where it cannot be decoded."""
+        """Return every field of a topic's messages; none if it cannot be decoded."""
         try:
             return self._type(self._channels(topic)[0]).leaves()
         except CannotDecode:
@@ -333,7 +333,7 @@ class Recording:
                     yield plain.log_time_ns[decoded.rows], decoded.fields
 
     def raw_between(self, low_ns: int, high_ns: int) -> list[RawMessage]:
-        """Every message logged in [low_ns, high_ns], and what was in force before: by log time.
+        """Return messages logged in [low_ns, high_ns] and those in force before, by log time.
 
         In force is each topic's last message before it, and of `/tf_static`, on which several
         nodes publish, all of them.
@@ -409,7 +409,7 @@ class Recording:
         return decoder_of(channel, kind, leaves)
 
     def _lost(self, topic: str) -> dict[str, int]:
-        """Messages of a topic that damage is known to have cost, by reason."""
+        """Count messages of a topic that damage is known to have cost, by reason."""
         lost = Counter[str]()
         for stream in self._streams[topic]:
             for item in stream.storage.damage:

@@ -62,7 +62,7 @@ class Account:
 
     @property
     def lost(self) -> int:
-        """Messages that the container counts and that gave no row."""
+        """Count messages that the container counts and that gave no row."""
         return max(self.expected - self.decoded, 0)
 
 
@@ -104,7 +104,7 @@ class TopicReading:
 
     @property
     def paths(self) -> list[str]:
-        """The fields to decode: those wanted, and those that are reduced."""
+        """Return the fields to decode: those wanted, and those that are reduced."""
         return list(dict.fromkeys([*self._wanted, *self._reduced]))
 
     @property
@@ -118,7 +118,7 @@ class TopicReading:
             self._fields.setdefault(path, growing(column))
 
     def skip(self, reason: str, count: int) -> None:
-        """Messages that are not read at all."""
+        """Count messages that are not read at all."""
         self._add({reason: count})
 
     def take(self, decode: Callable[[MessageBatch], Decoded], batch: MessageBatch) -> None:

@@ -335,7 +335,7 @@ class _Compiler:
             plan.paths[inner_path] = (kind, (length, *dims))
 
     def _time(self, name: str, path: str, dot: str, plan: CdrPlan, fixed: list[FixedField]) -> None:
-        """Its two fields; wanted as nanoseconds of both, or each by its own path, or all."""
+        """Add its two fields: as nanoseconds of both, or each by its own path, or all."""
         fields = self.message.fields_of(name)
         bases = [field.base for field in fields]
         if len(fields) != 2 or not all(base in ("int32", "uint32") for base in bases):

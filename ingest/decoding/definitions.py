@@ -118,7 +118,7 @@ def ackermann_types() -> Typesdict:
 
 @cache
 def folder_types(folder: str) -> Typesdict:
-    """Every type that the `.msg` and `.idl` files of a folder define.
+    """Return every type that the `.msg` and `.idl` files of a folder define.
 
     Raises:
         RecordingError: no such folder, no definition in it or too many, or one that cannot be read;

@@ -96,7 +96,7 @@ class MessageType(ABC):
         """
 
     def leaves(self) -> list[Leaf]:
-        """Every field path of the type, in the order of its definition.
+        """Return every field path of the type, in the order of its definition.
 
         Inside a message that holds its own type the paths have no end: there they are left out
         (`leaf` still finds each).

@@ -63,7 +63,7 @@ class ProtobufType(MessageType):
 
     @property
     def message_class(self) -> Any:
-        """The class that parses it."""
+        """Return the class that parses it."""
         return GetMessageClass(self.pool.FindMessageTypeByName(self.name))
 
 

@@ -123,7 +123,7 @@ def align(
     *,
     tolerance_s: float = TOLERANCE_S,
 ) -> tuple[list[ClockSegment], ClockReport]:
-    """Every topic on the alignment clock, cut where that clock jumps.
+    """Put every topic on the alignment clock, cut where that clock jumps.
 
     `topics` are in the order of their log time; stamped ones hold the field `header.stamp`.
     A message whose stamp is more than `clock.jump_s` from where its segment's clock has it is

@@ -169,7 +169,7 @@ class AlignedInputs:
         return [follows[row] for row in self.latest("command").row]
 
     def poses(self) -> list[PoseSeries]:
-        """Every pose of each segment, in the fixed frame."""
+        """Return every pose of each segment, in the fixed frame."""
         if "pose" in self.inputs.by_name:
             topic = self.inputs.by_name["pose"].topic
             columns = [self.inputs.numbers("pose", key) for key in ("x_m", "y_m", "yaw_rad")]

@@ -97,7 +97,7 @@ _BLOCK = 1 << 16  # windows sorted at a time: bounds memory
 
 
 def topic_clocks(topics: Mapping[str, TopicColumns], jump_s: float) -> list[TopicClock]:
-    """Every topic's clocks compared."""
+    """Compare every topic's clocks."""
     return [topic_clock(name, columns, jump_s) for name, columns in topics.items()]
 
 

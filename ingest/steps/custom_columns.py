@@ -255,7 +255,7 @@ def _said(is_list: bool, length: str | None) -> str:
 
 
 def custom_signals(aligned: AlignedInputs) -> Custom:
-    """Every custom signal at every tick of every segment, causally held; null where it is not."""
+    """Hold every custom signal causally at every tick of every segment; null if unknown."""
     columns: dict[str, CustomColumn] = {}
     count = sum(map(len, aligned.ticks))
     table = pa.table({"tick": np.arange(count)})

@@ -63,7 +63,7 @@ class Filling:
         self.stand_ins: dict[str, str] = {}  # of inputs none of whose messages has an estimate
 
     def fill(self) -> Signals:
-        """Every signal; what else is known of the ticks is in the attributes afterwards."""
+        """Compute every signal; the attributes then hold what else is known of the ticks."""
         self._numbers(
             "command", speed_mps="command_speed_mps", yaw_rate_radps="command_yaw_rate_radps"
         )

@@ -81,7 +81,7 @@ class Fixes:
         max_std_m: float | None = None,
         track_m: float | None = None,
     ) -> FixedPoses:
-        """Their poses about the origin (None: the first of use)."""
+        """Return their poses about the origin (None: the first of use)."""
         max_std_m, track_m = max_std_m or MAX_STD_M, track_m or TRACK_M
         problem = self.problems(max_std_m)
         x, y, yaw = np.full((3, len(problem)), np.nan)

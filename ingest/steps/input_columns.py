@@ -109,7 +109,7 @@ class InputColumns:
 
     @cached_property
     def fixed(self) -> FixedPoses:
-        """The pose of each message, where it is by latitude and longitude."""
+        """Return the pose of each message whose position is by latitude and longitude."""
         source = self.by_name["pose"]
         columns, yaw = self.topics[source.topic], None
         if "heading" in self.by_name:
@@ -133,7 +133,7 @@ class InputColumns:
 
     @cached_property
     def plans(self) -> list[F64]:
-        """Each plan's points (P, 2); P is 0 where the planner found none."""
+        """Return each plan's points (P, 2); P is 0 if the planner found none."""
         x, y = self.column("plan", "x_m"), self.column("plan", "y_m")
         points = [
             np.stack([np.asarray(x[row], np.float64), np.asarray(y[row], np.float64)], axis=-1)
@@ -149,7 +149,7 @@ class InputColumns:
 
     @cached_property
     def goals(self) -> F64:
-        """Each goal (G, 2)."""
+        """Return each goal (G, 2)."""
         goals = np.stack([self.numbers("goal", axis) for axis in ("x_m", "y_m")], axis=1)
         if "goal" not in self.placed:
             return np.asarray(goals - self.origin_m)

@@ -57,7 +57,7 @@ _COLUMNS = ("stamp_ns", "x_m", "y_m", "yaw_rad")
 
 
 def poses_along(tree: Tree) -> list[PoseSeries]:
-    """Every pose of a tree's base in its fixed frame, by segment."""
+    """Return every pose of a tree's base in its fixed frame, by segment."""
     times = tree.times(tree.frames.base)
     at = tree.place(tree.frames.base, times)
     x, y = (np.where(at.problem == "", column, np.nan) for column in at.translation_m.T[:2])

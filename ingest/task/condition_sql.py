@@ -124,7 +124,7 @@ def _plain_query(node: dict[str, Any]) -> bool:
 
 
 def _walk(part: Any) -> Iterator[dict[str, Any]]:
-    """Every node of an expression."""
+    """Yield every node of an expression."""
     if isinstance(part, dict):
         if "class" in part:
             yield part

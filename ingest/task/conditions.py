@@ -98,7 +98,7 @@ class Condition(Checked, frozen=True):
 
     @property
     def words(self) -> set[str]:
-        """Every word of its SQL, of its `let`s and its probability."""
+        """Return every word of its SQL, of its `let`s and its probability."""
         expressions = (self.sql, self.probability, *self.let.values())
         return {word for text in expressions for word in re.findall(r"\w+", text)}
 
@@ -210,7 +210,7 @@ def labels_version(conditions: Sequence[Condition]) -> str:
 
 
 def label(steps: pa.Table, conditions: Sequence[Condition]) -> dict[str, Bools]:
-    """Every condition over a table of steps, in the table's row order.
+    """Evaluate every condition over a table of steps, in the table's row order.
 
     `steps` holds `episode_index`, `step_index` and the stored signals, one row a step, including
     the last step of each episode (which is no transition, but whose signals `lead` sees).

@@ -151,6 +151,6 @@ class Noise(Checked, frozen=True):
 
     @property
     def constants(self) -> dict[str, float]:
-        """Each by the name that SQL has for it."""
+        """Return each by the name that SQL has for it."""
         named = msgspec.structs.asdict(self)
         return {"_noise_".join(name.rsplit("_", 1)): value for name, value in named.items()}

@@ -79,7 +79,7 @@ class Task(Checked, frozen=True):
 
     @property
     def observation_names(self) -> list[str]:
-        """The name of every entry of the observation, in order."""
+        """Return the name of every entry of the observation, in order."""
         bearings = (np.arange(self.sectors) + 0.5) * (360 / max(self.sectors, 1)) - 180
         return [
             *("near_sin", "near_cos", "far_sin", "far_cos", "goal_distance"),
@@ -102,7 +102,7 @@ class Task(Checked, frozen=True):
 
     @property
     def action_names(self) -> list[str]:
-        """The actions for people, e.g. `0.8 m/s left 0.7`."""
+        """Return the actions' names for people, e.g. `0.8 m/s left 0.7`."""
         return [_action_name(*action) for action in self.actions]
 
     @property

@@ -116,7 +116,7 @@ def test_thinned_frames_are_counted_and_the_last_one_kept_holds(bag: Path, tmp_p
     assert set(spans) == {2, 3}
 
 
-def test_frames_are_thinned_by_themselves_where_the_clock_was_set_back(tmp_path: Path) -> None:
+def test_thinning_frames_across_a_clock_set_back(tmp_path: Path) -> None:
     """A simulation that is started again repeats its times."""
     files = [file_of(picture(number)) for number in range(120)]
     topics = typed_topics(Drive(duration_s=12.0)) | {FRONT: compressed(files)}
@@ -194,7 +194,7 @@ def test_an_unknown_encoding_and_a_short_raw_image_are_counted(tmp_path: Path) -
     }
 
 
-def test_a_topic_that_is_no_image_is_refused_and_one_that_is_missing_said(bag: Path) -> None:
+def test_other_and_missing_image_topics(bag: Path) -> None:
     with pytest.raises(
         RecordingError, match=r"/odom holds nav_msgs/msg/Odometry, which is not an im"
     ):
@@ -220,7 +220,7 @@ def test_a_topic_that_is_no_image_is_refused_and_one_that_is_missing_said(bag: P
         ("string format", "data"),
     ],
 )
-def test_a_message_that_only_bears_the_name_of_an_image_is_refused(
+def test_an_image_type_with_other_fields_is_refused(
     tmp_path: Path, fields: str, named: str
 ) -> None:
     """What it holds is as the file defines it, which anybody may write."""
@@ -339,9 +339,7 @@ def test_a_file_damaged_inside_is_found_when_it_is_decoded() -> None:
 
 
 @given(st.binary(max_size=64), st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"]))
-def test_whatever_the_bytes_are_they_are_an_image_or_said_not_to_be(
-    data: bytes, start: bytes
-) -> None:
+def test_any_bytes_are_an_image_or_a_problem(data: bytes, start: bytes) -> None:
     for ending in (b"", b"\xff\xd9", b"IEND\xaeB`\x82"):
         try:
             layout = compressed_layout(start + data + ending, "jpeg")

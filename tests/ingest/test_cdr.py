@@ -296,7 +296,7 @@ def test_invalid_text_is_counted() -> None:
     }
 
 
-def test_a_count_that_cannot_be_is_refused_before_anything_is_allocated() -> None:
+def test_an_impossible_count_allocates_nothing() -> None:
     rule = "=" * 80
     point = "MSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z"
     message = one("pkg/msg/T", f"geometry_msgs/Point[] p\n{rule}\n{point}")

@@ -70,7 +70,7 @@ def test_the_first_is_committed_at_once_and_then_those_of_some_seconds_together(
 
 
 def test_no_more_than_so_many_wait(tmp_path, monkeypatch):
-    monkeypatch.setattr(prepared_module, "MOST", 2)
+    monkeypatch.setattr(prepared_module, "MAX_WAITING", 2)
     store = StoreWriter(tmp_path / "s")
     group = CommitGroup(store, clock=lambda: 0.0)
     for place in range(5):

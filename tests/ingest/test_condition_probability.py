@@ -61,7 +61,7 @@ def condition(text: str = FILE, noise_m: float = 0.1) -> Condition:
     return made.with_constants(Noise(lidar_m=noise_m).constants)
 
 
-def test_the_parts_of_a_file_are_named_and_looked_over_by_windows():
+def test_parts_of_a_condition_file():
     fast = condition()
     assert (fast.doc, fast.timing, fast.priority) == ("Fast, for a while.", "pre", 35)
     assert list(fast.let) == ["over_mps", "smooth_mps"]
@@ -117,7 +117,7 @@ def test_a_band_that_is_none_is_refused():
             Condition("fast", "pre", "true", uncertain=band)
 
 
-def test_a_profile_states_the_noise_and_stays_the_same_profile_for_rows():
+def test_noise_of_a_profile_does_not_change_rows():
     usual = parse_profile(WAREHOUSE, where="a")
     noisy = parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0.05\n", where="b")
     assert usual.hash == noisy.hash
@@ -131,7 +131,7 @@ def test_a_profile_states_the_noise_and_stays_the_same_profile_for_rows():
         parse_profile(WAREHOUSE + "\n[noise]\nlidar_m = 0\n", where="c")
 
 
-def test_rows_from_before_there_were_probabilities_get_them_when_labelled_again(tmp_path: Path):
+def test_old_rows_get_probabilities_when_relabelled(tmp_path: Path):
     rows = recording_transitions(1)
     later = [column.name for column in COVERAGE if column.name in ("probabilities", "uncertain")]
     names = [field.name for field in steps_schema()]

@@ -102,7 +102,7 @@ def in_the_way(drive: dict[str, np.ndarray], ahead: np.ndarray, aside_m: float =
 
 
 @pytest.mark.parametrize("planned", [True, False])
-def test_an_obstacle_in_the_way_is_a_blocked_aisle_only_when_it_stays(planned):
+def test_only_an_obstacle_that_stays_blocks_an_aisle(planned):
     speed = np.where(np.arange(60) < 20, 0.9, 0.0)  # up to a pallet, and stop before it
     x = np.concatenate([[0.0], np.cumsum(speed * 0.2)[:-1]])
     drive = {
@@ -159,7 +159,7 @@ def test_how_near_is_near_follows_the_robot():
     assert held_by(small, nearer, "recovery")[-1] <= 13  # there is room again at .1 m
 
 
-def test_how_much_is_slip_follows_the_robot_and_its_localisers_noise():
+def test_slip_limit_follows_robot_and_localiser_noise():
     table = steps(60, wheel_speed_mps=changed(0.58, 0.5, 60, slice(20, 40)))
     assert given_to(table, "wheel_slip") == []
     small = Noise().constants | SMALL

@@ -268,7 +268,7 @@ def test_what_contradicts_itself_is_kept_and_said(profile, tmp_path, case):
 
 
 @pytest.mark.parametrize("seen_s", [-0.6, -0.4, 0.0, 0.1, 0.4, 0.8])
-def test_scans_that_turn_at_another_time_than_the_poses_are_named(profile, tmp_path, seen_s):
+def test_scans_that_turn_before_or_after_the_poses(profile, tmp_path, seen_s):
     found, _ = found_in(in_a_hall(winding(), seen_s), profile, tmp_path)
     if abs(seen_s) < 0.3:  # a lidar takes time to turn, and its messages to arrive
         assert found == []
@@ -325,7 +325,7 @@ def test_profile_new_does_not_use_wheels_that_are_none(tmp_path, capsys):
     assert "# CONTRADICTS ITSELF: /odom: its poses step" in other.read_text()
 
 
-def test_a_clock_that_is_repaired_does_not_hide_the_localisers_noise(tmp_path):
+def test_a_repaired_clock_does_not_hide_localiser_noise(tmp_path):
     """Noise that slip must exceed is told of a drive whose other clock was repaired, too."""
     noisy = winding()
     pose, rng = noisy["/odom"], np.random.default_rng(0)

@@ -93,7 +93,7 @@ def soon(store: Path) -> list[int]:
     return [step for step, holds in found if holds]
 
 
-def test_corrections_survive_new_rules_a_new_ingest_and_a_changed_profile(
+def test_corrections_survive_relabelling_and_ingest(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = soon(store)
@@ -137,7 +137,7 @@ def test_taken_out_the_labels_of_the_rules_are_there_again(store: Path) -> None:
     assert remove_corrections(StoreWriter(store)) == ([], None)
 
 
-def test_a_recording_that_was_ingested_meanwhile_is_not_corrected(store: Path) -> None:
+def test_a_reingested_recording_is_not_corrected(store: Path) -> None:
     with Store(store) as opened:
         recording = opened.sql("SELECT min(recording_id) FROM recordings").fetchall()[0][0]
     given = {recording: RecordingCorrections("another", [])}
@@ -145,9 +145,7 @@ def test_a_recording_that_was_ingested_meanwhile_is_not_corrected(store: Path) -
         correct_store(StoreWriter(store), given)
 
 
-def test_views_and_panels_show_corrections_and_stale_labels_does_not(
-    store: Path, tmp_path: Path
-) -> None:
+def test_views_and_panels_show_corrections(store: Path, tmp_path: Path) -> None:
     mixture = "[each_condition]\nshare = 'natural'\n[evaluation_split]\nby = 'none'\n"
     plain = panel_of(store, mixture, tmp_path / "plain").header.labels_version
     said(store, 2, 4, True)
@@ -241,7 +239,7 @@ def test_what_is_said_last_counts_and_nothing_is_said_twice(
     assert corrected_version("r", again) == corrected_version("r", every)
 
 
-def test_times_that_a_clock_repeats_are_told_apart_by_the_episode() -> None:
+def test_episodes_tell_repeated_times_apart() -> None:
     moments = Moments(np.array([0, 0, 1, 1]), np.array([10, 20, 10, 20]))
     correction = Correction("x", True, 1, 10, 20, NOW)
     assert moments.covered(correction).tolist() == [False, False, True, True]
@@ -250,7 +248,7 @@ def test_times_that_a_clock_repeats_are_told_apart_by_the_episode() -> None:
     assert moments.covered(moved).tolist() == [True, False, True, False]
 
 
-def test_label_uses_the_profile_that_the_store_keeps_where_its_file_is_gone(
+def test_label_uses_the_profile_kept_in_the_store(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (tmp_path / "amr.toml").read_text().replace('name = "warehouse_amr"', 'name = "own"', 1)

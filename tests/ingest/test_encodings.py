@@ -340,7 +340,7 @@ def test_invalid_protobuf_definitions(definition: bytes, says: str | None) -> No
         protobuf_type("lab.Scan", definition)
 
 
-def test_a_protobuf_definition_that_unfolds_without_end_is_refused() -> None:
+def test_an_endless_protobuf_definition_is_refused() -> None:
     files = Files()
     file = files.file.add(name="a.proto", package="a", syntax="proto3")
     for depth in range(22):

@@ -32,14 +32,14 @@ def test_the_end_of_a_recording_truncates():
     )
 
 
-def test_reaching_the_goal_terminates_and_what_follows_is_no_episode():
+def test_reaching_the_goal_terminates():
     found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0)]).topics())
     # x = 1 + .5 t comes within .4 m of 3 at t = 3.2 s, tick 16.
     assert found.episodes == [EpisodeSpan(0, 16, True, "goal", False)]
     assert found.dropped == {"goal already reached": 13}
 
 
-def test_a_goal_reached_on_the_tick_of_the_next_goal_still_terminates():
+def test_goal_reached_on_the_next_goals_tick_terminates():
     """The mission layer sends the next goal at once: judge the tick by the goal before it."""
     found = episodes_of(Drive(goals=[(0.0, 3.0, 1.0), (3.2, 11.0, 1.0)]).topics())
     assert found.episodes == [
@@ -48,7 +48,7 @@ def test_a_goal_reached_on_the_tick_of_the_next_goal_still_terminates():
     ]
 
 
-def test_the_same_goal_ordered_again_after_it_was_reached_is_a_new_episode():
+def test_the_same_goal_again_is_a_new_episode():
     again = Drive(goals=[(0.0, 3.0, 1.0), (5.0, 3.0, 1.0)])  # it has driven 0.5 m past by then
     found = episodes_of(again.topics())
     assert [(e.first, e.last) for e in found.episodes] == [(0, 16), (25, 29)]
@@ -97,7 +97,7 @@ def test_a_bump_terminates_where_the_task_says_so():
     assert found.dropped == {"bumper: pressed within the last 1 s": 4}
 
 
-def test_scraping_along_something_is_one_bump_and_no_episodes_of_one_step():
+def test_scraping_along_something_is_one_bump():
     topics = Drive().topics()
     time = np.arange(0, 6, 0.02)
     pressed = (time > 2.0) & (time < 4.0) & (time % 0.5 < 0.1)  # touches it every half second
@@ -110,7 +110,7 @@ def test_scraping_along_something_is_one_bump_and_no_episodes_of_one_step():
     assert found.dropped == {"bumper: pressed within the last 1 s": 11}
 
 
-def test_a_bump_on_the_tick_of_a_new_goal_ends_the_old_episode_and_begins_none():
+def test_a_bump_on_a_new_goals_tick_begins_no_episode():
     topics = Drive(goals=[(0.0, 11.0, 1.0), (2.0, 10.0, 1.0)]).topics()
     time = np.arange(0, 6, 0.02)
     topics["/bumper"] = columns(time, {"data": time == 2.0}, stamped=False)

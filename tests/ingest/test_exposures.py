@@ -105,7 +105,7 @@ def test_an_exposure_takes_no_row_from_a_condition():
 
 
 @pytest.mark.parametrize("more", ['timing = "post"', 'timing = "pre"\nprobability = "0.5"'])
-def test_an_exposure_is_known_before_acting_and_has_no_probability(more):
+def test_an_exposure_has_no_probability(more):
     text = f'{TEXT}\n[[condition]]\nname = "x"\nkind = "exposure"\nsql = "true"\n{more}\n'
     with pytest.raises(ConfigError, match="exposure is a situation known before acting"):
         parse_profile(text, where="here")

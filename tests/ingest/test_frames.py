@@ -125,7 +125,7 @@ def test_static_transforms_never_age():
     assert found.translation_m.tolist() == [[1, 2, 3], [1, 2, 3]]
 
 
-def test_static_transforms_hold_across_a_clock_that_is_set_and_moving_ones_do_not():
+def test_only_static_transforms_hold_across_a_clock_jump():
     log = np.arange(0, 10, 0.1)
     clock = columns(log, {})
     later = log >= 5
@@ -155,7 +155,7 @@ def test_the_future_is_not_seen():
     assert np.array_equal(whole.translation_m, cut.translation_m)
 
 
-def test_a_transform_stamped_ahead_counts_from_when_it_was_received():
+def test_a_transform_ahead_counts_from_its_reception():
     """As localisation stamps map -> odom; it says nothing about the recording's clocks either."""
     moving: list[Line] = [(t, "map", "base_link", t, 0, 0, 0) for t in np.arange(0, 5, 0.5)]
     tree = tree_of(Frames(), moving, [], ahead_s=1.0)
@@ -164,7 +164,7 @@ def test_a_transform_stamped_ahead_counts_from_when_it_was_received():
     assert tree.segments[0].clock_map.offset_ns == 2_000_000
 
 
-def test_a_frame_that_gets_another_parent_is_counted_and_followed():
+def test_a_frame_with_a_new_parent_is_followed():
     moving: list[Line] = [
         (0.0, "map", "odom", 5, 0, 0, 0),
         (0.0, "map", "lift", 100, 0, 0, 0),
@@ -256,7 +256,7 @@ def test_missing_transforms_are_named():
     assert "there are odom -> base_footprint" in str(error.value)
 
 
-def test_goals_and_plans_in_another_frame_are_put_in_the_fixed_one():
+def test_goals_and_plans_are_put_in_the_fixed_frame():
     drive = Drive()
     topics = drive_with_transforms(drive)
     usual = steps_of(parse_profile(framed(), where="p"), topics)
@@ -384,7 +384,7 @@ def test_a_message_may_hold_many_transforms_or_none():
     assert list(edges.only({"odom"}).parents) == ["odom"]
 
 
-def test_a_localiser_that_speaks_seldom_beside_transforms_is_said(tmp_path, capsys):
+def test_a_slow_localiser_beside_transforms_is_noted(tmp_path, capsys):
     drive, said = Drive(20.0), {}
     topics = drive_with_transforms(drive)
     typed = typed_topics(drive) | {"/tf": ("tf2_msgs/msg/TFMessage", topics["/tf"])}

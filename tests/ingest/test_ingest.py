@@ -190,7 +190,7 @@ def test_a_truncated_file_is_refused_unless_salvaged(tmp_path, run):
     assert 10 < one["transitions"] < 29
 
 
-def test_the_wrong_profile_says_what_is_missing_and_what_is_there(bag, tmp_path, run):
+def test_the_wrong_profile_says_what_is_missing(bag, tmp_path, run):
     text = WAREHOUSE
     other = tmp_path / "other.toml"
     other.write_text(text.replace('"/scan"', '"/front/scan"').replace('"/imu"', '"/odom"'))
@@ -289,7 +289,7 @@ def test_the_page_names_every_input_and_what_stands_in_for_it():
         assert fallback in page
 
 
-def test_the_sample_log_is_labelled_about_as_well_as_the_page_says(run):
+def test_labels_of_the_sample_log_are_as_good_as_documented(run):
     code, said, _ = run(ROOT / "sample_logs" / "amr_monday.mcap", "--dry-run")
     assert code == 0
     page = (ROOT / "docs" / "ingest.md").read_text()

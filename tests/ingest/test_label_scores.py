@@ -39,7 +39,7 @@ def test_the_true_conditions_of_a_step_are_one_text():
         ("ramp,carpet", "carpet"),
     ],
 )
-def test_a_reader_that_needs_one_condition_gets_the_most_pressing(text, one):
+def test_the_most_pressing_condition_comes_first(text, one):
     assert primary_of(text) == one
 
 
@@ -153,7 +153,7 @@ def test_events_are_found_as_one_would_by_looking_at_every_pair(drawn, reach):
 
 @settings(max_examples=40)
 @given(episodes(), st.randoms())
-def test_a_truth_that_is_its_own_label_scores_one_and_parts_add_up(drawn, chance):
+def test_perfect_labels_score_one_and_parts_add_up(drawn, chance):
     holds, true, episode, step = drawn
     for one in score({"slip": true}, texts(true), episode, step, 0.2):
         assert one.precision == one.recall == one.event_precision == one.event_recall == 1

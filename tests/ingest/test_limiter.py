@@ -43,7 +43,7 @@ def one(
 
 @settings(max_examples=80)
 @given(limits, speeds, clearances, speeds)
-def test_no_speed_grows_or_turns_round_and_none_is_beyond_the_robot(
+def test_limited_speeds_never_grow_or_turn_round(
     of: Limits, command: tuple[float, float], clearance: F64, before: tuple[float, float]
 ) -> None:
     found = one(of, command, clearance, before)
@@ -139,7 +139,7 @@ def test_what_is_not_known_is_a_stop(bad: str) -> None:
     assert RULES[found.rule[0]] == "unknown"
 
 
-def test_a_profile_says_its_limits_and_rows_do_not_depend_on_them() -> None:
+def test_limits_of_a_profile_do_not_change_rows() -> None:
     text = profile_toml(PROFILE) + "\n[limiter]\nstop_m = 0.3\nmax_speed_mps = 0.5\n"
     profile = parse_profile(text, where="mine")
     assert profile.hash == PROFILE.hash

@@ -93,7 +93,7 @@ def test_counts_of_a_wrong_summary_are_not_used(tmp_path):
         assert [loss.messages for loss in recording.lost_messages] == [None]
 
 
-def test_where_the_chunk_has_no_crc_the_summarys_copy_is_the_proven_one(tmp_path):
+def test_without_a_chunks_crc_the_summary_counts(tmp_path):
     """A definition that is damaged in a chunk without CRC, and whole in a summary with one."""
     whole = write_mcap(tmp_path / "whole.mcap")
     content = bytearray(write_mcap(tmp_path / "plain.mcap", compression=0).read_bytes())
@@ -112,7 +112,7 @@ def test_where_the_chunk_has_no_crc_the_summarys_copy_is_the_proven_one(tmp_path
         assert other.integrity == "damaged"
 
 
-def test_a_topic_that_begins_late_is_compared_in_the_chunk_where_it_begins(tmp_path):
+def test_a_late_topic_is_compared_where_it_begins(tmp_path):
     """As rosbag2 writes them: a channel's definition lies right before its first message."""
     from mcap.writer import Writer
 

@@ -61,7 +61,7 @@ def speeds(graph: Graph, topic: str = COMMAND) -> list[tuple[float, float]]:
     return [(message.linear.x, message.angular.z) for message in graph.of(topic)]
 
 
-def test_it_drives_the_twin_to_its_goal_and_sees_what_the_twin_does(policy: Path) -> None:
+def test_it_drives_the_twin_to_its_goal(policy: Path) -> None:
     graph, node = started(policy)
     assert node.trigger_activate() is Returned.SUCCESS
     robot, seen = TwinRobot(graph, SPEC), []
@@ -86,7 +86,7 @@ def test_it_drives_the_twin_to_its_goal_and_sees_what_the_twin_does(policy: Path
     assert {entry.key: entry.value for entry in said.values}["decisions"] == str(steps)
 
 
-def test_its_transitions_command_only_when_active_and_stop_when_they_end(policy: Path) -> None:
+def test_it_commands_only_when_active(policy: Path) -> None:
     graph, node = started(policy)
     robot = TwinRobot(graph, SPEC)
     driven(robot, steps=3)
@@ -119,7 +119,7 @@ def test_it_can_be_configured_again_after_a_cleanup(policy: Path) -> None:
     assert len(graph.timers) == 3
 
 
-def test_configured_again_it_has_the_limits_of_its_new_policy_and_of_who_set_them(
+def test_configured_again_it_has_the_new_limits(
     tmp_path: Path,
 ) -> None:
     def limited(name: str, speed_mps: float) -> Path:
@@ -188,9 +188,7 @@ def test_what_is_hostile_is_a_stop_and_counted(policy: Path) -> None:
     assert all(np.isfinite(pair).all() for pair in speeds(graph))
 
 
-def test_a_policy_whose_weights_are_no_numbers_is_a_stop_with_its_reason(
-    policy: Path, tmp_path: Path
-) -> None:
+def test_a_policy_with_nan_weights_is_a_stop(policy: Path, tmp_path: Path) -> None:
     import onnx
 
     model = onnx.load(policy)
@@ -205,9 +203,7 @@ def test_a_policy_whose_weights_are_no_numbers_is_a_stop_with_its_reason(
     assert speeds(graph)[-1] == (0.0, 0.0)
 
 
-def test_a_policy_that_does_not_fit_leaves_it_unconfigured_and_says_why(
-    policy: Path, tmp_path: Path
-) -> None:
+def test_an_unfit_policy_leaves_it_unconfigured(policy: Path, tmp_path: Path) -> None:
     other = tmp_path / "turtlebot3.toml"
     other.write_text(profile_toml(load_profile("turtlebot3")), encoding="utf-8")
     for parameters, why in (
@@ -244,7 +240,7 @@ def test_parameters_choose_the_command_and_its_limits(policy: Path) -> None:
     assert {message.data for message in graph.of(LIMITER)} & {1}
 
 
-def test_in_shadow_it_commands_nothing_and_its_log_is_compared_in_sql(
+def test_in_shadow_it_commands_nothing(
     policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     graph, node = started(policy, drive=False)

@@ -81,7 +81,7 @@ def test_a_part_that_is_missing_is_damage(tmp_path, capsys, ending, number):
     assert f"run_{number}.{ending}" in capsys.readouterr().err
 
 
-def test_a_hole_is_damage_though_the_metadata_was_made_without_it(tmp_path):
+def test_a_hole_is_damage_despite_the_metadata(tmp_path):
     """As `ros2 bag reindex` makes it, of what is there."""
     folder = split_bag(tmp_path / "run")
     part(folder, 1).unlink()

@@ -188,9 +188,7 @@ def test_salvaged_columns_are_those_of_the_whole_file(whole: Path, tmp_path: Pat
             assert one["/long"].fields["data"].tolist() == other["/long"].fields["data"].tolist()
 
 
-def test_a_message_that_is_lost_is_counted_once_however_often_it_is_read(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_a_lost_message_is_counted_once(whole: Path, tmp_path: Path) -> None:
     file = tmp_path / "run.db3"
     file.write_bytes(DAMAGE["a text goes on elsewhere"](bytearray(whole.read_bytes())))
     with open_recording(file, salvage=True) as recording:

@@ -125,7 +125,7 @@ def test_a_scan_without_a_single_valid_range_is_not_free_floor(nothing):
     assert set(np.array(steps.problem)[~blind]) == {""}
 
 
-def test_positions_far_from_their_origin_are_refused_with_what_to_do():
+def test_positions_far_from_their_origin_are_refused():
     """UTM northings: finite, but float32 tells no centimetres there."""
     topics = Drive().topics()
     topics["/amcl_pose"].fields["pose.pose.position.y"][:] += 5.2e6
@@ -191,7 +191,7 @@ def test_a_proposal_is_the_latest_at_or_before_the_tick():
         assert not [note for note in steps.notes if "nav_command" in note]
 
 
-def test_an_unknown_proposal_is_counted_and_leaves_the_tick_usable():
+def test_an_unknown_proposal_leaves_the_tick_usable():
     topics = Drive().topics()
     topics["/cmd_vel_nav"] = proposed([1.0, 1.2, 1.4, 1.6, 3.0], [0.5, 0.5, np.nan, 0.5, 0.5])
     steps = steps_of(PROFILE, topics)
@@ -276,7 +276,7 @@ def test_a_robot_that_was_carried_does_not_drive_on():
     assert steps.signals["localised_speed_mps"] == pytest.approx(np.full(30, SPEED_MPS))
 
 
-def test_at_a_fixed_rate_the_action_is_the_one_in_force_for_most_of_the_interval():
+def test_at_a_fixed_rate_the_longest_action_counts():
     import msgspec
 
     profile = msgspec.structs.replace(PROFILE, clock=Clock(steps="rate"))
@@ -319,7 +319,7 @@ def test_without_imu_and_goal_the_stand_ins_are_used():
     assert (steps.routing.goal == -1).all()
 
 
-def test_an_optional_topic_without_messages_is_replaced_like_one_that_is_not_there():
+def test_an_optional_topic_without_messages_is_replaced():
     import msgspec
 
     from restock.ingest.steps.aligned_inputs import fallbacks_used

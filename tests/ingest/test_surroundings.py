@@ -79,7 +79,7 @@ def test_who_walks_toward_a_robot_comes_nearer_by_what_they_walk(bearing_deg, st
     st.floats(1.5, 6.0),
 )
 @settings(max_examples=150)
-def test_what_stands_does_not_come_nearer_however_the_robot_moves(discs, forward_m, turn, walls):
+def test_standing_things_do_not_come_nearer(discs, forward_m, turn, walls):
     """But for what a sector's breadth leaves open: less than what a walk of .5 m/s adds up to."""
     discs = [disc for disc in discs if np.hypot(disc[0], disc[1]) > disc[2] + 0.5]
     pose = (forward_m * np.cos(turn / 2), forward_m * np.sin(turn / 2), turn)
@@ -94,7 +94,7 @@ def over(scans: list[Any]) -> float:
     return float(came_nearer(TASK, now, earlier[::-1])[0])
 
 
-def test_an_edge_that_beams_hit_now_and_miss_now_does_not_come_nearer():
+def test_a_flickering_edge_does_not_come_nearer():
     """Chair legs and the rims of things, with something behind them."""
     seen, missed = (scan((0.0, 0.0, 0.0), discs, 2.0) for discs in ([(1.7, 0.3, 0.1)], []))
     assert over([missed, seen]) > 0.2  # of two scans alone it looks so
@@ -119,7 +119,7 @@ def test_where_no_beam_came_back_nothing_is_known():
     assert over([lost, near]) == 0
 
 
-def test_a_lidar_slower_than_the_steps_sees_nobody_come_where_the_robot_goes():
+def test_a_slow_lidar_sees_nobody_come():
     """Its scans are held: the last one is then of where the robot was steps ago."""
     at_m = np.arange(8) * 0.15
     scans = [scan((x, 0.0, 0.0), [(3.0, 0.2, 0.4)]) for x in at_m]
@@ -135,7 +135,7 @@ def test_the_same_scan_again_tells_nothing():
     assert came_nearer(TASK, now, [before])[0] == 0
 
 
-def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
+def test_a_return_on_the_plan_is_found():
     near, far = np.array([1.0, 0.0]), np.array([1.8, 0.9])  # a plan that bends left
     at_m = np.array(plan_distances_m(TASK))[:, None]
     beyond = (at_m - TASK.near_m) / (TASK.far_m - TASK.near_m)
@@ -158,7 +158,7 @@ def test_a_return_on_the_plan_is_found_along_it_and_beside_it_not():
     assert [one[0] for one in returns_on_plan(free, ahead, plan)] == [TASK.range_max_m] * 2
 
 
-def test_the_gap_is_from_the_plan_to_what_is_nearest_beside_the_way_just_ahead():
+def test_the_gap_is_to_the_nearest_beside_the_plan():
     plan = np.stack([np.array(plan_distances_m(TASK)), np.zeros(7)], axis=-1)[None]
 
     def gap(discs: list[Disc]) -> float:

@@ -89,7 +89,7 @@ TO_THE_SIDE = (
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["warehouse_amr", "turtlebot3"]))
-def test_the_mirror_image_is_what_is_observed_in_a_mirrored_world(seed, profile):
+def test_mirror_image_equals_a_mirrored_world(seed, profile):
     task = load_profile(profile).task
     rng = np.random.default_rng(seed)
 
@@ -221,7 +221,7 @@ def test_a_bump_terminates_only_where_the_task_says_so():
     assert terminated(TASK, signals(goal_distance_m=0.3)).all()
 
 
-def test_the_clearance_ahead_is_of_the_sectors_toward_the_waypoint():
+def test_clearance_ahead_is_toward_the_waypoint():
     sectors = np.array([[1.0, 2.0, 3.0, 4.0, 0.5, 9.0, 9.0, 9.0]])
     task = msgspec.structs.replace(TASK, sectors=8)
     # Straight ahead, slightly left: sector 4, and its neighbours 3 and 5.
@@ -293,7 +293,7 @@ def test_actions_have_names_for_people():
     assert names[0] == "stop"
 
 
-def test_a_quaternion_without_a_length_has_no_yaw_and_any_other_length_the_same():
+def test_yaw_does_not_depend_on_a_quaternions_length():
     turn = np.array([0.1, -0.2, 0.5, 0.8])
     yaw = yaw_of(*(turn / np.linalg.norm(turn))[:, None])[0]
     scaled = yaw_of(*np.outer(turn, [1.0, 1e-6, 40.0, 0.0, 1e300, np.nan]))

@@ -77,7 +77,7 @@ def test_reward_by_hand():
     assert table["progress_m"].to_numpy() == pytest.approx(np.full(16, 0.1), abs=1e-5)
 
 
-def test_progress_is_along_the_plan_that_was_in_force_when_acting():
+def test_progress_is_along_the_plan_when_acting():
     """A new, longer plan to the same goal is no loss of progress."""
     topics = Drive().topics()
     x, y = (topics["/plan"].fields[f"poses[].pose.position.{axis}"] for axis in "xy")
@@ -100,7 +100,7 @@ def test_progress_is_along_the_plan_that_was_in_force_when_acting():
     assert len(set(table["episode_index"].to_pylist())) == 1
 
 
-def test_ids_are_of_the_recording_and_its_step_and_outlive_a_new_profile():
+def test_ids_outlive_a_new_profile():
     topics = Drive().topics()
     whole = rows_of(topics)["transition_id"].to_numpy()
     assert (whole >> STEP_BITS == int("fedcba9876543210", 16) >> 26).all()
@@ -130,7 +130,7 @@ def test_labels_zone_policy_and_truth():
     assert set(table["zone"].to_pylist()[13:]) == {"aisle_1_west"}
 
 
-def test_the_last_step_of_an_episode_is_seen_by_conditions_that_look_ahead():
+def test_conditions_see_an_episodes_last_step():
     topics = Drive(goals=[(0.0, 3.0, 1.0)]).topics()
     time = (topics["/scan"].log_time_ns - START_NS) * 1e-9
     late = np.repeat(time > 3.15, 72)  # only the episode's end, at 3.2 s, has the obstacle

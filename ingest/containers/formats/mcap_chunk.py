@@ -74,7 +74,7 @@ class Chunk:
     index: dict[int, tuple[int, int]] = field(default_factory=dict)  # channel -> entries in file
 
     def counts(self) -> dict[int, int]:
-        """Messages per channel, by the message index."""
+        """Count messages per channel by the message index."""
         return {
             channel: (stop - start) // _INDEX.itemsize
             for channel, (start, stop) in self.index.items()
@@ -264,7 +264,7 @@ def walked_messages(part: bytes | memoryview) -> tuple[Positions, str | None]:
 
 
 def messages_at(buffer: NDArray[np.uint8], at: Ints) -> Messages:
-    """Messages whose records start at these positions (which were walked, and so fit)."""
+    """Return the messages whose records start at these (walked) positions."""
     return _messages(at, gather(buffer, at, _HEAD))
 
 
@@ -362,7 +362,7 @@ class Definitions:
         ]
 
     def named(self) -> dict[int, Channel]:
-        """Every channel with its schema; without one, its messages have no type."""
+        """Return every channel with its schema; without one, its messages have no type."""
         return {
             number: Channel(
                 number,

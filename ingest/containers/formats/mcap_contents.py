@@ -77,14 +77,14 @@ class Contents:
     rosbag2: str = ""  # the metadata.yaml in its own record
 
     def indexed_counts(self) -> Counter[int]:
-        """Messages per channel as far as they are known without looking into chunks."""
+        """Count messages per channel as far as possible without looking into chunks."""
         counts = Counter({channel: len(positions) for channel, positions in self.loose.items()})
         for chunk in self.chunks:
             counts.update(chunk.counts())
         return counts
 
     def claimed_counts(self) -> dict[int, int] | None:
-        """Messages per channel by the statistics; None where they are missing or incomplete."""
+        """Return messages per channel by the statistics; None if missing or incomplete."""
         if self.statistics is None or (self.cut is not None and not self.resumed):
             return None
         # Counts per channel are optional; the total is not.

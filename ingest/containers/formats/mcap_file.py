@@ -275,7 +275,7 @@ def _ahead(works: Iterable[Callable[[int], _Inflated]]) -> Iterator[_Inflated]:
 
 
 def batch_of(buffer: NDArray[np.uint8], parts: list[Messages]) -> MessageBatch:
-    """Messages from several places of one buffer, as one batch."""
+    """Join messages from several places of one buffer to one batch."""
     return MessageBatch(
         buffer,
         np.concatenate([part.start for part in parts]),
@@ -448,7 +448,7 @@ class McapFile:
         return self._checks.integrity
 
     def _check_loose(self) -> None:
-        """Messages outside chunks are checked by the CRC of the whole data section."""
+        """Check messages outside chunks by the CRC of the whole data section."""
         position, crc = self._contents.data_end
         if not crc:
             self._checks.unchecked += 1
